@@ -1,0 +1,48 @@
+# Needs only make and Python 3.11 or later; everything else goes into the project's own .venv.
+PYTHON ?= python3
+JOBS ?= 2
+DEMO ?= runs/demo
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench clean
+
+help: ## what one can make
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## make .venv and install hypogoal with its tested versions into it (once)
+
+# A half-made .venv (Debian without python3-venv) must not pass for a whole one at the next call.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "hypogoal needs Python 3.11 or later: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+		{ rm -rf $(VENV); echo "python could not make a virtual environment: install python3-venv" >&2; exit 1; }
+
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing hypogoal and its dependencies into $(VENV) (some minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+# An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(DEMO).
+demo: $(STAMP) ## three-key DoorKey from nothing to a report, in runs/demo
+	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
+
+test: $(STAMP) ## the tests, without those marked slow
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(TESTS)
+
+check: $(STAMP) ## linter, formatter, types, import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(STAMP) ## DoorKey steps per second, MiniGrid's and ours (BENCH=--short for a quick look)
+	$(BIN)/python -m benchmarks.doorkey $(BENCH)
+
+clean: ## remove caches and builds; data/, runs/ and .venv stay
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

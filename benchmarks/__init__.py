@@ -1,0 +1,1 @@
+"""Timings of hypogoal against what it replaces; not installed with the package."""

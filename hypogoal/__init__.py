@@ -1,0 +1,36 @@
+"""hypogoal: transferable sub-goals by hypothesising which features generalise.
+
+The heavy parts (torch, the environments) are imported on first use, so that ``import hypogoal`` and the
+command line's ``--help`` stay fast.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from hypogoal.api import OptionEnv, load_ensemble, load_options
+
+_LAZY = {
+    "load_ensemble": "hypogoal.api",
+    "load_options": "hypogoal.api",
+    "OptionEnv": "hypogoal.api",
+}
+__all__ = ["OptionEnv", "__version__", "load_ensemble", "load_options"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        import importlib
+
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'hypogoal' has no attribute {name!r}")
+
+
+def register() -> None:
+    """Register hypogoal's environments; Gymnasium's plug-in entry point calls it on ``import gymnasium``."""
+    from hypogoal.domains.doorkey_registration import register as register_doorkey
+
+    register_doorkey()

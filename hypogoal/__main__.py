@@ -1,0 +1,7 @@
+"""``python -m hypogoal``."""
+
+import sys
+
+from hypogoal.cli import main
+
+sys.exit(main())

@@ -1,0 +1,49 @@
+"""The Python interface: load what was trained, predict, and play options as actions of a Gymnasium environment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.tensors import load_tensors
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.storage import read_ensemble
+from hypogoal.options.env import OptionEnv, Options, make_policies
+
+__all__ = ["OptionEnv", "load_ensemble", "load_options"]
+
+
+def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
+    """The hypotheses of one sub-goal.
+
+    Args:
+        path: an ensemble artefact's folder.
+        sub_goal: for example ``open-red-door``.
+
+    Returns:
+        An ensemble; ``ensemble.predict(observations)`` gives float32 (N, K) from uint8 (N, *obs_shape).
+
+    Raises:
+        UserError: not an ensemble artefact, or no such sub-goal.
+    """
+    artefact = open_artefact(Path(path), "ensemble")
+    return read_ensemble(artefact.path, artefact.config, sub_goal)
+
+
+def load_options(path: str | Path, ensemble: str | Path | None = None) -> Options:
+    """The options of an options or meta artefact: policies and termination classifiers.
+
+    Args:
+        path: the artefact's folder.
+        ensemble: the ensemble artefact they were trained with; found from the manifest when None.
+
+    Raises:
+        UserError: not such an artefact, the ensemble is gone, or the options end at the true sub-goals (oracle).
+    """
+    artefact = open_artefact(Path(path), ("options", "meta"))
+    config = artefact.config
+    folder = Path(ensemble) if ensemble else artefact.input("ensemble")
+    source = open_artefact(folder, "ensemble")
+    ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
+    policies = make_policies(config, load_tensors(artefact.path / "options.safetensors"), source.config)
+    return Options(tuple(config["sub_goals"]), config["members"], ensembles, policies, config["option_timeout"])

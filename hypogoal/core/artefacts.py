@@ -1,0 +1,232 @@
+"""Artefacts: folders with a ``manifest.json``, written beside their final name and renamed at the end.
+
+What has a manifest is complete (Spec A8). The manifest says what made the artefact: kind, format version, the full
+resolved configuration, the seed, the sha256 of every file and of every input's manifest, package versions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.config import as_dict
+from hypogoal.core.errors import UserError
+
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+MAX_MANIFEST_BYTES = 16 * 2**20
+PACKAGES = ("hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "h5py", "safetensors", "stable-baselines3")
+PARTIAL = ".partial"
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A complete artefact: its folder and what its manifest says."""
+
+    path: Path
+    manifest: dict[str, Any]
+
+    @property
+    def kind(self) -> str:
+        """ensemble, options, meta, baseline, evaluation or report."""
+        return str(self.manifest["kind"])
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration that made it."""
+        return dict(self.manifest["config"])
+
+    @property
+    def seed(self) -> int:
+        """The seed that made it."""
+        return int(self.manifest["seed"])
+
+    def input(self, kind: str) -> Path:
+        """The path of the input artefact of ``kind``: as recorded, else beside this artefact."""
+        for entry in self.manifest["inputs"]:
+            if entry["kind"] == kind:
+                for candidate in (self.path / entry["relative"], Path(entry["path"])):
+                    if candidate.exists():
+                        return candidate.resolve()
+                raise UserError(f"the {kind} that {self.path} was made from is gone", entry["path"], "Restore it.")
+        raise UserError(f"{self.path} was made from no {kind}", self.path / MANIFEST, "Is it the right artefact?")
+
+
+def sha256_of(path: Path) -> str:
+    """The sha256 of a file, as hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that an artefact's numbers depend on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def claim(out: Path, *, force: bool = False) -> Path:
+    """Check that ``out`` may be written before any work is done.
+
+    Raises:
+        UserError: it exists and ``force`` is false, or it exists and is not ours to replace.
+    """
+    if out.exists():
+        ours = (out / MANIFEST).is_file() or (out.is_dir() and not any(out.iterdir()))
+        if not force:
+            raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
+        if not ours and out.is_dir():
+            raise UserError("--force replaces only artefacts, and this folder has no manifest", out, "Move it away.")
+    parent = out.absolute().parent
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"the output's folder cannot be made ({error.strerror})", parent, "Choose another --out.") from None
+    if not os.access(parent, os.W_OK):
+        raise UserError("no permission to write", parent, "Choose another --out.")
+    return out
+
+
+@contextlib.contextmanager
+def create_artefact(
+    out: Path, *, kind: str, config: Any, seed: int, inputs: Sequence[Path] = (), force: bool = False
+) -> Iterator[Path]:
+    """A fresh folder to fill; at the end its manifest is written and it is renamed to ``out``.
+
+    Args:
+        out: the artefact's final folder.
+        kind: ensemble, options, meta, baseline, evaluation or report.
+        config: the resolved configuration, a dataclass or a dict.
+        seed: the seed that makes it.
+        inputs: artefact folders or data files that were read.
+        force: replace an existing artefact.
+
+    Yields:
+        The folder to write into. When the block raises, the folder is removed and ``out`` is as it was.
+    """
+    claim(out, force=force)
+    partial = out.with_name(f".{out.name}{PARTIAL}-{os.getpid()}")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        manifest = {
+            "kind": kind,
+            "format": FORMAT_VERSION,
+            "config": config if isinstance(config, dict) else as_dict(config),
+            "seed": seed,
+            "inputs": [_input_entry(Path(path), out) for path in inputs],
+            "files": {
+                str(file.relative_to(partial)): sha256_of(file) for file in sorted(partial.rglob("*")) if file.is_file()
+            },
+            "versions": versions(),
+            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        }
+        (partial / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        _replace(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _replace(partial: Path, out: Path) -> None:
+    """Rename ``partial`` to ``out``; an old artefact there is moved aside first and removed last."""
+    old = out.with_name(f".{out.name}.old-{os.getpid()}")
+    if out.exists():
+        out.rename(old)
+    partial.rename(out)
+    if old.is_dir():
+        shutil.rmtree(old)
+    elif old.exists():
+        old.unlink()
+
+
+def _input_entry(path: Path, out: Path) -> dict[str, str]:
+    folder = path.is_dir()
+    target = path / MANIFEST if folder else path
+    kind = open_artefact(path).kind if folder else "data"
+    relative = os.path.relpath(path.absolute(), out.absolute())
+    return {"path": str(path), "relative": relative, "kind": kind, "sha256": sha256_of(target)}
+
+
+def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefact:
+    """Open a complete artefact and check that it is what the caller needs.
+
+    Args:
+        path: the artefact's folder.
+        kind: the kind, or kinds, that the caller can use; None for any.
+
+    Raises:
+        UserError: missing, not an artefact, damaged, of another kind, or of a newer format.
+    """
+    manifest_path = path / MANIFEST
+    if not path.exists():
+        raise UserError("no such artefact", path, "Check the path, or run the stage that makes it.")
+    if not path.is_dir() or not manifest_path.is_file():
+        raise UserError(f"not an artefact (no {MANIFEST})", path, "Give the folder that a stage wrote.")
+    if manifest_path.stat().st_size > MAX_MANIFEST_BYTES:
+        raise UserError("the manifest is too large to be one", manifest_path, "Is it a hypogoal artefact?")
+    try:
+        manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        raise UserError("the manifest is not valid JSON", manifest_path, "Make the artefact again.") from None
+    wanted = {"kind": str, "format": int, "config": dict, "seed": int, "inputs": list, "files": dict}
+    if not isinstance(manifest, dict):
+        raise UserError("the manifest is not a JSON object", manifest_path, "Make the artefact again.")
+    if isinstance(manifest.get("format"), int) and manifest["format"] > FORMAT_VERSION:
+        raise UserError(
+            f"format {manifest['format']} is newer than this hypogoal reads ({FORMAT_VERSION})",
+            manifest_path,
+            "Upgrade hypogoal.",
+        )
+    for key, form in wanted.items():
+        if not isinstance(manifest.get(key), form):
+            raise UserError(f"the manifest's {key!r} is missing or malformed", manifest_path, "Make the artefact again.")
+    kinds = (kind,) if isinstance(kind, str) else kind
+    if kinds is not None and manifest["kind"] not in kinds:
+        raise UserError(
+            f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed",
+            path,
+            "Give the right folder.",
+        )
+    return Artefact(path, manifest)
+
+
+def find_artefacts(run: Path, kind: str, depth: int = 3) -> list[Artefact]:
+    """All complete artefacts of ``kind`` below ``run`` (and ``run`` itself), sorted by path."""
+    if not run.is_dir():
+        raise UserError("no such run", run, "Give the folder that 'hypogoal run' wrote.")
+    found = []
+    for manifest in sorted(run.rglob(MANIFEST)):
+        parts = manifest.relative_to(run).parts
+        if len(parts) <= depth + 1 and not any(part.startswith(".") for part in parts):
+            artefact = open_artefact(manifest.parent)
+            if artefact.kind == kind:
+                found.append(artefact)
+    return found
+
+
+def check_files(artefact: Artefact) -> list[str]:
+    """One line for each file of the artefact that is missing or changed; none when it is whole."""
+    faults = []
+    for name, digest in artefact.manifest["files"].items():
+        path = artefact.path / name
+        if not path.resolve().is_relative_to(artefact.path.resolve()):
+            faults.append(f"{name}: outside the artefact")
+        elif not path.is_file():
+            faults.append(f"{name}: missing")
+        elif sha256_of(path) != digest:
+            faults.append(f"{name}: changed since it was written")
+    return faults

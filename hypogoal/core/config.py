@@ -1,0 +1,204 @@
+"""Settings: one home for each default, with unit, meaning and source; presets and ``--set`` resolve here.
+
+A stage's configuration is a frozen dataclass whose every field is a :func:`setting`. ``hypogoal config STAGE``
+and the manifests are made from the same fields. Precedence: ``--set`` > option > preset > default.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+import typing
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+from hypogoal.core.errors import UserError
+
+T = TypeVar("T")
+
+
+def setting(
+    default: Any,
+    meaning: str,
+    *,
+    unit: str = "",
+    source: str = "",
+    choices: Iterable[Any] | None = None,
+    low: float | None = None,
+    high: float | None = None,
+) -> Any:
+    """A dataclass field with its unit, meaning, source and allowed values."""
+    metadata = {
+        "meaning": meaning,
+        "unit": unit,
+        "source": source,
+        "choices": tuple(choices) if choices is not None else None,
+        "low": low,
+        "high": high,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def load_preset(name: str | None, stage: str) -> dict[str, Any]:
+    """The differences from the defaults that preset ``name`` asks for in ``stage``.
+
+    Args:
+        name: a preset shipped with the package (``demo``, ``paper``), the path of an own TOML file, or None.
+        stage: the command's name; the TOML table read is ``[stage]``.
+
+    Raises:
+        UserError: unknown preset, unreadable file or not TOML.
+    """
+    if name is None:
+        return {}
+    folder = resources.files("hypogoal") / "presets"
+    known = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    if name.endswith(".toml"):
+        path = Path(name)
+        if not path.is_file():
+            raise UserError("no such preset file", path, f"Presets that come with hypogoal: {', '.join(known)}.")
+        text = path.read_text(encoding="utf-8")
+    elif name in known:
+        text = (folder / f"{name}.toml").read_text(encoding="utf-8")
+    else:
+        raise UserError("unknown preset", name, f"Choose one of {', '.join(known)}, or give a .toml file.")
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"the preset is not valid TOML ({error})", name, "Mend the file.") from None
+    values = table.get(stage, {})
+    if not isinstance(values, dict):
+        raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
+    return values
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
+    """``["steps=300", ...]`` -> ``{"steps": "300", ...}``."""
+    values = {}
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals or not key.strip():
+            raise UserError("--set needs key=value", repr(assignment), "For example --set steps=300.")
+        values[key.strip().replace("-", "_")] = value.strip()
+    return values
+
+
+def resolve(
+    config_class: type[T],
+    *,
+    stage: str,
+    preset: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    assignments: Iterable[str] = (),
+) -> T:
+    """The configuration of a stage from its preset, its options and its ``--set`` pairs.
+
+    Args:
+        config_class: frozen dataclass of :func:`setting` fields.
+        stage: the command's name, for presets and messages.
+        preset: see :func:`load_preset`.
+        options: command-line options; those that are None were not given.
+        assignments: ``key=value`` texts.
+
+    Raises:
+        UserError: unknown key, wrong type, or a value out of range.
+    """
+    values: dict[str, Any] = dict(load_preset(preset, stage))
+    values.update({key: value for key, value in (options or {}).items() if value is not None})
+    values.update(parse_assignments(assignments))
+    return from_values(config_class, values, stage)
+
+
+def from_values(config_class: type[T], values: Mapping[str, Any], stage: str) -> T:
+    """Build ``config_class`` from plain values (text, TOML or JSON), checking each of them."""
+    fields = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
+    kinds = typing.get_type_hints(config_class)
+    checked: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, n=1)
+            hint = f"Did you mean {near[0]!r}? " if near else ""
+            raise UserError(f"{stage} has no setting", key, f"{hint}See 'hypogoal config {stage}'.")
+        checked[key] = _checked(fields[key], kinds[key], value, stage)
+    return config_class(**checked)
+
+
+def as_dict(config: Any) -> dict[str, Any]:
+    """The configuration as JSON-ready values."""
+    return {
+        field.name: list(value) if isinstance(value := getattr(config, field.name), tuple) else value
+        for field in dataclasses.fields(config)
+    }
+
+
+def describe(config_class: type) -> list[dict[str, Any]]:
+    """Every setting with default, type, unit, meaning, source and allowed values."""
+    kinds = typing.get_type_hints(config_class)
+    rows = []
+    for field in dataclasses.fields(config_class):
+        kind = kinds[field.name]
+        row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": field.default}
+        rows.append(row | {key: field.metadata.get(key) for key in ("unit", "meaning", "source")})
+        rows[-1]["allowed"] = _allowed(field.metadata)
+    return rows
+
+
+def _allowed(meta: Mapping[str, Any]) -> str:
+    if meta.get("choices"):
+        return "|".join(str(choice) for choice in meta["choices"])
+    low, high = meta.get("low"), meta.get("high")
+    if low is None and high is None:
+        return ""
+    return f"{'' if low is None else low} .. {'' if high is None else high}".strip()
+
+
+def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -> Any:
+    where = f"{field.name}={value!r} in {stage}"
+    try:
+        parsed = _parse(kind, value)
+    except (TypeError, ValueError, KeyError, OverflowError):
+        name = "true or false" if kind is bool else getattr(kind, "__name__", str(kind))
+        raise UserError("wrong kind of value", where, f"It must be {name}.") from None
+    meta = field.metadata
+    for item in parsed if isinstance(parsed, tuple) else (parsed,):
+        if isinstance(item, float) and not math.isfinite(item):
+            raise UserError("value is not finite", where, "Give a finite number.")
+        if meta.get("choices") and item not in meta["choices"]:
+            raise UserError("value not allowed", where, f"Choose one of {_allowed(meta).replace('|', ', ')}.")
+        for bound, outside in (("low", lambda a, b: a < b), ("high", lambda a, b: a > b)):
+            if meta.get(bound) is not None and outside(item, meta[bound]):
+                raise UserError("value out of range", where, f"Allowed: {_allowed(meta)}.")
+    return parsed
+
+
+def _parse(kind: Any, value: Any) -> Any:
+    if typing.get_origin(kind) is tuple:
+        (item_kind, *_rest) = typing.get_args(kind)
+        items = value.split(",") if isinstance(value, str) else value
+        return tuple(_parse(item_kind, item.strip() if isinstance(item, str) else item) for item in items if item != "")
+    if kind is bool:
+        if isinstance(value, bool):
+            return value
+        return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[str(value).lower()]
+    if kind is int:
+        if isinstance(value, bool):
+            raise TypeError
+        if isinstance(value, str):
+            value = value.replace("_", "")
+        number = float(value)
+        if number != int(number):
+            raise ValueError
+        return int(value) if isinstance(value, (int, str)) and str(value).lstrip("+-").isdigit() else int(number)
+    if kind is float:
+        if isinstance(value, bool):
+            raise TypeError
+        return float(value)
+    if kind is str:
+        if not isinstance(value, str):
+            raise TypeError
+        return value
+    raise TypeError(f"unsupported setting type {kind}")

@@ -1,0 +1,22 @@
+"""Errors that a user reads: one line saying what, where and what to do next (Spec G2, G3)."""
+
+from __future__ import annotations
+
+
+class UserError(Exception):
+    """A mistake the user can mend. The command line prints it as one line and exits with code 2.
+
+    Args:
+        what: what is wrong, as a sentence without a full stop.
+        where: the file, key or value that is wrong.
+        do: what to do next.
+    """
+
+    def __init__(self, what: str, where: object = None, do: str = ""):
+        self.what, self.where, self.do = what, where, do
+        line = what if where is None else f"{what}: {where}"
+        super().__init__(" ".join((f"{line}. {do}" if do else line).split()))
+
+
+class NumericalError(Exception):
+    """NaN or Inf where a number was needed (Spec G3): names the member and the step; nothing was overwritten."""

@@ -1,0 +1,92 @@
+"""Progress on stderr: a rich bar with rate and time left in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+PLAIN_INTERVAL_SECONDS = 10.0
+
+
+class Progress:
+    """``with Progress("train-meta", total=300_000) as progress: progress.advance(32, success=0.5)``."""
+
+    def __init__(self, title: str, total: int, quiet: bool = False):
+        self.title, self.total, self.quiet = title, total, quiet
+        self.done = 0
+        self._start = self._last = time.monotonic()
+        self._bar: Any = None
+        self._task: Any = None
+
+    def __enter__(self) -> Progress:
+        if not self.quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as Bar
+
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=16),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[numbers]}"),
+                TimeRemainingColumn(),
+            )
+            self._bar = Bar(*columns, console=Console(stderr=True))
+            self._bar.start()
+            self._task = self._bar.add_task(self.title, total=self.total, numbers="")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        elif not self.quiet and kind is None:
+            self._line("done")
+
+    def advance(self, n: int = 1, **numbers: float) -> None:
+        """``n`` more units are done; ``numbers`` are shown beside the bar."""
+        self.update(self.done + n, **numbers)
+
+    def update(self, done: int, **numbers: float) -> None:
+        """``done`` units are done in all."""
+        self.done = done
+        if self.quiet:
+            return
+        text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items())
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, numbers=text)
+        elif time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
+            self._line(text)
+
+    def _line(self, text: str) -> None:
+        self._last = time.monotonic()
+        seconds = max(self._last - self._start, 1e-9)
+        rate = self.done / seconds
+        left = (self.total - self.done) / rate if rate > 0 else 0.0
+        tail = f", {text}" if text else ""
+        print(
+            f"{self.title}: {self.done}/{self.total} ({rate:.0f}/s, {left:.0f} s left){tail}",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+class MetricsLog:
+    """``metrics.jsonl``: one JSON object a line, flushed as it is written."""
+
+    def __init__(self, path: Path):
+        self._file: TextIO = path.open("a", encoding="utf-8")
+
+    def write(self, **numbers: Any) -> None:
+        """Append one line."""
+        self._file.write(json.dumps(numbers) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file; further writes fail."""
+        self._file.close()

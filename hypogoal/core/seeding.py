@@ -1,0 +1,35 @@
+"""Randomness is passed in: every consumer gets its own stream, named after what it is for."""
+
+from __future__ import annotations
+
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+
+def _sequence(seed: int, names: tuple[str | int, ...]) -> np.random.SeedSequence:
+    keys = [zlib.crc32(name.encode()) if isinstance(name, str) else int(name) for name in names]
+    return np.random.SeedSequence([int(seed), *keys])
+
+
+def seed_for(seed: int, *names: str | int) -> int:
+    """A 63-bit seed for the stream called ``names`` of run ``seed``."""
+    return int(_sequence(seed, names).generate_state(1, np.uint64)[0] >> 1)
+
+
+def rng_for(seed: int, *names: str | int) -> np.random.Generator:
+    """A NumPy generator for the stream called ``names`` of run ``seed``."""
+    return np.random.default_rng(_sequence(seed, names))
+
+
+def torch_generator(seed: int, *names: str | int) -> torch.Generator:
+    """A torch CPU generator for the stream called ``names`` of run ``seed``."""
+    import torch
+
+    generator = torch.Generator()
+    generator.manual_seed(seed_for(seed, *names))
+    return generator

@@ -1,0 +1,215 @@
+"""DoorKey with three keys (Spec B1-B3): the domain as the stages see it, and how its states are collected.
+
+The parts: ``doorkey_env`` (the Gymnasium environment and the sub-goals), ``doorkey_states`` (states and rules
+of one layout), ``doorkey_engine`` (many environments, fast), ``doorkey_registration`` (the Gymnasium id).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import Collected, States
+from hypogoal.domains.doorkey_engine import DoorKeyEngine, SingleDoorKey, draw
+from hypogoal.domains.doorkey_env import (
+    DOOR_LABELS,
+    MAX_STEPS,
+    OBSERVATION_SHAPE,
+    SUB_GOALS,
+    DoorKeyEnv,
+    DoorKeyGrid,
+    Layout,
+    layout_of,
+)
+from hypogoal.domains.doorkey_registration import ENV_ID, register
+from hypogoal.domains.doorkey_states import DoorKeyStates
+
+__all__ = [
+    "DOMAIN",
+    "ENV_ID",
+    "SUB_GOALS",
+    "DoorKeyConfig",
+    "DoorKeyEngine",
+    "DoorKeyEnv",
+    "DoorKeyGrid",
+    "SingleDoorKey",
+    "collect",
+    "register",
+]
+
+register()
+
+
+@dataclass(frozen=True)
+class DoorKeyConfig:
+    """What ``hypogoal collect doorkey`` can be told."""
+
+    regime: str = setting(
+        "fixed",
+        "labelled states: 'fixed', the layout as it lies; 'shuffled', keys re-drawn within its walls",
+        source="Spec B3",
+        choices=("fixed", "shuffled"),
+    )
+    draws: int = setting(20, "key placements of the regime 'shuffled'", source="own choice", low=1, high=1000)
+    labelled_seed: int = setting(
+        0, "layout seed of the labelled states", source="paper, MiniGrid experiment", low=0
+    )
+    unlabelled_seeds: tuple[int, ...] = setting(
+        (1, 2), "layout seeds of the unlabelled states", source="paper, MiniGrid experiment", low=0
+    )
+    heldout_first: int = setting(
+        1000,
+        "first held-out layout seed; seeds whose grid is a training layout's or came before are passed over",
+        low=0,
+    )
+    heldout_layouts: int = setting(20, "held-out layouts", source="Spec B3", low=1, high=500)
+    door_label: str = setting(
+        "open",
+        "open-red-door holds when the door is 'open', or when the agent is also 'in-front', facing it",
+        source="Spec B2",
+        choices=DOOR_LABELS,
+    )
+    keyring: bool = setting(True, "several keys can be held", source="Spec B1")
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """All states of one layout that an expert can bring about (``ids`` in ``states``), and its origin."""
+
+    layout_seed: int
+    draw: int
+    states: DoorKeyStates
+    ids: NDArray[np.int64]
+
+
+def collect(config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
+    """Spec B3: labelled, unlabelled and held-out states, each with its origin.
+
+    The scripted expert is an exhaustive sweep: every position and direction at every stage of the task (which
+    keys are held; door locked, open, closed again) that can be reached without dropping a key, each image
+    once, found by breadth-first search. In the regime ``shuffled`` as many states as the layout has as it
+    lies are kept, at random.
+
+    Args:
+        config: see ``DoorKeyConfig``.
+        seed: of the key placements and of the choice among their states; ``fixed`` does not depend on it.
+        progress: its ``advance()`` is called after each layout.
+
+    Returns:
+        Labels of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each:
+        layout_seed, draw (0: keys as the seed has them), agent_x, agent_y, direction, door_state (0 open,
+        1 closed, 2 locked), keys_held (bit 0 blue, 1 green, 2 red).
+
+    Raises:
+        UserError: the labelled states have one class only of some sub-goal, or too many draws are asked for.
+    """
+    sources = _labelled_layouts(config, seed)
+    training = [(layout_seed, 0, layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]
+    heldout = _heldout_layouts(config, avoid=[layout for _, _, layout in [*sources, *training]])
+    swept = [
+        [_sweep(config, *source, progress) for source in group] for group in (sources, training, heldout)
+    ]
+    keep = None
+    if config.regime == "shuffled":
+        amount = len(DoorKeyStates(layout_of(config.labelled_seed), config.keyring).reachable())
+        total = sum(len(sweep.ids) for sweep in swept[0])
+        rng = rng_for(seed, "doorkey", "shuffled-states")
+        keep = np.sort(rng.choice(total, min(amount, total), replace=False))
+    labelled, unlabelled, test = _states_of(swept[0], keep), _states_of(swept[1]), _states_of(swept[2])
+    for index, sub_goal in enumerate(SUB_GOALS):
+        if len(np.unique(labelled.labels[:, index])) < 2:
+            raise UserError(
+                f"the labelled states have no two classes of {sub_goal}",
+                f"labelled_seed={config.labelled_seed}, keyring={config.keyring}",
+                "Choose another labelled_seed, or keyring=true.",
+            )
+    return Collected(OBSERVATION_SHAPE, SUB_GOALS, labelled, unlabelled, test)
+
+
+def _labelled_layouts(config: DoorKeyConfig, seed: int) -> list[tuple[int, int, Layout]]:
+    layout = layout_of(config.labelled_seed)
+    if config.regime == "fixed":
+        return [(config.labelled_seed, 0, layout)]
+    placements = list(itertools.permutations(layout.key_cells(), 3))
+    if len(placements) < config.draws:
+        raise UserError(
+            f"the layout has only {len(placements)} key placements", f"draws={config.draws}", "Ask for fewer."
+        )
+    chosen = rng_for(seed, "doorkey", "key-placements").choice(len(placements), config.draws, replace=False)
+    return [
+        (config.labelled_seed, number, replace(layout, keys=placements[index]))
+        for number, index in enumerate(chosen.tolist(), start=1)
+    ]
+
+
+def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[Layout]) -> list[tuple[int, int, Layout]]:
+    """The first layouts from ``heldout_first`` on whose grid no other layout has."""
+    grids = {layout.grid for layout in [*avoid, layout_of(config.labelled_seed)]}
+    chosen: list[tuple[int, int, Layout]] = []
+    for layout_seed in itertools.count(config.heldout_first):
+        if len(chosen) == config.heldout_layouts:
+            break
+        layout = layout_of(layout_seed)
+        if layout.grid not in grids:
+            grids.add(layout.grid)
+            chosen.append((layout_seed, 0, layout))
+    return chosen
+
+
+def _sweep(config: DoorKeyConfig, layout_seed: int, number: int, layout: Layout, progress: Any) -> _Sweep:
+    states = DoorKeyStates(layout, config.keyring, config.door_label)
+    sweep = _Sweep(layout_seed, number, states, states.reachable())
+    progress.advance()
+    return sweep
+
+
+def _states_of(sweeps: Sequence[_Sweep], keep: NDArray[np.int64] | None = None) -> States:
+    """Images, labels and origins of the swept states; only of those numbered ``keep``, through all."""
+    images, labels, origins = [], [], []
+    begin = 0
+    for sweep in sweeps:
+        ids = sweep.ids
+        if keep is not None:
+            ids = ids[keep[(keep >= begin) & (keep < begin + len(ids))] - begin]
+        begin += len(sweep.ids)
+        images.append(draw(sweep.states.codes(ids)))
+        labels.append(sweep.states.labels(ids))
+        whence = {"layout_seed": np.full(len(ids), sweep.layout_seed), "draw": np.full(len(ids), sweep.draw)}
+        origins.append(whence | sweep.states.origins(ids))
+    joined = {name: np.concatenate([origin[name] for origin in origins]) for name in origins[0]}
+    return States(np.concatenate(images), np.concatenate(labels), joined)
+
+
+class DoorKeyDomain:
+    """Spec B6: three-key DoorKey behind the interface of ``hypogoal.domains.base.Domain``."""
+
+    name = "doorkey"
+    sub_goals: tuple[str, ...] = SUB_GOALS
+    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    config_class = DoorKeyConfig
+    env_id = ENV_ID
+
+    def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
+        """See ``collect``."""
+        return collect(config, seed, progress)
+
+    def make_engine(
+        self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, **arguments: Any
+    ) -> DoorKeyEngine:
+        """An engine of ``count`` environments of one layout; ``arguments``: ``keyring``, ``door_label``."""
+        return DoorKeyEngine(layout_seed, count, max_steps=max_steps, **arguments)
+
+    def label(self, env: Any) -> NDArray[np.bool_]:
+        """The true sub-goal predicates of a Gymnasium DoorKey's current state, bool (5,)."""
+        return env.unwrapped.labels()
+
+
+DOMAIN = DoorKeyDomain()

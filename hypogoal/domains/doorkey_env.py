@@ -1,0 +1,247 @@
+"""Spec B1, B2: three-key DoorKey on minigrid's own classes, its five sub-goals, and what a layout is.
+
+This is the reference: the fast engine (``doorkey_engine.py``) is tested to be pixel- and step-exact with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from minigrid.core.grid import Grid
+from minigrid.core.mission import MissionSpace
+from minigrid.core.world_object import Door, Goal, Key, Wall
+from minigrid.minigrid_env import MiniGridEnv
+from numpy.typing import NDArray
+
+SIZE = 8  # cells a side
+TILE = 8  # pixels a cell
+OBSERVATION_SHAPE = (SIZE * TILE, SIZE * TILE, 3)
+MAX_STEPS = 500
+DOOR_COLOUR = "red"
+KEY_COLOURS = ("blue", "green", "red")  # in the order of the first three sub-goals
+PLACING_ORDER = ("red", "green", "blue")  # the matching key first, as in the authors' fork
+SUB_GOALS = ("collect-blue-key", "collect-green-key", "collect-red-key", "open-red-door", "go-to-goal")
+DOOR_LABELS = ("open", "in-front")
+MISSION = "use the red key to open the door and then get to the goal"
+
+
+def sub_goals_reached(
+    held: NDArray[np.bool_],
+    door_open: NDArray[np.bool_],
+    facing_door: NDArray[np.bool_],
+    on_goal: NDArray[np.bool_],
+    door_label: str = "open",
+) -> NDArray[np.bool_]:
+    """Spec B2: the five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
+
+    Args:
+        held: bool (..., 3), the blue, the green and the red key is held.
+        door_open: bool (...,), the red door is open.
+        facing_door: bool (...,), the agent stands next to the door's cell and looks at it.
+        on_goal: bool (...,), the agent is on the goal cell.
+        door_label: what ``open-red-door`` means: ``open`` (wherever the agent stands) or ``in-front``.
+
+    Source: the paper's text (``in-front``), its authors' check (``open``).
+    """
+    opened = door_open if door_label == "open" else door_open & facing_door
+    return np.concatenate([held, np.stack([opened, on_goal], axis=-1)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x.
+
+    Attributes:
+        walls: the cells of walls (the door's cell is not among them).
+        door, goal: their cells.
+        start, direction: where the agent begins (0 right, 1 down, 2 left, 3 up).
+        keys: the cells of the blue, the green and the red key.
+    """
+
+    walls: frozenset[int]
+    door: int
+    goal: int
+    start: int
+    direction: int
+    keys: tuple[int, int, int]
+
+    @property
+    def grid(self) -> tuple[frozenset[int], int, int, tuple[int, int, int]]:
+        """All but the agent: two layouts of the same grid have the same states, whatever their seeds."""
+        return self.walls, self.door, self.goal, self.keys
+
+    def key_cells(self) -> list[int]:
+        """The cells where a key can lie at the start: the agent's room without the agent's own cell."""
+        rows = [cell for cell in range(SIZE * SIZE) if cell % SIZE < self.door % SIZE]
+        return [cell for cell in rows if cell not in self.walls and cell != self.start]
+
+
+class _RingDoor(Door):
+    """MiniGrid's door, opened by any held key of its colour instead of only the one in the hand."""
+
+    def toggle(self, env: Any, pos: tuple[int, int]) -> bool:
+        """Unlock and open with a held key; an unlocked door opens and closes and never locks again."""
+        if self.is_locked:
+            if self.color not in env.held:
+                return False
+            self.is_locked = False
+        self.is_open = not self.is_open
+        return True
+
+
+class DoorKeyGrid(MiniGridEnv):
+    """Three-key DoorKey with MiniGrid's own dictionary observations; ``DoorKeyEnv`` gives the image instead.
+
+    Args:
+        keyring: True, pickup puts a key onto a ring and drop takes the last one off (the authors' fork);
+            False, MiniGrid's hands that hold one key.
+        max_steps: steps after which an episode is truncated.
+        layout_seed: the layout of every episode; None, the layout follows from ``reset(seed)``.
+            ``layout_seed=s`` is the layout of ``reset(seed=s)``.
+        door_label: definition of ``open-red-door`` in ``info["labels"]``, see ``sub_goals_reached``.
+    """
+
+    def __init__(
+        self,
+        keyring: bool = True,
+        max_steps: int = MAX_STEPS,
+        layout_seed: int | None = None,
+        door_label: str = "open",
+        render_mode: str | None = None,
+    ):
+        if door_label not in DOOR_LABELS:
+            raise ValueError(f"door_label must be one of {DOOR_LABELS}, not {door_label!r}")
+        self.keyring = keyring
+        self.layout_seed = layout_seed
+        self.door_label = door_label
+        self.ring: list[Key] = []
+        super().__init__(
+            mission_space=MissionSpace(mission_func=self._gen_mission),
+            grid_size=SIZE,
+            max_steps=max_steps,
+            render_mode=render_mode,
+            highlight=False,
+        )
+
+    @staticmethod
+    def _gen_mission() -> str:
+        return MISSION
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Colours of the keys held, the last picked up last."""
+        if self.keyring:
+            return tuple(key.color for key in self.ring)
+        return (self.carrying.color,) if self.carrying is not None else ()
+
+    def _gen_grid(self, width: int, height: int) -> None:
+        episode_rng = self._np_random
+        if self.layout_seed is not None:
+            self._np_random, _ = seeding.np_random(self.layout_seed)
+        self.ring = []
+        self.grid = Grid(width, height)
+        self.grid.wall_rect(0, 0, width, height)
+        self.put_obj(Goal(), width - 2, height - 2)
+        split = self._rand_int(2, width - 2)
+        self.grid.vert_wall(split, 0)
+        self.place_agent(size=(split, height))
+        self.door = _RingDoor(DOOR_COLOUR, is_locked=True)
+        self.put_obj(self.door, split, self._rand_int(1, width - 2))
+        for colour in PLACING_ORDER:
+            self.place_obj(Key(colour), top=(0, 0), size=(split, height))
+        self.mission = MISSION
+        self._np_random = episode_rng
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """A new episode; ``info["labels"]`` has the true sub-goal predicates."""
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info | {"labels": self._named_labels()}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """MiniGrid's step, but for a ring that takes and gives keys; reward 1 at the goal, else 0."""
+        played = action
+        if self.keyring and action in (self.actions.pickup, self.actions.drop):
+            self._use_ring(pick_up=action == self.actions.pickup)
+            played = self.actions.done  # all that is left to MiniGrid is to count the step and to look
+        observation, reward, terminated, truncated, info = super().step(played)
+        return observation, float(reward), terminated, truncated, info | {"labels": self._named_labels()}
+
+    def _use_ring(self, pick_up: bool) -> None:
+        x, y = self._ahead()
+        cell = self.grid.get(x, y)
+        if pick_up and isinstance(cell, Key):
+            self.ring.append(cell)
+            self.grid.set(x, y, None)
+        elif not pick_up and cell is None and self.ring:
+            self.grid.set(x, y, self.ring.pop())
+        hand: Any = self.ring[-1] if self.ring else None
+        self.carrying = hand  # MiniGrid's own view shows it
+
+    def _agent_at(self) -> tuple[int, int]:
+        return int(self.agent_pos[0]), int(self.agent_pos[1])
+
+    def _ahead(self) -> tuple[int, int]:
+        x, y = self.front_pos
+        return int(x), int(y)
+
+    def _reward(self) -> float:
+        return 1.0
+
+    def labels(self) -> NDArray[np.bool_]:
+        """Spec B2: the true predicates of the current state, bool (5,), in the order of ``SUB_GOALS``."""
+        held = np.array([colour in self.held for colour in KEY_COLOURS])
+        facing = self.grid.get(*self._ahead()) is self.door
+        on_goal = isinstance(self.grid.get(*self._agent_at()), Goal)
+        door_open, facing_door, at_goal = np.array([self.door.is_open, facing, on_goal])
+        return sub_goals_reached(held, door_open, facing_door, at_goal, self.door_label)
+
+    def _named_labels(self) -> dict[str, bool]:
+        return dict(zip(SUB_GOALS, self.labels().tolist(), strict=True))
+
+    def layout(self) -> Layout:
+        """The layout of the current episode, read off the grid. Only right after ``reset``."""
+        x, y = self._agent_at()
+        where: dict[Any, int] = {}
+        walls = set()
+        for cell, thing in enumerate(self.grid.grid):
+            if isinstance(thing, Wall):
+                walls.add(cell)
+            elif thing is not None:
+                where[thing.color if isinstance(thing, Key) else type(thing)] = cell
+        return Layout(
+            walls=frozenset(walls),
+            door=where[_RingDoor],
+            goal=where[Goal],
+            start=y * SIZE + x,
+            direction=int(self.agent_dir),
+            keys=(where["blue"], where["green"], where["red"]),
+        )
+
+
+class DoorKeyEnv(DoorKeyGrid):
+    """Spec B1: three-key DoorKey, observed as the full RGB image, uint8 (64, 64, 3), without a view cone.
+
+    Gymnasium id ``hypogoal/DoorKey-8x8-v0``; seven actions: left, right, forward, pickup, drop, toggle, done.
+    Arguments as ``DoorKeyGrid``.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.observation_space = spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
+
+    def gen_obs(self) -> NDArray[np.uint8]:
+        """What MiniGrid's ``RGBImgObsWrapper(tile_size=8)`` draws when the view cone is not tinted."""
+        return self.grid.render(TILE, self._agent_at(), self.agent_dir)
+
+
+def layout_of(layout_seed: int) -> Layout:
+    """The layout of ``DoorKeyEnv(layout_seed=layout_seed)``."""
+    env = DoorKeyGrid(layout_seed=layout_seed)
+    env.reset()
+    return env.layout()

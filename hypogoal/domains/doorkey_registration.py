@@ -1,0 +1,14 @@
+"""The DoorKey environment's Gymnasium id. Light on purpose: minigrid is imported only when one is made."""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register as register_env
+from gymnasium.envs.registration import registry
+
+ENV_ID = "hypogoal/DoorKey-8x8-v0"
+
+
+def register() -> None:
+    """Spec B1: make ``gymnasium.make("hypogoal/DoorKey-8x8-v0")`` work; calling it again does nothing."""
+    if ENV_ID not in registry:
+        register_env(id=ENV_ID, entry_point="hypogoal.domains.doorkey:DoorKeyEnv")

@@ -1,0 +1,276 @@
+"""The states of one DoorKey layout and MiniGrid's rules on them, for many states at once.
+
+A state is a *configuration* (the door and where the three keys are) and a *pose* (the agent's cell and
+direction). Turning and walking change the pose only and are table look-ups in NumPy. Picking up, dropping and
+toggling change the configuration: rare, so worked out in plain Python the first time and remembered. Every
+state met gets an id.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+from minigrid.core.actions import Actions
+from minigrid.core.grid import Grid
+from minigrid.core.world_object import Door, Goal, Key, Wall
+from numpy.typing import NDArray
+
+from hypogoal.domains.doorkey_env import DOOR_COLOUR, KEY_COLOURS, SIZE, TILE, Layout, sub_goals_reached
+
+N_ACTIONS = len(Actions)
+LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = (int(action) for action in Actions)
+CELLS = SIZE * SIZE
+POSES = CELLS * 4  # pose = cell * 4 + direction
+HELD = CELLS  # a key's place: its cell, or HELD + rank on the ring (rank 0 was picked up first)
+OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers
+START = 0  # the id of the start state
+UNKNOWN = -1
+
+# One byte says what is drawn in a cell.
+EMPTY, WALL, GOAL = 0, 1, 2
+KEY = 3  # plus 0, 1, 2: blue, green, red
+DOOR = 6  # plus OPEN, CLOSED, LOCKED
+AGENT = 9  # plus the direction; plus 0, 4, 8: on the floor, in the open door, on the goal
+N_CODES = AGENT + 12
+AGENT_ON = np.zeros(N_CODES, np.uint8)
+AGENT_ON[[EMPTY, DOOR + OPEN, GOAL]] = AGENT, AGENT + 4, AGENT + 8  # plus the direction
+
+# MiniGrid's rules as tables. They are read flat: one index into a table is several times faster than two.
+_POSE = np.arange(POSES)
+# AHEAD: the cell in front of each pose. MOVES: the pose after each action.
+AHEAD = np.clip((_POSE >> 2) + np.array((1, SIZE, -1, -SIZE))[_POSE & 3], 0, CELLS - 1)
+MOVES = np.tile(_POSE, (N_ACTIONS, 1))
+MOVES[LEFT] = (_POSE & ~3) | ((_POSE - 1) & 3)
+MOVES[RIGHT] = (_POSE & ~3) | ((_POSE + 1) & 3)
+MOVES[FORWARD] = AHEAD * 4 + (_POSE & 3)
+# Given the action and the code ahead: which row of MOVES applies, and may the configuration change?
+MOVE_AS = np.full((N_ACTIONS, N_CODES), DONE)
+MOVE_AS[LEFT], MOVE_AS[RIGHT] = LEFT, RIGHT
+MOVE_AS[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = FORWARD
+MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), np.bool_)
+MAY_CHANGE[PICKUP, KEY : KEY + 3] = MAY_CHANGE[DROP, EMPTY] = MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
+
+Configuration = tuple[int, int, int, int]  # the door; the places of the blue, the green and the red key
+
+
+@cache
+def tiles() -> NDArray[np.uint8]:
+    """MiniGrid's drawing of each cell code, uint8 (N_CODES, 8, 8, 3)."""
+    things: list[Any] = [None, Wall(), Goal(), *(Key(colour) for colour in KEY_COLOURS)]
+    things += [
+        Door(DOOR_COLOUR, is_open=state == OPEN, is_locked=state == LOCKED)
+        for state in (OPEN, CLOSED, LOCKED)
+    ]
+    drawn = [Grid.render_tile(thing, tile_size=TILE) for thing in things]
+    for under in (None, things[DOOR + OPEN], things[GOAL]):
+        drawn += [Grid.render_tile(under, agent_dir=direction, tile_size=TILE) for direction in range(4)]
+    table = np.stack(drawn).astype(np.uint8)  # render_tile returns float64
+    table.flags.writeable = False
+    return table
+
+
+class DoorKeyStates:
+    """The states of one layout met so far; ids are stable, and START is the id of the start state.
+
+    Args:
+        layout: walls, door, goal, keys and the agent's start.
+        keyring: see ``DoorKeyGrid``.
+        door_label: definition of ``open-red-door``, see ``sub_goals_reached``.
+
+    Attributes:
+        n_states: ids met so far are 0 .. n_states - 1.
+        rows: what each configuration shows without the agent, as 64 cell codes.
+    """
+
+    def __init__(self, layout: Layout, keyring: bool = True, door_label: str = "open"):
+        self.layout, self.keyring, self.door_label = layout, keyring, door_label
+        self.n_states = 0
+        self.rows: list[bytes] = []
+        self._configurations: list[Configuration] = []
+        self._index: dict[Configuration, int] = {}
+        self._changes: dict[int, int] = {}
+        self._codes = np.zeros((16, CELLS), np.uint8)
+        self._places = np.zeros((16, 4), np.uint8)
+        self._id_at = np.full((16, POSES), UNKNOWN, np.int64)  # the id of (configuration, pose)
+        self._configuration_of = np.zeros(256, np.int64)
+        self._pose_of = np.zeros(256, np.int64)
+        start = layout.start * 4 + layout.direction
+        self._new_id(self._index_of((LOCKED, *layout.keys)) * POSES + start)
+
+    @property
+    def n_changes(self) -> int:
+        """How many changes of a configuration have been worked out and remembered."""
+        return len(self._changes)
+
+    def step(self, ids: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """MiniGrid's rules: the states that follow, int64 (n,), on actions int (n,) of 0 .. 6."""
+        configuration, pose = self._configuration_of.take(ids), self._pose_of.take(ids)
+        front = AHEAD.take(pose)
+        ahead = self._codes.ravel().take(configuration * CELLS + front)
+        case = np.asarray(actions, np.int64) * N_CODES + ahead
+        for index in np.flatnonzero(MAY_CHANGE.take(case)).tolist():
+            here = configuration.item(index)
+            configuration[index] = self.change(here, front.item(index), int(actions[index]))
+        site = configuration * POSES + MOVES.take(MOVE_AS.take(case) * POSES + pose)
+        following = self._id_at.ravel().take(site)
+        for index in np.flatnonzero(following < 0).tolist():
+            following[index] = self._new_id(site.item(index))
+        return following
+
+    def change(self, configuration: int, front: int, action: int) -> int:
+        """The configuration after ``pickup``, ``drop`` or ``toggle`` on cell ``front``; may be the same."""
+        key = (configuration * CELLS + front) * N_ACTIONS + action
+        known = self._changes.get(key)
+        if known is None:
+            known = self._changes[key] = self._index_of(
+                self._after(self._configurations[configuration], front, action)
+            )
+        return known
+
+    def _after(self, configuration: Configuration, front: int, action: int) -> Configuration:
+        door, *keys = configuration
+        held = sum(place >= HELD for place in keys)
+        if action == PICKUP and front in keys and (self.keyring or not held):
+            keys[keys.index(front)] = HELD + held
+        elif action == DROP and held and self.rows[self._index[configuration]][front] == EMPTY:
+            keys[keys.index(max(keys))] = front
+        elif action == TOGGLE and front == self.layout.door and (door != LOCKED or keys[-1] >= HELD):
+            door = CLOSED if door == OPEN else OPEN  # once unlocked it never locks again
+        return door, keys[0], keys[1], keys[2]
+
+    def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """What each cell shows, uint8 (n, 64) row by row: with ``tiles()`` it says the whole image."""
+        codes = self._codes.take(self._configuration_of.take(ids), axis=0)
+        pose = self._pose_of.take(ids)
+        agent = np.arange(len(codes)) * CELLS + (pose >> 2)
+        codes.ravel()[agent] = AGENT_ON.take(codes.ravel().take(agent)) + (pose & 3)
+        return codes
+
+    def at_goal(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the agent is on the goal, bool (n,)."""
+        return self._pose_of.take(ids) >> 2 == self.layout.goal
+
+    def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Spec B2: true sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
+        configuration, pose = self._configuration_of[ids], self._pose_of[ids]
+        door, keys = self._places[configuration, 0], self._places[configuration, 1:]
+        facing = AHEAD[pose] == self.layout.door
+        return sub_goals_reached(keys >= HELD, door == OPEN, facing, self.at_goal(ids), self.door_label)
+
+    def origins(self, ids: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+        """Where each state is: agent_x, agent_y, direction, door_state, keys_held; int64 (n,) each.
+
+        ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked); ``keys_held`` has bit 0 for the blue, 1 for
+        the green, 2 for the red key.
+        """
+        configuration, pose = self._configuration_of[ids], self._pose_of[ids]
+        held = self._places[configuration, 1:] >= HELD
+        return {
+            "agent_x": (pose >> 2) % SIZE,
+            "agent_y": (pose >> 2) // SIZE,
+            "direction": pose & 3,
+            "door_state": self._places[configuration, 0].astype(np.int64),
+            "keys_held": held @ np.array([1, 2, 4]),
+        }
+
+    def distances(self, drop: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Breadth-first search: ids of all states reachable from the start, nearest first, and steps to each.
+
+        States on the goal are included and not gone beyond. Without ``drop`` they are a few thousand; with it
+        some ten million.
+        """
+        actions = np.array([action for action in range(N_ACTIONS) if drop or action != DROP])
+        found, depth = [np.array([START])], 0
+        seen = np.ones(1, np.bool_)
+        steps = [np.zeros(1, np.int64)]
+        while len(found[-1]):
+            origin = found[-1][~self.at_goal(found[-1])]
+            following = np.unique(self.step(np.repeat(origin, len(actions)), np.tile(actions, len(origin))))
+            seen = np.concatenate([seen, np.zeros(self.n_states - len(seen), np.bool_)])
+            new = following[~seen[following]]
+            seen[new] = True
+            depth += 1
+            found.append(new)
+            steps.append(np.full(len(new), depth))
+        return np.concatenate(found), np.concatenate(steps)
+
+    def reachable(self, drop: bool = False) -> NDArray[np.int64]:
+        """Ids of all states reachable from the start, nearest first, one for each image.
+
+        States that differ only in the order of the keys on the ring look the same; the first one found stands
+        for them all.
+        """
+        ids, _ = self.distances(drop)
+        images = self.codes(ids).view(f"V{CELLS}")[:, 0]
+        _, first = np.unique(images, return_index=True)
+        return ids[np.sort(first)]
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """All ids given so far, as arrays: ``restore`` on fresh states of the layout gives the same ids."""
+        known = slice(self.n_states)
+        return {
+            "configurations": np.array(self._configurations, np.uint8),
+            "configuration_of": self._configuration_of[known].copy(),
+            "pose_of": self._pose_of[known].copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a ``snapshot`` of the same layout.
+
+        Raises:
+            ValueError: states were met already, or the snapshot is of another layout.
+        """
+        first = [tuple(configuration) for configuration in snapshot["configurations"][:1].tolist()]
+        if self.n_states != 1 or first != self._configurations or snapshot["pose_of"][0] != self._pose_of[0]:
+            raise ValueError("a snapshot is restored onto the fresh states of its own layout")
+        for door, *keys in snapshot["configurations"].tolist():
+            self._index_of((door, keys[0], keys[1], keys[2]))
+        for site in (snapshot["configuration_of"] * POSES + snapshot["pose_of"]).tolist():
+            self._new_id(site)
+
+    def _new_id(self, site: int) -> int:
+        known = self._id_at.item(site)
+        if known != UNKNOWN:  # met twice in one vector step
+            return known
+        if self.n_states == len(self._pose_of):
+            self._configuration_of = _doubled(self._configuration_of)
+            self._pose_of = _doubled(self._pose_of)
+        new = self.n_states
+        self._configuration_of[new], self._pose_of[new] = divmod(site, POSES)
+        self._id_at[divmod(site, POSES)] = new
+        self.n_states += 1
+        return new
+
+    def _index_of(self, configuration: Configuration) -> int:
+        known = self._index.get(configuration)
+        if known is not None:
+            return known
+        new = len(self._configurations)
+        if new == len(self._codes):
+            self._codes, self._places, self._id_at = (
+                _doubled(self._codes),
+                _doubled(self._places),
+                _doubled(self._id_at, UNKNOWN),
+            )
+        row = bytearray(CELLS)
+        for cell in self.layout.walls:
+            row[cell] = WALL
+        row[self.layout.goal] = GOAL
+        row[self.layout.door] = DOOR + configuration[0]
+        for colour, place in enumerate(configuration[1:]):
+            if place < HELD:
+                row[place] = KEY + colour
+        self._index[configuration] = new
+        self._configurations.append(configuration)
+        self.rows.append(bytes(row))
+        self._codes[new] = np.frombuffer(row, np.uint8)
+        self._places[new] = configuration
+        return new
+
+
+def _doubled(table: NDArray[Any], filling: int = 0) -> NDArray[Any]:
+    """The table with as many rows again, of ``filling``."""
+    return np.concatenate([table, np.full_like(table, filling)])

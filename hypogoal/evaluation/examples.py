@@ -1,0 +1,51 @@
+"""Held-out states worth looking at, and the overlay of the states in which an option stopped."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def pick_examples(
+    probabilities: NDArray[np.float32], labels: NDArray[np.bool_], per_kind: int = 2, threshold: float = 0.5
+) -> list[tuple[int, str]]:
+    """States on which members disagree, all err, or all are right, so that a reader sees each.
+
+    Args:
+        probabilities: float (N, K), every member's P(sub-goal reached).
+        labels: bool (N,).
+        per_kind: states of each kind at most.
+        threshold: above which a member says yes.
+
+    Returns:
+        (index, kind) with kind ``disagree`` (the widest spread of probabilities first, true and false states in
+        turn), ``wrong`` (the most sure errors first), ``right yes`` and ``right no``; fewer where there are none.
+    """
+    verdicts = probabilities > threshold
+    correct = verdicts == labels[:, None]
+    spread = probabilities.max(1) - probabilities.min(1)
+    disagree = ~(verdicts.all(1) | (~verdicts).all(1))
+    wrong = ~correct.any(1)
+    error = np.abs(probabilities - labels[:, None]).min(1)
+    right = correct.all(1)
+    half = -(-per_kind // 2)
+    picked = [
+        *_first(disagree & labels, -spread, half, "disagree"),
+        *_first(disagree & ~labels, -spread, per_kind - half, "disagree"),
+        *_first(wrong & labels, -error, half, "wrong"),
+        *_first(wrong & ~labels, -error, per_kind - half, "wrong"),
+        *_first(right & labels, error, 1, "right yes"),
+        *_first(right & ~labels, error, 1, "right no"),
+    ]
+    return [(int(index), kind) for index, kind in picked]
+
+
+def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], count: int, kind: str) -> list[tuple[int, str]]:
+    candidates = np.flatnonzero(mask)
+    ranked = candidates[np.argsort(order[candidates], kind="stable")]
+    return [(int(index), kind) for index in ranked[:count]]
+
+
+def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Figures 7 and 8: the mean image of states uint8 (n, H, W, C), n at least 1: what they share stays sharp."""
+    return states.astype(np.float32).mean(axis=0).round().astype(np.uint8)

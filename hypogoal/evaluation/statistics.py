@@ -1,0 +1,92 @@
+"""Numbers over runs (Spec F5): mean and standard error, and the interquartile mean with a bootstrap interval."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import bootstrap, trim_mean
+
+RESAMPLES = 2_000
+CONFIDENCE = 0.95
+
+
+def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Spec F5: mean and standard error of the mean (n - 1 in the variance) of (n,); the error of one value is NaN."""
+    if len(values) == 0:
+        return float("nan"), float("nan")
+    error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
+    return float(values.mean()), error
+
+
+def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> Any:
+    """Spec F5: the mean of the middle half (a quarter of the values, rounded down, is cut off at either end)."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def bootstrap_interval(
+    values: NDArray[np.float64], strata: Sequence[Hashable], rng: np.random.Generator
+) -> tuple[float, float, str]:
+    """Spec F5: 95 % percentile bootstrap interval of the interquartile mean.
+
+    Runs are drawn again within their stratum (a layout), so the interval speaks of these layouts with other seeds.
+    Where a layout has a single run there is nothing to draw within it: then runs are drawn from all of them, and the
+    interval speaks of other layouts too.
+
+    Args:
+        values: float (n,), one per run.
+        strata: n hashable marks.
+        rng: draws the resamples.
+
+    Returns:
+        Lower and upper bound, NaN for fewer than two runs, and over what was resampled.
+    """
+    if len(values) < 2:
+        return float("nan"), float("nan"), "one run: no interval"
+    marks = sorted(set(strata), key=str)
+    groups = [values[[mark == own for own in strata]] for mark in marks]
+    if min(len(group) for group in groups) < 2:
+        groups, over = [values], "runs"
+    else:
+        over = "runs within layouts" if len(groups) > 1 else "runs"
+    if np.ptp(values) == 0:
+        return float(values[0]), float(values[0]), over
+
+    def statistic(*resampled: NDArray[np.float64], axis: int = -1) -> Any:
+        return interquartile_mean(np.concatenate(resampled, axis=axis), axis=axis)
+
+    found = bootstrap(
+        groups,
+        statistic,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        vectorized=True,
+        rng=rng,
+    ).confidence_interval
+    return float(found.low), float(found.high), over
+
+
+def aggregate(
+    values: Sequence[float], strata: Sequence[Hashable], unit: str, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Spec F5: everything said of a number over runs. Runs whose number is NaN are left out and ``n`` says so.
+
+    Returns:
+        mean, standard_error, iqm, interval (95 %, of the iqm), interval_over, n, unit.
+    """
+    known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
+    marks = [mark for value, mark in zip(values, strata, strict=True) if not np.isnan(value)]
+    mean, error = mean_and_error(known)
+    low, high, over = bootstrap_interval(known, marks, rng)
+    return {
+        "mean": mean,
+        "standard_error": error,
+        "iqm": float(interquartile_mean(known)) if len(known) else float("nan"),
+        "interval": [low, high],
+        "interval_over": over,
+        "n": len(known),
+        "unit": unit,
+    }

@@ -1,0 +1,120 @@
+"""Spec C5: member networks, chosen by name.
+
+Each is a plain ``nn.Sequential`` of modules used once, from float (N, C, H, W) in 0..1 to logits (N, 2), column 1
+being "sub-goal reached". DeepLift attributes rightly only through such modules, and only with each ReLU before its
+MaxPool. :func:`reordered` gives the same function in the order that is faster to train.
+
+The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors' public
+code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of 0.1 in DoorKey's
+network is left out, since the paper has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from hypogoal.core.errors import UserError
+
+CLASSES = 2
+
+
+def doorkey(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    """Spec C5: DoorKey, two convolutions (+ BatchNorm + ReLU) and three dense layers; at least 41x41 pixels.
+
+    Source: the paper's appendix; sizes from the authors' code (minigrid_cnn.py).
+    """
+    convolutions = [
+        nn.Conv2d(channels, 32, kernel_size=5, stride=2, bias=False),
+        nn.BatchNorm2d(32),
+        nn.ReLU(),
+        nn.MaxPool2d(kernel_size=3, stride=2),
+        nn.Conv2d(32, 64, kernel_size=3, stride=2, bias=False),
+        nn.BatchNorm2d(64),
+        nn.ReLU(),
+        nn.MaxPool2d(kernel_size=4, stride=2),
+    ]
+    return convolutions, (750, 100)
+
+
+def montezuma(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    """Spec C5: Montezuma, three convolutions (+ BatchNorm + ReLU) and two dense layers; at least 36x36 pixels.
+
+    Source: the paper's appendix; sizes from the authors' code (monte_cnn.py).
+    """
+    convolutions = [
+        nn.Conv2d(channels, 32, kernel_size=8, stride=4, bias=False),
+        nn.BatchNorm2d(32),
+        nn.ReLU(),
+        nn.Conv2d(32, 64, kernel_size=4, stride=2, bias=False),
+        nn.BatchNorm2d(64),
+        nn.ReLU(),
+        nn.Conv2d(64, 64, kernel_size=3, stride=1, bias=False),
+        nn.BatchNorm2d(64),
+        nn.ReLU(),
+    ]
+    return convolutions, (512,)
+
+
+NETWORKS: dict[str, Callable[[int], tuple[list[nn.Module], tuple[int, ...]]]] = {
+    "doorkey": doorkey,
+    "montezuma": montezuma,
+}
+"""By name: number of channels -> convolutional part, and the widths of the hidden dense layers behind it."""
+
+
+def build_network(name: str, observation_shape: tuple[int, ...], generator: torch.Generator) -> nn.Sequential:
+    """A member network with fresh weights.
+
+    Args:
+        name: one of :data:`NETWORKS`.
+        observation_shape: (H, W, C).
+        generator: draws the initial weights (PyTorch's default distributions).
+
+    Returns:
+        float (N, C, H, W) -> logits (N, 2), on the CPU.
+
+    Raises:
+        UserError: unknown network, or observations that are no images or too small for it.
+    """
+    if name not in NETWORKS:
+        raise UserError("unknown network", name, f"Choose one of {', '.join(sorted(NETWORKS))}.")
+    where = f"observation shape {tuple(observation_shape)}"
+    if len(observation_shape) != 3 or min(observation_shape) < 1:
+        raise UserError("member networks need images (H, W, C)", where, "Collect image observations.")
+    height, width, channels = observation_shape
+    seed = int(torch.randint(2**62, (), generator=generator))
+    with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
+        torch.manual_seed(seed)
+        layers, hidden = NETWORKS[name](channels)
+        try:
+            with torch.no_grad():
+                features = nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
+        except RuntimeError:
+            raise UserError(f"images too small for the network {name!r}", where, "Give larger ones.") from None
+        layers.append(nn.Flatten())
+        for inputs, outputs in pairwise((features.numel(), *hidden)):
+            layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+        layers.append(nn.Linear(hidden[-1], CLASSES))
+    return nn.Sequential(*layers).train()
+
+
+def reordered(network: nn.Sequential) -> nn.Sequential:
+    """The same function with each ReLU after its MaxPool; the modules, and so the weights, are shared.
+
+    ReLU is monotone, so the order does not matter to values or gradients, but behind the pooling it has a quarter
+    of the work. Only attribution needs the other order.
+    """
+    layers = list(network)
+    for index, (layer, following) in enumerate(pairwise(network)):
+        if isinstance(layer, nn.ReLU) and isinstance(following, nn.MaxPool2d):
+            layers[index], layers[index + 1] = following, layer
+    return nn.Sequential(*layers)
+
+
+def as_input(observations: Tensor) -> Tensor:
+    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the memory order (channels last) it came in."""
+    return observations.permute(0, 3, 1, 2).to(torch.float32).div_(255.0)

@@ -1,0 +1,84 @@
+"""What is at a path, and is it whole: the answers of ``hypogoal show`` and ``hypogoal verify``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.artefacts import MANIFEST, check_files, open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import SPLITS, open_dataset
+
+
+def describe_path(path: Path) -> dict[str, Any]:
+    """Kind, configuration, inputs and numbers of a data file, an artefact, or every artefact of a run."""
+    if path.is_file():
+        dataset = open_dataset(path)
+        about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
+        return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
+    if (path / MANIFEST).is_file():
+        artefact = open_artefact(path)
+        keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
+        return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
+    return {"kind": "run", "path": str(path), "artefacts": [describe_path(part) for part in _parts(path)]}
+
+
+def lines(about: dict[str, Any]) -> list[str]:
+    """A description as text, a line a fact."""
+    if about["kind"] == "run":
+        return [f"{part['path']}: {part['kind']}" for part in about["artefacts"]]
+    text = [f"{about['path']}: {about['kind']}"]
+    for key, value in about.items():
+        if key in ("path", "kind") or value is None:
+            continue
+        if isinstance(value, dict):
+            text.append(f"{key}:")
+            text.extend(f"  {name}: {item}" for name, item in value.items())
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            text.append(f"{key}:")
+            text.extend(f"  {item['kind']} {item['path']}" for item in value)
+        else:
+            text.append(f"{key}: {value}")
+    return text
+
+
+def faults_of(path: Path) -> list[str]:
+    """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
+    try:
+        if path.is_file():
+            return _data_faults(path)
+        if (path / MANIFEST).is_file():
+            artefact = open_artefact(path)
+            return [f"{path}/{fault}" for fault in check_files(artefact)]
+        return [fault for part in _parts(path) for fault in faults_of(part)]
+    except UserError as error:
+        return [str(error)]
+
+
+def _data_faults(path: Path) -> list[str]:
+    dataset = open_dataset(path)
+    faults = []
+    for split in SPLITS:
+        for sub_goal in dataset.sub_goals:
+            part = getattr(dataset, split)(sub_goal)
+            if part.observations.shape[1:] != dataset.observation_shape or part.observations.dtype.name != "uint8":
+                faults.append(f"{path}: {split}/{sub_goal}: observations are not uint8 {dataset.observation_shape}")
+            if len(part.labels) != len(part.observations):
+                faults.append(f"{path}: {split}/{sub_goal}: {len(part.labels)} labels, {len(part.observations)} states")
+    if dataset.unlabelled().shape[1:] != dataset.observation_shape:
+        faults.append(f"{path}: unlabelled: observations are not uint8 {dataset.observation_shape}")
+    return faults
+
+
+def _parts(run: Path) -> list[Path]:
+    if not run.is_dir():
+        raise UserError("no such file or folder", run, "Check the path.")
+    artefacts = [manifest.parent for manifest in sorted(run.rglob(MANIFEST)) if not _hidden(manifest, run)]
+    data = [file for file in sorted(run.rglob("*.h5")) if file.parent not in artefacts and not _hidden(file, run)]
+    if not artefacts and not data:
+        raise UserError("no artefact and no data file here", run, "Give what a stage wrote.")
+    return [*data, *artefacts]
+
+
+def _hidden(path: Path, run: Path) -> bool:
+    return any(part.startswith(".") for part in path.relative_to(run).parts)

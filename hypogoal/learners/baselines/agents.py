@@ -1,0 +1,204 @@
+"""PPO and DQN of stable-baselines3, made from the table of settings and trained on an engine."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from torch import Tensor
+
+from hypogoal.core.errors import NumericalError
+from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.learners.baselines.engine_env import EngineEnv
+from hypogoal.learners.baselines.networks import CELL, NETWORKS
+from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
+
+Report = Callable[[int, dict[str, float]], None]
+
+
+class ExploringDQN(DQN):
+    """DQN whose every environment explores on its own, with an epsilon that may wait for the first goal.
+
+    stable-baselines3 tosses one coin for all environments at once and counts epsilon's fall from step 0.
+    """
+
+    explore_rng: np.random.Generator
+    chosen: DQNSettings
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """Epsilon-greedy actions (N,) for observations (N, C, H, W); greedy where ``deterministic``."""
+        actions, state = self.policy.predict(observation, state, episode_start, deterministic=True)
+        if not deterministic:
+            explore = self.explore_rng.random(len(actions)) < self.exploration_rate
+            anything = self.explore_rng.integers(self.action_space.n, size=len(actions))  # type: ignore[attr-defined]
+            actions = np.where(explore, anything, actions)
+        return actions, state
+
+
+class _Watch(BaseCallback):
+    """Reports every ``interval`` steps, stops at NaN, and tells DQN's epsilon when the first goal was seen."""
+
+    def __init__(self, env: EngineEnv, report: Report | None, interval: int):
+        super().__init__()
+        self.env, self.report, self.interval = env, report, interval
+        self.first_goal: int | None = None
+        self._seen, self._next = 0, interval
+
+    def _on_step(self) -> bool:
+        for step, _, _, terminated in self.env.episodes[self._seen :]:
+            if terminated and self.first_goal is None:
+                self.first_goal = step
+        self._seen = len(self.env.episodes)
+        if self.env.steps >= self._next:
+            self._next += self.interval
+            check_finite(self.model, self.env.steps)
+            if self.report is not None:
+                self.report(self.env.steps, self._numbers())
+        return True
+
+    def _numbers(self) -> dict[str, float]:
+        logged = self.model.logger.name_to_value
+        numbers = {key.removeprefix("train/"): float(value) for key, value in logged.items() if key.startswith("train/")}
+        if isinstance(self.model, DQN):
+            numbers["epsilon"] = float(self.model.exploration_rate)
+        return {"episodes": len(self.env.episodes), "success": self.env.success(), **numbers}
+
+
+def check_finite(model: BaseAlgorithm, step: int) -> None:
+    """Spec G3.
+
+    Raises:
+        NumericalError: a weight of the agent is NaN or infinite.
+    """
+    for name, weight in model.policy.named_parameters():
+        if not torch.isfinite(weight).all():
+            raise NumericalError(f"NaN or Inf in {type(model).__name__}'s {name} at step {step}")
+
+
+def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int) -> BaseAlgorithm:
+    """A fresh agent with the hyperparameters ``chosen``."""
+    policy: dict[str, Any] = {
+        "features_extractor_class": NETWORKS[chosen.network],
+        "features_extractor_kwargs": {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL},
+        "net_arch": [],
+        "optimizer_kwargs": {"fused": True},
+    }
+    agent: BaseAlgorithm
+    if isinstance(chosen, PPOSettings):
+        with warnings.catch_warnings():
+            # Table 5's 100 decisions do not divide into batches of 64: the second one has 36.
+            warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
+            agent = PPO(
+                "MlpPolicy",
+                env,
+                learning_rate=chosen.learning_rate,
+                n_steps=chosen.rollout // env.num_envs,
+                batch_size=chosen.batch,
+                n_epochs=chosen.epochs,
+                gamma=chosen.gamma,
+                gae_lambda=chosen.gae_lambda,
+                clip_range=chosen.clip,
+                ent_coef=chosen.entropy,
+                policy_kwargs=policy,
+                seed=seed_for(seed, "agent") % 2**32,
+                device="cpu",
+            )
+    else:
+        agent = ExploringDQN(
+            "MlpPolicy",
+            env,
+            learning_rate=chosen.learning_rate,
+            buffer_size=chosen.replay,
+            learning_starts=chosen.warm_up,
+            batch_size=chosen.batch,
+            tau=chosen.target_tau,
+            gamma=chosen.gamma,
+            train_freq=1,
+            target_update_interval=chosen.target_interval * env.num_envs,  # it counts environment steps
+            policy_kwargs=policy,
+            seed=seed_for(seed, "agent") % 2**32,
+            device="cpu",
+        )
+        agent.explore_rng = rng_for(seed, "explore")
+        agent.chosen = chosen
+    agent.set_logger(Logger(folder=None, output_formats=[]))
+    return agent
+
+
+def train(
+    env: EngineEnv,
+    chosen: PPOSettings | DQNSettings,
+    steps: int,
+    seed: int,
+    report: Report | None = None,
+    interval: int = 5_000,
+) -> BaseAlgorithm:
+    """Spec E7: train a fresh agent for ``steps`` environment steps (rounded up to whole rollouts).
+
+    Args:
+        env: the engine's environments; ``env.episodes`` is filled.
+        chosen: hyperparameters.
+        steps: environment steps, summed over the environments.
+        seed: of everything random.
+        report: called with (step, numbers) every ``interval`` steps.
+        interval: steps.
+
+    Returns:
+        The trained agent.
+
+    Raises:
+        NumericalError: NaN or Inf in a weight.
+    """
+    with own_randomness():
+        agent = make_agent(env, chosen, seed)
+        watch = _Watch(env, report, interval)
+        if isinstance(agent, ExploringDQN):
+            agent.exploration_schedule = lambda _: epsilon(agent.chosen, env.steps, watch.first_goal)
+            agent.exploration_rate = 1.0
+        agent.learn(steps, callback=watch, log_interval=None)  # type: ignore[arg-type]
+    check_finite(agent, env.steps)
+    return agent
+
+
+def weights(agent: BaseAlgorithm) -> dict[str, Tensor]:
+    """The agent's weights by name, shared ones once, without the target network's."""
+    named = agent.policy.named_parameters()
+    return {name: weight.detach() for name, weight in named if not name.startswith("q_net_target.")}
+
+
+def epsilon(chosen: DQNSettings, step: int, first_goal: int | None) -> float:
+    """Table 4: exploration at ``step``: from 1 to the final value, linearly, from the start or the first goal on."""
+    if chosen.epsilon_from == "first-goal":
+        if first_goal is None:
+            return 1.0
+        step -= first_goal
+    share = min(1.0, step / chosen.epsilon_steps)
+    return 1.0 + share * (chosen.epsilon_final - 1.0)
+
+
+@contextlib.contextmanager
+def own_randomness() -> Iterator[None]:
+    """Lend stable-baselines3 the global generators it insists on, and put them back afterwards."""
+    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng(devices=[]):
+        try:
+            yield
+        finally:
+            random.setstate(python)
+            np.random.set_state(numpy_state)  # noqa: NPY002

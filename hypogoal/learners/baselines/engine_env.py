@@ -1,0 +1,94 @@
+"""An engine as a stable-baselines3 vectorised environment, and the list of episodes played in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from hypogoal.domains.base import Engine
+
+
+class EngineEnv(VecEnv):
+    """All environments of an engine, with its primitive actions and images.
+
+    Observations are the engine's images, uint8 (C, H, W), or, where the engine's images are made of tiles, the cells'
+    tile codes, uint8 (cells,), which say the same in 1/192 of the bytes (see ``networks.CellNetwork``). An episode cut
+    at its step limit is marked as truncated: its last state is not a terminal one.
+
+    Attributes:
+        episodes: (step, length, reward, terminated) of every finished episode; step counts all environments' steps.
+        steps: environment steps so far, summed over the environments.
+    """
+
+    def __init__(self, engine: Engine):
+        self.engine = engine
+        self.tiles: NDArray[np.uint8] | None = getattr(engine, "tiles", None)
+        space = spaces.Box(0, 255, self._observe(engine.ids[:1]).shape[1:], np.uint8)
+        super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
+        self.steps = 0
+        self.episodes: list[tuple[int, int, float, int]] = []
+        self._rewards = np.zeros(engine.count, dtype=np.float64)
+        self._actions = np.zeros(engine.count, dtype=np.int64)
+
+    def _observe(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+        if self.tiles is not None:
+            return self.engine.codes(ids)  # type: ignore[attr-defined]
+        return self.engine.images(ids).transpose(0, 3, 1, 2)
+
+    def reset(self) -> NDArray[np.uint8]:
+        """Put every environment at the start of an episode."""
+        self._rewards[:] = 0
+        return self._observe(self.engine.reset())
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take note of the actions (count,) of the next step."""
+        self._actions = np.asarray(actions, dtype=np.int64)
+
+    def step_wait(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step every environment; where an episode ended, the observation is that of the next one's start."""
+        lengths = self.engine.elapsed + 1
+        step = self.engine.step(self._actions)
+        self.steps += self.num_envs
+        self._rewards += step.rewards
+        done = step.terminated | step.truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(done):
+            infos[index]["terminal_observation"] = self._observe(step.next_ids[index : index + 1])[0]
+            infos[index]["TimeLimit.truncated"] = bool(not step.terminated[index])
+            reward, terminated = float(self._rewards[index]), int(step.terminated[index])
+            self.episodes.append((self.steps, int(lengths[index]), reward, terminated))
+            self._rewards[index] = 0
+        return self._observe(self.engine.ids), step.rewards, done, infos
+
+    def success(self, last: int = 100) -> float:
+        """Share of the last episodes that reached a terminal state; 0 before the first."""
+        tail = self.episodes[-last:]
+        return sum(row[3] for row in tail) / len(tail) if tail else 0.0
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+        """The engine is one object: every environment has its attributes."""
+        if attr_name == "render_mode":  # asked for by VecEnv; an engine is never shown
+            return [None] * len(list(self._get_indices(indices)))
+        return [getattr(self.engine, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+        """Not supported: an engine's attributes are fixed."""
+        raise NotImplementedError("an engine's attributes are fixed")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: None | int | Iterable[int] = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Not supported: an engine has no per-environment methods."""
+        raise NotImplementedError("an engine has no per-environment methods")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: None | int | Iterable[int] = None) -> Sequence[bool]:  # type: ignore[override]
+        """An engine wears no Gymnasium wrappers."""
+        return [False] * len(list(self._get_indices(indices)))

@@ -1,0 +1,48 @@
+"""Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies and exploration schedules."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+
+def double_q_targets(
+    rewards: Tensor, terminal: Tensor, next_online: Tensor, next_target: Tensor, gamma: float
+) -> Tensor:
+    """Spec D2: r + gamma (1 - terminal) Q_target(s', argmax_a Q_online(s', a)).
+
+    Args:
+        rewards: float (...,).
+        terminal: bool (...,), True where nothing follows s'.
+        next_online: float (..., A), the online network at s'.
+        next_target: float (..., A), the target network at s'.
+        gamma: discount per step.
+
+    Returns:
+        float (...,).
+
+    Source: Van Hasselt, Guez and Silver 2016, the target of Double DQN.
+    """
+    best = next_online.argmax(-1, keepdim=True)
+    following = next_target.gather(-1, best).squeeze(-1)
+    return rewards + gamma * following * (~terminal)
+
+
+@torch.no_grad()
+def follow(target: nn.Module, online: nn.Module, tau: float) -> None:
+    """Move every parameter and buffer of ``target`` towards ``online`` by ``tau``; 1 copies the whole network."""
+    theirs = [tensor.detach() for tensor in online.state_dict().values()]
+    ours = list(target.state_dict().values())
+    moving = [(a, b) for a, b in zip(ours, theirs, strict=True) if a.is_floating_point() and tau < 1]
+    if moving:
+        torch._foreach_lerp_([a for a, _ in moving], [b for _, b in moving], tau)
+    for a, b in zip(ours, theirs, strict=True):
+        if tau >= 1 or not a.is_floating_point():
+            a.copy_(b)
+
+
+def linear_epsilon(steps: NDArray[np.int64], over: int, final: float) -> NDArray[np.float64]:
+    """Exploration falling from 1 to ``final`` over ``over`` steps (Tables 2 and 4), float (n,)."""
+    return np.maximum(final, 1.0 - (1.0 - final) * np.asarray(steps) / over)

@@ -1,0 +1,100 @@
+"""Prioritised experience replay (Schaul et al. 2015) over integer state ids: a transition costs bytes, not images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class SumTree:
+    """Priorities whose prefix sums are found in O(log n), for many indices at once."""
+
+    def __init__(self, capacity: int):
+        self.leaves = 1 << max(1, (capacity - 1).bit_length())
+        self.nodes = np.zeros(2 * self.leaves)
+
+    @property
+    def total(self) -> float:
+        """The sum of all priorities."""
+        return float(self.nodes[1])
+
+    def get(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The priorities at ``indices``."""
+        return self.nodes[indices + self.leaves]
+
+    def set(self, indices: NDArray[np.int64], priorities: NDArray[np.float64]) -> None:
+        """Write priorities (the last one wins where an index repeats) and mend the sums above them."""
+        nodes = self.nodes
+        places = indices + self.leaves
+        nodes[places] = priorities
+        while places[0] > 1:
+            places = places >> 1
+            if len(places) > 8:
+                places = np.unique(places)
+            nodes[places] = nodes[2 * places] + nodes[2 * places + 1]
+
+    def find(self, sums: NDArray[np.float64]) -> NDArray[np.int64]:
+        """For each prefix sum in [0, total) the leaf it falls on."""
+        nodes = self.nodes
+        places = np.ones(len(sums), dtype=np.int64)
+        rest = sums.copy()
+        while places[0] < self.leaves:
+            places *= 2
+            left = nodes[places]
+            right = rest >= left
+            # Rounding may leave a sum at the very end of an empty right branch: stay left there.
+            right &= nodes[places + 1] > 0
+            rest -= np.where(right, left, 0.0)
+            places += right
+        return places - self.leaves
+
+
+class PrioritisedReplay:
+    """A ring of transitions, sampled in proportion to priority ** alpha.
+
+    Args:
+        capacity: transitions kept (Tables 2 and 4: 1e5).
+        fields: name -> NumPy dtype of what is stored per transition.
+        alpha: 0 samples uniformly, 1 in full proportion.
+        beta: strength of the importance weights that correct for it.
+    """
+
+    def __init__(self, capacity: int, fields: Mapping[str, Any], *, alpha: float, beta: float):
+        self.capacity, self.alpha, self.beta = capacity, alpha, beta
+        self.data = {name: np.zeros(capacity, dtype=kind) for name, kind in fields.items()}
+        self.tree = SumTree(capacity)
+        self.size = self._next = 0
+        self._largest = 1.0
+
+    def add(self, **columns: NDArray[Any]) -> NDArray[np.int64]:
+        """Append n transitions with the largest priority seen; returns their indices, int64 (n,)."""
+        count = len(next(iter(columns.values())))
+        indices = (self._next + np.arange(count)) % self.capacity
+        for name, values in columns.items():
+            self.data[name][indices] = values
+        self.tree.set(indices, np.full(count, self._largest**self.alpha))
+        self._next = int((self._next + count) % self.capacity)
+        self.size = min(self.size + count, self.capacity)
+        return indices
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Stratified sample in proportion to priority.
+
+        Returns:
+            indices int64 (count,) and importance weights float32 (count,), the largest of them 1.
+        """
+        total = self.tree.total
+        sums = (np.arange(count) + rng.random(count)) * (total / count)
+        indices = np.minimum(self.tree.find(np.minimum(sums, np.nextafter(total, 0))), self.size - 1)
+        share = self.tree.get(indices) / total
+        weights = (self.size * np.maximum(share, 1e-12)) ** -self.beta
+        return indices, (weights / weights.max()).astype(np.float32)
+
+    def set_priorities(self, indices: NDArray[np.int64], priorities: NDArray[np.float64]) -> None:
+        """New priorities (absolute TD errors) of sampled transitions."""
+        priorities = np.asarray(priorities, dtype=np.float64) + 1e-3
+        self._largest = max(self._largest, float(priorities.max()))
+        self.tree.set(indices, priorities**self.alpha)

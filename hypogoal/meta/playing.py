@@ -1,0 +1,86 @@
+"""Options set up and played for a number of steps: what training options and training the meta-policy share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.config import setting
+from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Domain, Engine
+from hypogoal.hypotheses.storage import read_ensemble
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import OptionLoop
+from hypogoal.options.light import LightLearner
+from hypogoal.options.recurrent import RecurrentLearner
+from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
+
+LOG_INTERVAL = 2_000  # environment steps
+LEARNERS = {"light": LightLearner, "paper": RecurrentLearner}
+
+
+@dataclass(frozen=True)
+class PlayConfig(OptionConfig):
+    """Where options are played, and for how long."""
+
+    layout_seed: int = setting(100, "the layout the agent lives on", source="Spec E4", low=0)
+    max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", source="B1", low=1)
+    termination: str = setting(
+        "learned", "members' verdicts, or the true sub-goals (upper bound)", source="E6", choices=("learned", "oracle")
+    )
+    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="F5", low=0)
+
+
+def build(
+    domain: Domain, ensemble_folder: Path, about: Mapping[str, Any], config: PlayConfig, seed: int
+) -> tuple[Engine, Verdicts, LightLearner | RecurrentLearner]:
+    """The engine of one layout, the options' terminations on it and the learner of their policies.
+
+    Args:
+        domain: where to play.
+        ensemble_folder: an ensemble artefact's folder.
+        about: its manifest's configuration.
+        config: see :class:`PlayConfig`.
+        seed: of weights and exploration.
+    """
+    extra = {key: about["domain_config"][key] for key in ("keyring", "door_label") if key in about["domain_config"]}
+    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **extra)
+    if config.termination == "oracle":
+        verdicts = Verdicts(oracle_terminations(engine), len(domain.sub_goals))
+    else:
+        ensembles = [read_ensemble(ensemble_folder, dict(about), sub_goal) for sub_goal in about["sub_goals"]]
+        verdicts = Verdicts(learned_terminations(engine, ensembles), len(ensembles) * about["members"])
+        if hasattr(engine, "reachable"):
+            verdicts.of(engine.reachable())  # most of what will be visited, judged at once
+    return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed)
+
+
+def play(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress) -> None:
+    """Step ``loop`` until ``steps`` more environment steps were taken, logging as it goes (``metrics.jsonl``)."""
+    recorder = loop.recorder
+    end = recorder.steps + steps
+    logged = begin = recorder.steps
+    numbers: dict[str, float] = {}
+    while recorder.steps < end:
+        numbers |= loop.step()
+        if recorder.steps - logged >= LOG_INTERVAL or recorder.steps >= end:
+            logged = recorder.steps
+            success, length = recorder.success(), recorder.length()
+            shown = {"success": success, "length": length} if recorder.episodes else {}
+            log.write(step=recorder.steps, episodes=len(recorder.episodes), states=loop.engine.n_states, **shown, **numbers)
+            progress.update(min(recorder.steps - begin, steps), **shown)
+
+
+def layout_facts(engine: Any, config: PlayConfig, seed: int) -> dict[str, Any]:
+    """Spec F5: how hard the layout is: its shortest path and how often random play reaches the goal."""
+    rng = rng_for(seed, "random-play")
+    episodes = config.random_episodes
+    return {
+        "layout_seed": config.layout_seed,
+        "shortest_path": engine.shortest_path(),
+        "random_success": engine.random_success(episodes, rng) if episodes else None,
+        "random_episodes": episodes,
+    }

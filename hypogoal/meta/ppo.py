@@ -1,0 +1,182 @@
+"""The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import NumericalError
+from hypogoal.core.seeding import rng_for, seed_for, torch_generator
+from hypogoal.domains.base import Engine
+from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.networks import HEADS, NETWORKS
+from hypogoal.meta.smdp import smdp_advantages
+from hypogoal.options.execution import Outcome
+from hypogoal.options.networks import apply_to_states
+
+GRADIENT_NORM = 0.5
+
+
+@dataclass
+class _Decision:
+    """One choice of an option and what came of it; ``outcome`` fields are set when the option ends."""
+
+    state: int
+    offered: NDArray[np.bool_]
+    drawn: NDArray[np.float32]
+    log_prob: float
+    returned: float = 0.0
+    discount: float = 1.0
+    next_state: int = 0
+    terminated: bool = False
+    ended: bool = False
+
+
+class MetaPolicy:
+    """Chooses options for every environment and learns from what they return.
+
+    Args:
+        engine: gives observations of state ids.
+        options: the number of options, O.
+        config: see :class:`MetaConfig`.
+        seed: of weights, draws and minibatches.
+    """
+
+    def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int):
+        self.engine, self.options, self.config = engine, options, config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed_for(seed, "meta-weights"))
+            self.network = NETWORKS[config.meta_network](engine.observation_shape, options)
+            self.head = HEADS[config.head](options)
+        parameters = [*self.network.parameters(), *self.head.parameters()]
+        self.parameters = parameters
+        self.optimiser = torch.optim.Adam(parameters, lr=config.meta_learning_rate, eps=1e-5, fused=True)
+        self.generator = torch_generator(seed, "meta-draws")
+        self.rng = rng_for(seed, "meta-batches")
+        self._open: dict[int, _Decision] = {}
+        self._finished: list[list[_Decision]] = [[] for _ in range(engine.count)]
+        self._count = self.updates = 0
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """Draw an option for each of n environments in states ``ids`` among those offered, bool (n, O)."""
+        with torch.no_grad():
+            scores = self._outputs(ids)[:, :-1]
+            mask = torch.from_numpy(offered)
+            options, drawn = self.head.draw(scores, mask, self.generator)
+            log_prob = self.head.log_prob(scores, mask, drawn)[0]
+        for row, environment in enumerate(environments):
+            self._open[int(environment)] = _Decision(
+                int(ids[row]), offered[row], drawn[row].numpy(), float(log_prob[row])
+            )
+        return options.numpy()
+
+    def best(self, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """The preferred option in each state, without chance, int64 (n,)."""
+        with torch.no_grad():
+            return self.head.best(self._outputs(ids)[:, :-1], torch.from_numpy(offered)).numpy()
+
+    def record(self, outcome: Outcome) -> None:
+        """The chosen options ended as ``outcome`` says."""
+        for row, environment in enumerate(outcome.environments):
+            decision = self._open.pop(int(environment))
+            decision.returned = float(outcome.returns[row])
+            decision.discount = float(outcome.discounts[row])
+            decision.next_state = int(outcome.next_ids[row])
+            decision.terminated = bool(outcome.terminated[row])
+            decision.ended = decision.terminated or bool(outcome.truncated[row])
+            self._finished[int(environment)].append(decision)
+            self._count += 1
+
+    def learn(self) -> dict[str, float]:
+        """Update when enough decisions are finished; returns numbers to log, empty when none was due."""
+        if self._count < self.config.decisions:
+            return {}
+        sequences = [sequence for sequence in self._finished if sequence]
+        self._finished = [[] for _ in range(self.engine.count)]
+        self._count = 0
+        return self._update(sequences)
+
+    def _outputs(self, ids: NDArray[np.int64]) -> Tensor:
+        return apply_to_states(self.network, self.engine, ids)
+
+    def _update(self, sequences: list[list[_Decision]]) -> dict[str, float]:
+        config = self.config
+        flat = [decision for sequence in sequences for decision in sequence]
+        states = np.array([decision.state for decision in flat])
+        following = np.array([decision.next_state for decision in flat])
+        with torch.no_grad():
+            values = self._outputs(states)[:, -1].double().numpy()
+            next_values = self._outputs(following)[:, -1].double().numpy()
+        advantages = np.zeros(len(flat))
+        start = 0
+        for sequence in sequences:
+            part = slice(start, start + len(sequence))
+            advantages[part] = smdp_advantages(
+                np.array([decision.returned for decision in sequence]),
+                np.array([decision.discount for decision in sequence]),
+                values[part],
+                next_values[part],
+                np.array([decision.terminated for decision in sequence]),
+                np.array([decision.ended for decision in sequence]),
+                config.gae_lambda,
+            )
+            start += len(sequence)
+        offered = torch.from_numpy(np.stack([decision.offered for decision in flat]))
+        drawn = torch.from_numpy(np.stack([decision.drawn for decision in flat]))
+        old = torch.tensor([decision.log_prob for decision in flat])
+        goal = torch.from_numpy(advantages + values).float()
+        scaled = torch.from_numpy((advantages - advantages.mean()) / (advantages.std() + 1e-8)).float()
+        entropy_seen = 0.0
+        for _ in range(config.epochs):
+            order = self.rng.permutation(len(flat))
+            for begin in range(0, len(flat), config.meta_batch):
+                rows = order[begin : begin + config.meta_batch]
+                pick = torch.from_numpy(rows)
+                out = self._outputs(states[rows])
+                log_prob, entropy = self.head.log_prob(out[:, :-1], offered[pick], drawn[pick])
+                loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)
+                loss = loss + config.value_weight * (out[:, -1] - goal[pick]).square().mean()
+                loss = loss - config.entropy * entropy.mean()
+                self._step(loss)
+                entropy_seen = float(entropy.mean().detach())
+        self.updates += 1
+        return {"entropy": entropy_seen, "value": float(values.mean())}
+
+    def _step(self, loss: Tensor) -> None:
+        if not torch.isfinite(loss):
+            raise NumericalError(f"the meta-policy's loss is {float(loss)} at update {self.updates}")
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, GRADIENT_NORM, foreach=True)
+        self.optimiser.step()
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights, for an artefact."""
+        parts = {"network": self.network, "head": self.head}
+        return {
+            f"{part}.{name}": value.contiguous()
+            for part, module in parts.items()
+            for name, value in module.state_dict().items()
+        }
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Weights of an artefact."""
+        for part, module in (("network", self.network), ("head", self.head)):
+            module.load_state_dict(
+                {name[len(part) + 1 :]: value for name, value in state.items() if name.startswith(f"{part}.")}
+            )
+
+
+def clipped_surrogate(log_prob: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Tensor:
+    """PPO's loss: minus the mean of min(r A, clip(r, 1 - c, 1 + c) A), r the ratio of probabilities.
+
+    Source: Schulman et al. 2017, Eq. (7).
+    """
+    ratio = (log_prob - old).exp()
+    return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()

@@ -1,0 +1,42 @@
+"""Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hypogoal.core.config import setting
+
+
+@dataclass(frozen=True)
+class OptionConfig:
+    """How the intra-option policies are executed and learned."""
+
+    network: str = setting(
+        "light", "Q-network: the paper's conv-GRU, or a small one on cells", source="Spec D2", choices=("light", "paper")
+    )
+    experience: str = setting(
+        "shared", "who learns from a step: its own member, or all of them", source="own: paper", choices=("own", "shared")
+    )
+    option_timeout: int = setting(10, "an option ends after this many steps", unit="steps", source="paper", low=1)
+    mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="Spec D6")
+    bootstrap_timeout: bool = setting(True, "an option's timeout is not a terminal state", source="Spec D2")
+    option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
+    environments: int = setting(32, "environments stepped together", low=1, high=4096)
+    replay: int = setting(100_000, "transitions kept", source="Table 4", low=100)
+    warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1)
+    update_interval: int = setting(32, "environment steps per update", unit="steps", source="paper: 4", low=1)
+    option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
+    positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
+    option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
+    target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
+    target_tau: float = setting(0.01, "share of the online network a target update takes", low=0.0, high=1.0)
+    epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
+    epsilon_final: float = setting(0.05, "exploration in the end", source="paper: 0.01", low=0.0, high=1.0)
+    epsilon_from: str = setting(
+        "first-positive",
+        "when a member's epsilon begins to fall",
+        source="paper: start",
+        choices=("start", "first-positive"),
+    )
+    priority_alpha: float = setting(0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0)
+    priority_beta: float = setting(0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0)

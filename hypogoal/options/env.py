@@ -1,0 +1,180 @@
+"""Options played as the actions of a Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.options.execution import offered_options
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork
+from hypogoal.options.verdicts import THRESHOLD
+
+# A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
+Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """G x K options; option g*K + k aims at member k's hypothesis of sub-goal g.
+
+    Attributes:
+        sub_goals: G names.
+        members: K.
+        ensembles: the termination classifiers, one ensemble per sub-goal.
+        policies: starts an option's greedy policy.
+        timeout: steps after which an option ends.
+    """
+
+    sub_goals: tuple[str, ...]
+    members: int
+    ensembles: Sequence[Ensemble]
+    policies: Policies
+    timeout: int
+
+    @property
+    def count(self) -> int:
+        """G * K."""
+        return len(self.sub_goals) * self.members
+
+    def name(self, option: int) -> str:
+        """For example ``open-red-door/2``."""
+        return f"{self.sub_goals[option // self.members]}/{option % self.members}"
+
+    def verdicts(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which options' sub-goals hold in one observation (*obs): bool (G*K,)."""
+        return np.concatenate([ensemble.predict(observation[None])[0] > THRESHOLD for ensemble in self.ensembles])
+
+    def holds(self, option: int, observation: NDArray[np.uint8]) -> bool:
+        """Whether one option's own sub-goal holds in an observation (*obs)."""
+        ensemble = self.ensembles[option // self.members]
+        return bool(ensemble.predict(observation[None])[0, option % self.members] > THRESHOLD)
+
+
+def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any]) -> Policies:
+    """Greedy policies from an options artefact's weights.
+
+    Args:
+        config: its manifest's configuration.
+        weights: the tensors of ``options.safetensors``.
+        about: the ensemble manifest's configuration.
+    """
+    if config["termination"] == "oracle":
+        raise UserError(
+            "these options end at the true sub-goals, which only the domain's engine can see",
+            "termination=oracle",
+            "Load options that were trained with learned members.",
+        )
+    shape = tuple(about["observation_shape"])
+    if config["network"] == "light":
+        return _light_policies(weights, shape, len(config["sub_goals"]) * config["members"])
+    return _paper_policies(weights, shape)
+
+
+def _light_policies(weights: dict[str, Tensor], shape: tuple[int, ...], options: int) -> Policies:
+    actions = weights["online.heads.weight"].shape[0] // options
+    network = LightQNetwork(shape, options, actions)
+    network.load_state_dict({name[7:]: value for name, value in weights.items() if name.startswith("online.")})
+
+    def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
+        @torch.no_grad()
+        def act(observation: NDArray[np.uint8]) -> int:
+            return int(network(torch.from_numpy(observation[None]))[0, option].argmax())
+
+        return act
+
+    return start
+
+
+def _paper_policies(weights: dict[str, Tensor], shape: tuple[int, ...]) -> Policies:
+    networks: dict[int, PaperQNetwork] = {}
+
+    def network_of(option: int) -> PaperQNetwork:
+        if option not in networks:
+            prefix = f"{option}."
+            state = {name[len(prefix) :]: value for name, value in weights.items() if name.startswith(prefix)}
+            networks[option] = PaperQNetwork(shape, len(state["values.2.bias"])).eval()
+            networks[option].load_state_dict(state)
+        return networks[option]
+
+    def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
+        network = network_of(option)
+        hidden: Tensor | None = None
+
+        @torch.no_grad()
+        def act(observation: NDArray[np.uint8]) -> int:
+            nonlocal hidden
+            values, hidden = network(network.embed(torch.from_numpy(observation[None]))[:, None], hidden)
+            return int(values[0, 0].argmax())
+
+        return act
+
+    return start
+
+
+class OptionEnv(gymnasium.Wrapper):
+    """A Gymnasium environment whose actions are options (Spec E1): ``Discrete(G*K)``.
+
+    One step runs an option until its classifier says yes, its time is up or the episode ends. The reward is the sum
+    of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so that an agent can bootstrap with
+    gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached.
+
+    Args:
+        env: an environment with the observations that the options were trained on.
+        options: from :func:`hypogoal.load_options`.
+        gamma: discount per environment step inside an option; 1 for the plain sum.
+    """
+
+    def __init__(self, env: gymnasium.Env, options: Options, gamma: float = 1.0):
+        super().__init__(env)
+        wanted = tuple(options.ensembles[0].observation_shape)
+        if env.observation_space.shape != wanted:
+            raise UserError(
+                "the environment's observations are not those the options know",
+                f"{env.observation_space.shape}, not {wanted}",
+                "Use the environment they were trained on.",
+            )
+        self.options, self.gamma = options, gamma
+        self.action_space = gymnasium.spaces.Discrete(options.count)
+        self._observation: NDArray[np.uint8] | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """As the environment's own."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._observation = observation
+        return observation, info
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Spec D6: which options may start here, bool (G*K,)."""
+        return offered_options(self.options.verdicts(self._current())[None], mask_reached=True)[0]
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Run option ``action`` to its end."""
+        option = int(action)
+        act = self.options.policies(option)
+        total, duration, reached, ended = 0.0, 0, False, False
+        observation = self._current()
+        terminated = truncated = False
+        info: dict[str, Any] = {}
+        while not ended:
+            observation, reward, terminated, truncated, info = self.env.step(act(observation))
+            total += self.gamma**duration * float(reward)
+            duration += 1
+            reached = self.options.holds(option, observation)
+            ended = reached or terminated or truncated or duration >= self.options.timeout
+        self._observation = observation
+        info = info | {"duration": duration, "reached": reached, "option": self.options.name(option)}
+        return observation, total, terminated, truncated, info
+
+    def _current(self) -> NDArray[np.uint8]:
+        if self._observation is None:
+            raise UserError("the environment was not reset", None, "Call reset() first.")
+        return self._observation

@@ -1,0 +1,209 @@
+"""Options at work: many environments, each running one option at a time (Spec A3, A4, D1, D6, E1, E5).
+
+The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. An option runs at least
+one step and its termination is tested on the state it arrives at; it ends when its own classifier says yes, when its
+time is up, or when the episode ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.domains.base import Engine, Step
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.recording import Recorder
+from hypogoal.options.verdicts import Verdicts
+
+NONE = -1
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Finished option executions, arrays of length n.
+
+    Attributes:
+        environments: which environments they ran in.
+        returns: the environment's rewards inside the option, discounted from its start.
+        discounts: gamma ** tau with tau the option's duration, for the state reached.
+        next_ids: the states reached.
+        next_offered: bool (n, O), the options that may start there.
+        terminated: the task is over, nothing follows.
+        truncated: the episode was cut at its step limit.
+    """
+
+    environments: NDArray[np.int64]
+    returns: NDArray[np.float64]
+    discounts: NDArray[np.float64]
+    next_ids: NDArray[np.int64]
+    next_offered: NDArray[np.bool_]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+class Learner(Protocol):
+    """Intra-option policies: see :class:`hypogoal.options.light.LightLearner`."""
+
+    def act(
+        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+    ) -> NDArray[np.int64]: ...
+
+    def observe(
+        self,
+        ids: NDArray[np.int64],
+        actions: NDArray[np.int64],
+        next_ids: NDArray[np.int64],
+        options: NDArray[np.int64],
+        *,
+        terminated: NDArray[np.bool_],
+        timed_out: NDArray[np.bool_],
+        ended: NDArray[np.bool_],
+    ) -> None: ...
+
+    def learn(self) -> dict[str, float]: ...
+
+
+class Chooser(Protocol):
+    """Chooses options: uniformly (:class:`RandomChooser`) or by the meta-policy."""
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]: ...
+
+    def record(self, outcome: Outcome) -> None: ...
+
+    def learn(self) -> dict[str, float]: ...
+
+
+class RandomChooser:
+    """Spec E6: uniform choice among the options offered, the lower control and the way of ``train-options``."""
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """One of the offered options for each environment, int64 (n,)."""
+        return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
+
+    def record(self, outcome: Outcome) -> None:
+        """Nothing to remember."""
+
+    def learn(self) -> dict[str, float]:
+        """Nothing to learn."""
+        return {}
+
+
+def offered_options(verdicts: NDArray[np.bool_], mask_reached: bool) -> NDArray[np.bool_]:
+    """Spec D6: options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
+    if not mask_reached:
+        return np.ones_like(verdicts)
+    offered = ~verdicts
+    offered[~offered.any(1)] = True
+    return offered
+
+
+class OptionLoop:
+    """Steps every environment once per call of :meth:`step`.
+
+    Args:
+        engine: the environments.
+        verdicts: the options' termination classifiers.
+        learner: the intra-option policies.
+        chooser: the policy over options.
+        recorder: episodes and choices are told to it.
+        config: timeouts, masks.
+        gamma: the meta-level's discount per environment step (E1).
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        verdicts: Verdicts,
+        learner: Learner,
+        chooser: Chooser,
+        recorder: Recorder,
+        config: OptionConfig,
+        gamma: float,
+    ):
+        self.engine, self.verdicts, self.learner, self.chooser = engine, verdicts, learner, chooser
+        self.recorder, self.config, self.gamma = recorder, config, gamma
+        count = engine.count
+        self.option = np.full(count, NONE, dtype=np.int64)
+        self.age = np.zeros(count, dtype=np.int64)
+        self.returns = np.zeros(count)
+        self.episode_reward = np.zeros(count)
+        self.episode_length = np.zeros(count, dtype=np.int64)
+        engine.reset()
+
+    def step(self, *, explore: bool = True, learn: bool = True) -> dict[str, float]:
+        """One step of every environment, then the updates that are due; returns numbers to log."""
+        self._choose()
+        ids, option = self.engine.ids.copy(), self.option.copy()
+        actions = self.learner.act(ids, option, self.age, explore=explore)
+        step = self.engine.step(actions)
+        reached = self.verdicts.of(step.next_ids)[np.arange(len(ids)), option]
+        self.returns += self.gamma**self.age * step.rewards
+        self.age += 1
+        over = step.terminated | step.truncated
+        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
+        ended = reached | timed_out | over
+        self.learner.observe(
+            ids, actions, step.next_ids, option, terminated=step.terminated, timed_out=timed_out, ended=ended
+        )
+        self._finish_options(step, reached, ended)
+        self._finish_episodes(step)
+        numbers: dict[str, float] = {}
+        if learn:
+            numbers |= self.learner.learn()
+            numbers |= self.chooser.learn()
+        return numbers
+
+    def _choose(self) -> None:
+        free = np.flatnonzero(self.option == NONE)
+        if not len(free):
+            return
+        ids = self.engine.ids[free]
+        offered = offered_options(self.verdicts.of(ids), self.config.mask_reached)
+        chosen = self.chooser.choose(free, ids, offered)
+        self.option[free] = chosen
+        self.age[free] = 0
+        self.returns[free] = 0.0
+        self.recorder.chose(chosen, offered)
+
+    def _finish_options(self, step: Step, reached: NDArray[np.bool_], ended: NDArray[np.bool_]) -> None:
+        done = np.flatnonzero(ended)
+        if not len(done):
+            return
+        next_ids = step.next_ids[done]
+        self.recorder.finished(self.option[done], self.age[done], reached[done], next_ids)
+        self.chooser.record(
+            Outcome(
+                environments=done,
+                returns=self.returns[done],
+                discounts=self.gamma ** self.age[done],
+                next_ids=next_ids,
+                next_offered=offered_options(self.verdicts.of(next_ids), self.config.mask_reached),
+                terminated=step.terminated[done],
+                truncated=step.truncated[done],
+            )
+        )
+        self.option[done] = NONE
+
+    def _finish_episodes(self, step: Step) -> None:
+        self.recorder.steps += len(self.option)
+        self.episode_reward += step.rewards
+        self.episode_length += 1
+        over = step.terminated | step.truncated
+        for place in np.flatnonzero(over):
+            self.recorder.episode(
+                int(self.episode_length[place]),
+                float(self.episode_reward[place]),
+                bool(step.terminated[place]),
+            )
+        self.episode_reward[over] = 0.0
+        self.episode_length[over] = 0

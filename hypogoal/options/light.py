@@ -1,0 +1,195 @@
+"""Light option learning: one trunk, a head per member, every step a lesson for every member (Spec D1, D2, D8).
+
+Double DQN with prioritised replay over state ids. With ``experience=shared`` each stored transition carries each
+member's own reward, by that member's verdict on s'; a member's loss leaves out transitions that start inside its
+sub-goal. With ``experience=own`` (the paper) only the member whose option was running learns from a transition.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import NumericalError
+from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.domains.base import Engine
+from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
+from hypogoal.learners.replay import PrioritisedReplay
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.networks import LightQNetwork, apply_to_states
+from hypogoal.options.verdicts import Verdicts
+
+POSITIVES_KEPT = 512  # per member
+GRADIENT_NORM = 10.0
+
+
+class LightLearner:
+    """The intra-option policies of all O options, acting and learning together.
+
+    Args:
+        engine: gives observations of state ids.
+        verdicts: each option's termination classifier on states.
+        config: see :class:`OptionConfig`.
+        seed: of weights, exploration and sampling.
+    """
+
+    def __init__(self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int):
+        self.engine, self.verdicts, self.config = engine, verdicts, config
+        self.options = verdicts.options
+        self.rng = rng_for(seed, "options")
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed_for(seed, "option-weights"))
+            self.online = LightQNetwork(engine.observation_shape, self.options, engine.n_actions)
+        self.target = copy.deepcopy(self.online).requires_grad_(False)
+        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
+        fields = {"s": np.int32, "a": np.int8, "next": np.int32, "option": np.int16, "end": np.bool_, "timeout": np.bool_}
+        self.replay = PrioritisedReplay(
+            config.replay, fields, alpha=config.priority_alpha, beta=config.priority_beta
+        )
+        self.positive = {name: np.zeros((self.options, POSITIVES_KEPT), kind) for name, kind in fields.items()}
+        self.positives = np.zeros(self.options, dtype=np.int64)
+        self.option_steps = np.zeros(self.options, dtype=np.int64)
+        self.steps_since_positive = np.zeros(self.options, dtype=np.int64)
+        self.steps = self.updates = 0
+        self._due = 0
+
+    def epsilon(self) -> NDArray[np.float64]:
+        """Every option's exploration, float (O,)."""
+        first = self.config.epsilon_from == "first-positive"
+        steps = self.steps_since_positive if first else self.option_steps
+        return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
+
+    def act(
+        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+    ) -> NDArray[np.int64]:
+        """Actions int64 (E,) of the running options (E,) in states (E,)."""
+        with torch.no_grad():
+            values = apply_to_states(self.online, self.engine, ids).numpy()
+        actions = values[np.arange(len(ids)), options].argmax(1)
+        if explore:
+            random = self.rng.random(len(ids)) < self.epsilon()[options]
+            actions = np.where(random, self.rng.integers(self.engine.n_actions, size=len(ids)), actions)
+        return actions
+
+    def observe(
+        self,
+        ids: NDArray[np.int64],
+        actions: NDArray[np.int64],
+        next_ids: NDArray[np.int64],
+        options: NDArray[np.int64],
+        *,
+        terminated: NDArray[np.bool_],
+        timed_out: NDArray[np.bool_],
+        ended: NDArray[np.bool_],
+    ) -> None:
+        """Store one step of every environment; all arrays (E,).
+
+        Args:
+            ids, actions, next_ids: the step.
+            options: the options that were running.
+            terminated: the task is over.
+            timed_out: the option's time was up without reaching its sub-goal.
+            ended: the option stopped here for whatever reason.
+        """
+        row = {
+            "s": ids, "a": actions, "next": next_ids, "option": options, "end": terminated, "timeout": timed_out,
+        }  # fmt: skip
+        self.replay.add(**row)
+        hits = self.verdicts.of(next_ids) & ~self.verdicts.of(ids)
+        if self.config.experience == "own":
+            hits &= options[:, None] == np.arange(self.options)
+        for place, option in zip(*np.nonzero(hits), strict=True):
+            slot = self.positives[option] % POSITIVES_KEPT
+            for name, values in row.items():
+                self.positive[name][option, slot] = values[place]
+            self.positives[option] += 1
+        np.add.at(self.option_steps, options, 1)
+        np.add.at(self.steps_since_positive, options, self.positives[options] > 0)
+        self.steps += len(ids)
+        self._due += len(ids)
+
+    def learn(self) -> dict[str, float]:
+        """As many updates as are due; returns the last one's numbers, empty when none was due."""
+        numbers: dict[str, float] = {}
+        if self.steps < self.config.warm_up:
+            self._due = 0
+            return numbers
+        while self._due >= self.config.update_interval:
+            self._due -= self.config.update_interval
+            numbers = self._update()
+        return numbers
+
+    def _batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64], NDArray[np.float32]]:
+        have = np.flatnonzero(self.positives)
+        extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
+        indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
+        batch = {name: values[indices] for name, values in self.replay.data.items()}
+        if extra:
+            options = have[self.rng.integers(len(have), size=extra)]
+            kept = np.minimum(self.positives[options], POSITIVES_KEPT)
+            slots = (self.rng.random(extra) * kept).astype(np.int64)
+            batch = {name: np.concatenate([batch[name], self.positive[name][options, slots]]) for name in batch}
+            weights = np.concatenate([weights, np.ones(extra, np.float32)])
+        return batch, indices, weights
+
+    def _update(self) -> dict[str, float]:
+        batch, indices, weights = self._batch()
+        s, following = batch["s"].astype(np.int64), batch["next"].astype(np.int64)
+        here, reached = self.verdicts.of(s), self.verdicts.of(following)
+        owner = batch["option"][:, None] == np.arange(self.options)
+        terminal = reached | batch["end"][:, None]
+        if not self.config.bootstrap_timeout:
+            terminal = terminal | (owner & batch["timeout"][:, None])
+        learns = ~here & owner if self.config.experience == "own" else ~here
+
+        values = apply_to_states(self.online, self.engine, s)
+        with torch.no_grad():
+            next_online = apply_to_states(self.online, self.engine, following)
+            next_target = apply_to_states(self.target, self.engine, following)
+            goal = double_q_targets(
+                torch.from_numpy(reached).float(),
+                torch.from_numpy(terminal),
+                next_online,
+                next_target,
+                self.config.option_gamma,
+            )
+        actions = torch.from_numpy(batch["a"].astype(np.int64))[:, None, None].expand(-1, self.options, 1)
+        error = values.gather(2, actions).squeeze(2) - goal
+        error = error * torch.from_numpy(learns)
+        huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
+        loss = (huber.sum(1) * torch.from_numpy(weights)).mean()
+        self._step(loss)
+        largest = error.detach().abs().amax(1).numpy()
+        self.replay.set_priorities(indices, largest[: len(indices)])
+        return {"option_loss": float(loss.detach())}
+
+    def _step(self, loss: Tensor) -> None:
+        if not torch.isfinite(loss):
+            raise NumericalError(f"the option loss is {float(loss)} at update {self.updates}; nothing was saved over")
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.online.parameters(), GRADIENT_NORM, foreach=True)
+        self.optimiser.step()
+        self.updates += 1
+        if self.updates % self.config.target_interval == 0:
+            follow(self.target, self.online, self.config.target_tau)
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights and exploration counters, for an artefact."""
+        state = {f"online.{name}": value.contiguous() for name, value in self.online.state_dict().items()}
+        state["option_steps"] = torch.from_numpy(self.option_steps.copy())
+        state["steps_since_positive"] = torch.from_numpy(self.steps_since_positive.copy())
+        return state
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue from the weights and counters of an artefact; the replay starts empty."""
+        weights = {name[7:]: value for name, value in state.items() if name.startswith("online.")}
+        self.online.load_state_dict(weights)
+        self.target.load_state_dict(weights)
+        self.option_steps[:] = state["option_steps"].numpy()
+        self.steps_since_positive[:] = state["steps_since_positive"].numpy()

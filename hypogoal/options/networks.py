@@ -1,0 +1,116 @@
+"""Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hypogoal.domains.base import Engine
+
+CELL = 8  # pixels
+
+
+class CellEmbedding(nn.Module):
+    """A convolution whose kernel and stride are one cell (8 pixels), then ReLU.
+
+    Where an image is made of few distinct tiles, the same function is a look-up: convolve each tile once, then
+    gather by tile code. Both ways give the same values and gradients (a test asserts it).
+
+    Args:
+        observation_shape: (H, W, C) of the images.
+        channels: features per cell.
+    """
+
+    def __init__(self, observation_shape: tuple[int, ...], channels: int = 8):
+        super().__init__()
+        height, width, depth = observation_shape
+        self.conv = nn.Conv2d(depth, channels, CELL, stride=CELL)
+        self.features = channels * (height // CELL) * (width // CELL)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """uint8 (N, H, W, C) -> float32 (N, features), cells row by row."""
+        pixels = images.permute(0, 3, 1, 2).float() / 255.0
+        return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
+
+    def from_codes(self, codes: Tensor, tiles: Tensor) -> Tensor:
+        """The same from tile codes uint8 (N, cells) and the tiles uint8 (T, 8, 8, C) that they stand for."""
+        pixels = tiles.permute(0, 3, 1, 2).float() / 255.0
+        table = torch.relu(self.conv(pixels)).flatten(1)
+        return nn.functional.embedding(codes.long(), table).flatten(1)
+
+
+class LightQNetwork(nn.Module):
+    """One trunk and a head per member (Spec D8): values of every member's policy at once."""
+
+    def __init__(self, observation_shape: tuple[int, ...], members: int, actions: int, width: int = 128):
+        super().__init__()
+        self.members, self.actions = members, actions
+        self.cells = CellEmbedding(observation_shape)
+        self.trunk = nn.Sequential(
+            nn.Linear(self.cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+        )
+        self.heads = nn.Linear(width, members * actions)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """uint8 (N, H, W, C) -> float32 (N, members, actions)."""
+        return self._values(self.cells(images))
+
+    def from_codes(self, codes: Tensor, tiles: Tensor) -> Tensor:
+        """The same from tile codes; see :meth:`CellEmbedding.from_codes`."""
+        return self._values(self.cells.from_codes(codes, tiles))
+
+    def _values(self, features: Tensor) -> Tensor:
+        return self.heads(self.trunk(features)).view(-1, self.members, self.actions)
+
+
+class PaperQNetwork(nn.Module):
+    """The paper's network of one member: two of (conv, BatchNorm, ReLU, MaxPool), a GRU, two dense layers.
+
+    The paper gives no sizes. Channels 16 and 32 with kernel 3 are those of the authors' public code
+    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``); GRU 512 gives the 10.5 M parameters measured there.
+    ReLU stands after MaxPool: the same function, on a quarter of the values.
+    """
+
+    HIDDEN = 512
+
+    def __init__(self, observation_shape: tuple[int, ...], actions: int):
+        super().__init__()
+        height, width, depth = observation_shape
+        self.features = nn.Sequential(
+            nn.Conv2d(depth, 16, 3), nn.BatchNorm2d(16), nn.MaxPool2d(2), nn.ReLU(),
+            nn.Conv2d(16, 32, 3), nn.BatchNorm2d(32), nn.MaxPool2d(2), nn.ReLU(),
+            nn.Flatten(),
+        )  # fmt: skip
+        with torch.no_grad():
+            size = self.features.eval()(torch.zeros(1, depth, height, width)).shape[1]
+        self.features.train()
+        self.gru = nn.GRU(size, self.HIDDEN, batch_first=True)
+        self.values = nn.Sequential(nn.Linear(self.HIDDEN, 128), nn.ReLU(), nn.Linear(128, actions))
+
+    def embed(self, images: Tensor) -> Tensor:
+        """uint8 (N, H, W, C) -> float32 (N, features): the part before the GRU."""
+        return self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+
+    def forward(self, embedded: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Unroll the GRU over an option's own steps.
+
+        Args:
+            embedded: float32 (N, T, features), from :meth:`embed`.
+            hidden: float32 (1, N, 512), None at an option's first step.
+
+        Returns:
+            values float32 (N, T, actions) and the hidden state after the last step.
+        """
+        out, hidden = self.gru(embedded, hidden)
+        return self.values(out), hidden
+
+
+def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
+    """A cell network's output on states of an engine: by tile codes where the engine has them, else by images."""
+    tiles = getattr(engine, "tiles", None)
+    if tiles is not None:
+        codes = torch.from_numpy(engine.codes(ids))  # type: ignore[attr-defined]
+        return network.from_codes(codes, torch.from_numpy(tiles.copy()))  # type: ignore[operator]
+    return network(torch.from_numpy(engine.images(ids)))

@@ -1,0 +1,207 @@
+"""Option learning as in the paper: an independent conv-GRU network and replay per member (Spec D2, D3).
+
+The GRU is unrolled over the option's own steps: acting carries its hidden state from the option's first step on;
+learning samples a step and replays the option's execution up to it. Every member learns from its own executions.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.domains.base import Engine
+from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
+from hypogoal.learners.replay import PrioritisedReplay
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.networks import PaperQNetwork
+from hypogoal.options.verdicts import Verdicts
+
+FIELDS = {
+    "s": np.int32, "a": np.int8, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
+    "place": np.int16,  # steps since the option began
+    "execution": np.int32,
+}  # fmt: skip
+
+
+class Member:
+    """One member's policy: networks, optimiser, replay of whole executions, counters."""
+
+    def __init__(self, engine: Engine, config: OptionConfig, seed: int, option: int):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed_for(seed, "option-weights", option))
+            self.online = PaperQNetwork(engine.observation_shape, engine.n_actions)
+        self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
+        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
+        self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
+        self.steps = self.updates = self.due = self.positives = self.steps_since_positive = self.executions = 0
+
+
+class RecurrentLearner:
+    """The intra-option policies of all O options, each on its own.
+
+    Args:
+        engine, verdicts, config, seed: as of :class:`hypogoal.options.light.LightLearner`.
+    """
+
+    def __init__(self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int):
+        if config.experience != "own":
+            raise UserError(
+                "the paper's network learns from its member's own executions only",
+                f"experience={config.experience}",
+                "Give --set experience=own.",
+            )
+        self.engine, self.verdicts, self.config = engine, verdicts, config
+        self.options = verdicts.options
+        self.rng = rng_for(seed, "options")
+        self.members = [Member(engine, config, seed, option) for option in range(self.options)]
+        self.hidden = torch.zeros(engine.count, PaperQNetwork.HIDDEN)
+        self.running: list[list[tuple[int, int, int, bool, bool]]] = [[] for _ in range(engine.count)]
+
+    def epsilon(self) -> NDArray[np.float64]:
+        """Every option's exploration, float (O,)."""
+        first = self.config.epsilon_from == "first-positive"
+        steps = np.array([m.steps_since_positive if first else m.steps for m in self.members])
+        return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
+
+    @torch.no_grad()
+    def act(
+        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+    ) -> NDArray[np.int64]:
+        """Actions int64 (E,); moves each environment's hidden state one step on (BatchNorm in eval mode)."""
+        actions = np.empty(len(ids), dtype=np.int64)
+        self.hidden[torch.from_numpy(age == 0)] = 0.0
+        images = torch.from_numpy(self.engine.images(ids))
+        for option in np.unique(options):
+            rows = torch.from_numpy(np.flatnonzero(options == option))
+            network = self.members[option].online.eval()
+            values, hidden = network(network.embed(images[rows])[:, None], self.hidden[rows][None])
+            self.hidden[rows] = hidden[0]
+            actions[rows.numpy()] = values[:, 0].argmax(1).numpy()
+        if explore:
+            random = self.rng.random(len(ids)) < self.epsilon()[options]
+            actions = np.where(random, self.rng.integers(self.engine.n_actions, size=len(ids)), actions)
+        return actions
+
+    def observe(
+        self,
+        ids: NDArray[np.int64],
+        actions: NDArray[np.int64],
+        next_ids: NDArray[np.int64],
+        options: NDArray[np.int64],
+        *,
+        terminated: NDArray[np.bool_],
+        timed_out: NDArray[np.bool_],
+        ended: NDArray[np.bool_],
+    ) -> None:
+        """Collect each execution; store it in its member's replay when it ends. Arrays (E,)."""
+        for e in range(len(ids)):
+            steps = self.running[e]
+            steps.append((int(ids[e]), int(actions[e]), int(next_ids[e]), bool(terminated[e]), bool(timed_out[e])))
+            if ended[e]:
+                self._store(int(options[e]), steps)
+                self.running[e] = []
+
+    def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool]]) -> None:
+        member = self.members[option]
+        s, a, following, end, timeout = (np.array(column) for column in zip(*steps, strict=True))
+        reached = self.verdicts.of(following)[:, option]
+        member.replay.add(
+            s=s, a=a, next=following, terminal=reached | end, timeout=timeout,
+            place=np.arange(len(s)), execution=np.full(len(s), member.executions),
+        )  # fmt: skip
+        member.executions += 1
+        member.positives += int(reached.sum())
+        member.steps += len(s)
+        member.steps_since_positive += len(s) if member.positives else 0
+        member.due += len(s)
+
+    def learn(self) -> dict[str, float]:
+        """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
+        numbers: dict[str, float] = {}
+        for option, member in enumerate(self.members):
+            if member.steps < self.config.warm_up:
+                member.due = 0
+            while member.due >= self.config.update_interval:
+                member.due -= self.config.update_interval
+                numbers["option_loss"] = self._update(option, member)
+        return numbers
+
+    def _update(self, option: int, member: Member) -> float:
+        config, data = self.config, member.replay.data
+        indices, weights = member.replay.sample(config.option_batch, self.rng)
+        place = data["place"][indices].astype(np.int64)
+        # Steps of an execution lie side by side in the ring; the oldest may have been overwritten at the seam.
+        kept = np.arange(int(place.max()) + 1)
+        prefix = (indices[:, None] - place[:, None] + kept) % config.replay
+        whole = data["execution"][prefix[:, 0]] == data["execution"][indices]
+        if not whole.any():
+            return 0.0
+        indices, weights, place, prefix = indices[whole], weights[whole], place[whole], prefix[whole]
+        length = int(place.max()) + 1
+        rows = np.arange(len(indices))
+        states = data["s"][prefix[:, :length]].astype(np.int64)
+        states[kept[:length] > place[:, None]] = states[0, 0]
+        states = np.concatenate([states, states[:, :1]], axis=1)
+        states[rows, place + 1] = data["next"][indices]
+
+        unique, inverse = np.unique(states, return_inverse=True)
+        images = torch.from_numpy(self.engine.images(unique))
+        inverse = torch.from_numpy(inverse.reshape(states.shape))
+        member.online.train()
+        values = member.online(member.online.embed(images)[inverse])[0]
+        with torch.no_grad():
+            next_target = member.target(member.target.embed(images)[inverse])[0]
+        here, after = torch.from_numpy(place), torch.from_numpy(place + 1)
+        pick = torch.arange(len(indices))
+        terminal = data["terminal"][indices]
+        if not config.bootstrap_timeout:
+            terminal = terminal | data["timeout"][indices]
+        reached = self.verdicts.of(data["next"][indices].astype(np.int64))[:, option]
+        goal = double_q_targets(
+            torch.from_numpy(reached).float(),
+            torch.from_numpy(terminal),
+            values[pick, after].detach(),
+            next_target[pick, after],
+            config.option_gamma,
+        )
+        taken = values[pick, here, torch.from_numpy(data["a"][indices].astype(np.int64))]
+        error = taken - goal
+        huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
+        loss = (huber * torch.from_numpy(weights)).mean()
+        if not torch.isfinite(loss):
+            raise NumericalError(f"the loss of option {option} is {float(loss)} at update {member.updates}")
+        member.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        member.optimiser.step()
+        member.updates += 1
+        if member.updates % config.target_interval == 0:
+            follow(member.target, member.online, config.target_tau)
+        member.replay.set_priorities(indices, error.detach().abs().numpy())
+        return float(loss.detach())
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights and exploration counters, for an artefact."""
+        state: dict[str, Tensor] = {}
+        for option, member in enumerate(self.members):
+            for name, value in member.online.state_dict().items():
+                state[f"{option}.{name}"] = value.contiguous()
+        state["option_steps"] = torch.tensor([member.steps for member in self.members])
+        state["steps_since_positive"] = torch.tensor([member.steps_since_positive for member in self.members])
+        return state
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue from the weights and counters of an artefact; the replays start empty."""
+        for option, member in enumerate(self.members):
+            prefix = f"{option}."
+            weights = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+            member.online.load_state_dict(weights)
+            member.target.load_state_dict(weights)
+            member.steps = int(state["option_steps"][option])
+            member.steps_since_positive = int(state["steps_since_positive"][option])
+            member.positives = int(member.steps_since_positive > 0)

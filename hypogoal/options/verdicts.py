@@ -1,0 +1,72 @@
+"""Members' verdicts on states (is your sub-goal reached?), cached by state id where states repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.stacked import StackedMembers
+
+if TYPE_CHECKING:
+    from hypogoal.hypotheses.ensemble import Ensemble
+
+Classifier = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+THRESHOLD = 0.5
+MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
+
+
+def learned_terminations(engine: Engine, ensembles: Sequence[Ensemble]) -> Classifier:
+    """Spec D1: option g*K + k terminates where member k of sub-goal g's ensemble says yes.
+
+    Returns:
+        A function from state ids (n,) to verdicts bool (n, G*K).
+    """
+
+    stacked = StackedMembers(ensembles)
+
+    def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        images = engine.images(ids)
+        if len(ids) < MANY:
+            return stacked.predict(images) > THRESHOLD
+        return np.concatenate([ensemble.predict(images) > THRESHOLD for ensemble in ensembles], axis=1)
+
+    return classify
+
+
+def oracle_terminations(engine: Engine) -> Classifier:
+    """Spec E6: the true sub-goal predicates, one option per sub-goal; an upper bound, never the method."""
+    return engine.labels
+
+
+class Verdicts:
+    """A classifier of states with a cache: each state is judged once.
+
+    Args:
+        classify: state ids (n,) -> bool (n, O).
+        options: the number of options, O.
+    """
+
+    def __init__(self, classify: Classifier, options: int):
+        self.classify, self.options = classify, options
+        self._known = np.zeros(1024, dtype=np.bool_)
+        self._rows = np.zeros((1024, options), dtype=np.bool_)
+
+    def of(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Verdicts bool (n, O) of states (n,)."""
+        highest = int(ids.max()) + 1
+        if highest > len(self._known):
+            size = max(highest, 2 * len(self._known))
+            self._known = np.concatenate([self._known, np.zeros(size - len(self._known), dtype=np.bool_)])
+            self._rows = np.concatenate(
+                [self._rows, np.zeros((size - len(self._rows), self.options), dtype=np.bool_)]
+            )
+        known = self._known[ids]
+        if not known.all():
+            fresh = np.unique(ids[~known])
+            self._rows[fresh] = self.classify(fresh)
+            self._known[fresh] = True
+        return self._rows[ids]

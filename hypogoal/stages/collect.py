@@ -1,0 +1,35 @@
+"""Spec A1, B3: collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.artefacts import claim
+from hypogoal.core.config import as_dict
+from hypogoal.core.progress import Progress
+from hypogoal.dataset import open_dataset, write_dataset
+from hypogoal.domains.base import Domain
+
+
+def collect(
+    domain: Domain, config: Any, out: Path, *, seed: int = 0, force: bool = False, quiet: bool = False
+) -> dict[str, Any]:
+    """Collect ``domain``'s states into ``out``.
+
+    Args:
+        domain: see :mod:`hypogoal.domains.base`.
+        config: an instance of the domain's ``config_class``.
+        out: the HDF5 file to write.
+        seed: of whatever the domain draws at random.
+        force: replace an existing file.
+        quiet: no progress.
+
+    Returns:
+        Numbers of states and positives per split and sub-goal.
+    """
+    claim(out, force=force)
+    with Progress(f"collect {domain.name}", total=1, quiet=quiet) as progress:
+        collected = domain.collect(config, seed, progress)
+    write_dataset(out, collected, domain=domain.name, config=as_dict(config), seed=seed, force=force)
+    return open_dataset(out).counts()

@@ -1,0 +1,117 @@
+"""Spec A4, D5, E: learn the meta-policy over all options while their policies go on learning.
+
+Without ``--options`` the policies start fresh (the paper's D5); with it they continue, and the steps already spent
+count in every curve.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact, sha256_of
+from hypogoal.core.compute import prepare
+from hypogoal.core.config import as_dict, setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.core.seeding import rng_for
+from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.domains.base import load_domain
+from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
+from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
+from hypogoal.options.recording import Recorder
+
+
+@dataclass(frozen=True)
+class TrainMetaConfig(PlayConfig, MetaConfig):
+    """How options are learned and chosen, and for how long."""
+
+    steps: int = setting(300_000, "environment steps, all environments together", unit="steps", source="E4: 1.5e6", low=1)
+    chooser: str = setting(
+        "ppo", "the meta-policy, or uniform choice among those offered", source="E6", choices=("ppo", "random")
+    )
+
+
+def train_meta(
+    ensemble: Path,
+    config: TrainMetaConfig,
+    out: Path,
+    *,
+    options: Path | None = None,
+    seed: int = 0,
+    force: bool = False,
+    quiet: bool = False,
+    device: str = "auto",
+) -> dict[str, Any]:
+    """Train the meta-policy over the options of an ensemble artefact and write the artefact ``out``.
+
+    Args:
+        ensemble: the ensemble artefact.
+        config: see :class:`TrainMetaConfig`.
+        out: the artefact to write.
+        options: an options artefact, made from the same ensemble, to continue from.
+        seed, force, quiet, device: as for every stage.
+
+    Returns:
+        Steps, episodes, and success and length over the last 100 episodes.
+    """
+    prepare(device)
+    source = open_artefact(ensemble, "ensemble")
+    trained = open_artefact(options, "options") if options else None
+    if trained:
+        _check_fit(trained, source, config)
+    claim(out, force=force)
+    domain = load_domain(source.config["domain"])
+    engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
+    about = as_dict(config) | {
+        "sub_goals": source.config["sub_goals"],
+        "members": verdicts.options // len(source.config["sub_goals"]),
+        "domain": domain.name,
+        "domain_config": source.config["domain_config"],
+        "options_steps": trained.config["steps"] if trained else 0,
+        "setting": config.network,
+    }
+    inputs = [ensemble, options] if options else [ensemble]
+    with create_artefact(out, kind="meta", config=about, seed=seed, inputs=inputs, force=force) as folder:
+        recorder = Recorder(verdicts.options)
+        if trained:
+            learner.load(load_tensors(trained.path / "options.safetensors"))
+            recorder.episodes = read_episodes(trained.path / "episodes.csv")
+            recorder.start_at(trained.config["steps"])
+        policy = MetaPolicy(engine, verdicts.options, config, seed) if config.chooser == "ppo" else None
+        chooser: Chooser = policy or RandomChooser(rng_for(seed, "random-choice"))
+        loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=config.gamma)
+        log = MetricsLog(folder / "metrics.jsonl")
+        with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
+            play(loop, config.steps, log, progress)
+        log.close()
+        recorder.write(folder, engine.images)
+        save_tensors(folder / "options.safetensors", learner.state())
+        if policy:
+            save_tensors(folder / "meta.safetensors", policy.state())
+        (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
+    return {"steps": recorder.steps, "episodes": len(recorder.episodes), "success": recorder.success(), "length": recorder.length()}
+
+
+def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
+    """The rows of an ``episodes.csv``: step, length, reward, terminated."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [(int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"])) for r in csv.DictReader(file)]
+
+
+def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> None:
+    made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
+    if sha256_of(source.path / "manifest.json") not in made_from:
+        raise UserError("these options were trained with another ensemble", trained.path, f"Train them from {source.path}.")
+    for key in ("network", "termination", "layout_seed"):
+        if trained.config[key] != getattr(config, key):
+            raise UserError(
+                f"these options were trained with {key}={trained.config[key]}, train-meta has {getattr(config, key)}",
+                trained.path,
+                f"Give --set {key}={trained.config[key]}.",
+            )

@@ -1,0 +1,288 @@
+"""The fast DoorKey engines are pixel- and step-exact with the MiniGrid environment (Spec B1, B2)."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+
+import numpy as np
+import pytest
+from minigrid.core.world_object import Key
+from numpy.typing import NDArray
+
+from hypogoal.domains.doorkey import DoorKeyEngine, DoorKeyEnv, SingleDoorKey
+from hypogoal.domains.doorkey_env import DOOR_LABELS, SUB_GOALS, Layout
+from hypogoal.domains.doorkey_states import DROP, FORWARD, N_ACTIONS, PICKUP, START, TOGGLE, DoorKeyStates
+
+LAYOUTS = range(100, 140)
+STEPS = 110
+MAX_STEPS = 50
+
+
+def shortest_actions(states: DoorKeyStates) -> list[int]:
+    """A shortest way to the goal, walked back from it."""
+    ids, steps = states.distances()
+    goal = int(np.argmax(states.at_goal(ids)))
+    target, actions = int(ids[goal]), []
+    for depth in range(int(steps[goal]) - 1, -1, -1):
+        before = ids[steps == depth]
+        reaching = [
+            (int(state), action)
+            for action in range(N_ACTIONS)
+            if action != DROP
+            for state in before[states.step(before, np.full(len(before), action)) == target]
+        ]
+        target, action = reaching[0]
+        actions.append(action)
+    assert target == START
+    return actions[::-1]
+
+
+def busy_action(env: DoorKeyEnv, rng: np.random.Generator) -> int:
+    """A random action that likes to use what is in front: keys, the door, an empty cell to drop on."""
+    x, y = env.front_pos
+    ahead = env.grid.get(int(x), int(y))
+    if rng.random() < 0.5:
+        if isinstance(ahead, Key):
+            return PICKUP
+        if ahead is env.door:
+            return int(rng.choice([TOGGLE, FORWARD]))
+        if ahead is None and env.held and rng.random() < 0.25:
+            return DROP
+        return FORWARD
+    return int(rng.integers(N_ACTIONS))
+
+
+def count_events(seen: Counter[str], held: int, door: tuple[bool, bool], env: DoorKeyEnv) -> None:
+    """What the last step did, so that the test can say that it tested it."""
+    seen["pickup"] += len(env.held) > held
+    seen["drop"] += len(env.held) < held
+    seen[f"hold {len(env.held)}"] += 1
+    was_locked, was_open = door
+    seen["unlock"] += was_locked and not env.door.is_locked
+    seen["close"] += was_open and not env.door.is_open
+    seen["reopen"] += not was_locked and not was_open and env.door.is_open
+    seen["in the doorway"] += env.grid.get(int(env.agent_pos[0]), int(env.agent_pos[1])) is env.door
+
+
+def play_side_by_side(layout_seed: int, keyring: bool, seen: Counter[str]) -> None:
+    """One MiniGrid env, the engine (its other two envs doing something else) and the single engine, in step.
+
+    Episodes begin on a shortest path: to the goal, then to the open door, in turn; they go on at random.
+    """
+    label = DOOR_LABELS[layout_seed % 2]
+    env = DoorKeyEnv(layout_seed=layout_seed, door_label=label, keyring=keyring, max_steps=MAX_STEPS)
+    engine = DoorKeyEngine(layout_seed, 3, door_label=label, keyring=keyring, max_steps=MAX_STEPS)
+    single = SingleDoorKey(layout_seed, keyring=keyring, max_steps=MAX_STEPS)
+    rng = np.random.default_rng(layout_seed)
+    path: list[int] = []
+    try:
+        shortest = engine.shortest_path()
+        path = shortest_actions(engine.states)
+        assert len(path) == shortest
+    except ValueError:
+        assert not keyring
+    scripts = itertools.cycle([path, path[: path.index(TOGGLE) + 1] if path else []])
+    script = list(next(scripts))
+    first, _ = env.reset()
+    assert np.array_equal(single.reset(), first)
+    assert np.array_equal(engine.observe(), np.stack([first] * 3))
+    buffer = np.empty((3, 64, 64, 3), np.uint8)
+    for _ in range(STEPS):
+        held, door = len(env.held), (env.door.is_locked, env.door.is_open)
+        action = script.pop(0) if script else busy_action(env, rng)
+        image, reward, terminated, truncated, info = env.step(action)
+        count_events(seen, held, door, env)
+        step = engine.step(np.array([action, *rng.integers(N_ACTIONS, size=2)]))
+        outcome = (step.rewards[0], step.terminated[0], step.truncated[0])
+        assert outcome == (reward, terminated, truncated)
+        assert np.array_equal(engine.images(step.next_ids[:1])[0], image)
+        assert engine.labels(step.next_ids)[0].tolist() == list(info["labels"].values())
+        drawn, *alone = single.step(action)
+        assert tuple(alone) == outcome
+        assert np.array_equal(drawn, image)
+        if terminated or truncated:
+            seen["terminated"] += terminated
+            seen["truncated"] += truncated
+            image, _ = env.reset()
+            assert np.array_equal(single.reset(), image)
+            script = list(next(scripts))
+        assert engine.observe(buffer) is buffer
+        assert np.array_equal(buffer[0], image)
+        assert np.array_equal(buffer, engine.images(engine.ids))
+        assert engine.elapsed[0] == env.step_count
+
+
+@pytest.mark.parametrize("keyring", [True, False])
+def test_engines_are_exact_to_minigrid(keyring: bool) -> None:
+    """Spec B1, B2: pixels, rewards, ends and labels equal at every step of 40 layouts; all rules used."""
+    seen: Counter[str] = Counter()
+    for layout_seed in LAYOUTS:
+        play_side_by_side(layout_seed, keyring, seen)
+    for event in (
+        "pickup",
+        "drop",
+        "unlock",
+        "close",
+        "reopen",
+        "in the doorway",
+        "terminated",
+        "truncated",
+    ):
+        assert seen[event] >= 20, (event, seen)
+    assert seen["hold 1"] >= 100
+    assert (seen["hold 2"] >= 100 and seen["hold 3"] >= 50) is keyring
+    assert seen["hold 2"] + seen["hold 3"] > 0 or not keyring
+
+
+def test_vector_engine_is_many_single_ones() -> None:
+    """Spec B1: 16 environments over 1,500 uniformly random steps, episodes beginning again by themselves."""
+    engine = DoorKeyEngine(9, 16, max_steps=200)
+    singles = [SingleDoorKey(9, max_steps=200) for _ in range(16)]
+    expected = [single.reset() for single in singles]
+    ended = 0
+    for actions in np.random.default_rng(1).integers(N_ACTIONS, size=(1500, 16)):
+        step = engine.step(actions)
+        for index, (single, action) in enumerate(zip(singles, actions.tolist(), strict=True)):
+            expected[index], reward, terminated, truncated = single.step(action)
+            assert (step.rewards[index], step.terminated[index], step.truncated[index]) == (
+                reward,
+                terminated,
+                truncated,
+            )
+            if terminated or truncated:
+                ended += 1
+                expected[index] = single.reset()
+        assert np.array_equal(engine.observe(), np.stack(expected))
+    assert ended >= 16 * 7
+
+
+def test_images_are_the_callers_to_keep() -> None:
+    """Later steps do not draw into images that were handed out."""
+    engine, single = DoorKeyEngine(0, 1), SingleDoorKey(0)
+    vector_image, single_image = engine.observe(), single.reset()
+    copies = vector_image.copy(), single_image.copy()
+    for action in (0, 1, 1, 0, 2):
+        engine.step(np.array([action]))
+        engine.observe()
+        single.step(action)
+    assert np.array_equal(vector_image, copies[0])
+    shown = engine.observe(copy=False)
+    assert np.array_equal(shown, engine.images(engine.ids))
+    with pytest.raises(ValueError, match="read-only"):
+        shown[0] = 0
+    assert np.array_equal(single_image, copies[1])
+
+
+def test_codes_say_the_whole_image() -> None:
+    """64 one-byte codes and the tiles give the image; states of one image have one code row."""
+    engine = DoorKeyEngine(0, 1)
+    ids = engine.reachable()
+    codes = engine.codes(ids)
+    tiled = engine.tiles[codes].reshape(-1, 8, 8, 8, 8, 3).transpose(0, 1, 3, 2, 4, 5).reshape(-1, 64, 64, 3)
+    assert np.array_equal(tiled, engine.images(ids))
+    assert len(np.unique(codes, axis=0)) == len(ids)
+    assert len({image.tobytes() for image in engine.images(ids)}) == len(ids)
+
+
+def test_reachable_states_of_seed_0() -> None:
+    """Spec B2, B3: 1,640 images without drop, with the positives that the authors' definitions give."""
+    engine = DoorKeyEngine(0, 1)
+    positives = engine.labels(engine.reachable()).sum(axis=0)
+    assert dict(zip(SUB_GOALS, positives.tolist(), strict=True)) == {
+        "collect-blue-key": 836,
+        "collect-green-key": 836,
+        "collect-red-key": 1288,
+        "open-red-door": 468,
+        "go-to-goal": 8,
+    }
+    assert len(engine.reachable()) == 1640
+    in_front = DoorKeyEngine(0, 1, door_label="in-front")
+    assert in_front.labels(in_front.reachable())[:, 3].sum() == 8
+
+
+def corridor() -> Layout:
+    """Agent, red key, door, goal in a row (cells 9 to 12), the other keys walled in."""
+    open_cells = {9, 10, 11, 12, 50, 52}
+    return Layout(
+        frozenset(range(64)) - open_cells, door=11, goal=12, start=9, direction=0, keys=(50, 52, 10)
+    )
+
+
+def test_a_corridor_counted_by_hand() -> None:
+    """Spec B3, F5: pick up, forward, toggle, forward, forward; states with and without drop on paper.
+
+    Without drop: key lying 4, held and locked 8, held and open 12 + 1 on the goal, held and closed 8. With
+    it, the key can also lie in cell 9 or 10: locked 4 (9), closed 4 + 4, open 8 + 1 (9) and 4 + 4 + 1 (10).
+    """
+    states = DoorKeyStates(corridor())
+    engine = DoorKeyEngine(0, 1, states=states)
+    assert engine.shortest_path() == 5
+    assert shortest_actions(states) == [PICKUP, FORWARD, TOGGLE, FORWARD, FORWARD]
+    assert len(engine.reachable()) == 33
+    assert len(engine.reachable(drop=True)) == 33 + 30
+
+
+def test_all_layouts_are_solvable_with_the_ring() -> None:
+    """Spec B1: shortest paths of 9 to 26 steps; without the ring some layouts need a key to be dropped."""
+    paths = [DoorKeyEngine(seed, 1).shortest_path() for seed in range(60)]
+    assert min(paths) >= 9
+    assert max(paths) <= 26
+    with pytest.raises(ValueError, match="dropping"):
+        DoorKeyEngine(1, 1, keyring=False).shortest_path()
+
+
+def test_random_success() -> None:
+    """Spec F5: none below the shortest path; else the share that single episodes have; seeds repeat."""
+    engine = DoorKeyEngine(9, 1, max_steps=500)
+    assert (
+        DoorKeyEngine(9, 1, max_steps=engine.shortest_path() - 1).random_success(
+            200, np.random.default_rng(0)
+        )
+        == 0
+    )
+    share = engine.random_success(600, np.random.default_rng(0))
+    assert share == engine.random_success(600, np.random.default_rng(0))
+    rng, single, wins = np.random.default_rng(1), SingleDoorKey(9), 0
+    for _ in range(600):
+        single.reset()
+        for action in rng.integers(N_ACTIONS, size=500).tolist():
+            _, _, terminated, truncated = single.step(action)
+            if terminated or truncated:
+                wins += terminated
+                break
+    assert 0 < share < 0.2
+    assert abs(share - wins / 600) < 4 * np.sqrt(2 * 0.05 * 0.95 / 600)
+
+
+def test_ids_are_stable_and_survive_a_snapshot() -> None:
+    """Spec G1: a resumed engine gives the same ids as one that never stopped."""
+
+    def play(engine: DoorKeyEngine, actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.stack([engine.step(row).next_ids for row in actions])
+
+    actions = np.random.default_rng(3).integers(N_ACTIONS, size=(600, 4))
+    unbroken = DoorKeyEngine(7, 4)
+    play(unbroken, actions[:300])
+    early = unbroken.images(np.arange(unbroken.n_states))
+    snapshot = unbroken.snapshot()
+    expected = play(unbroken, actions[300:])
+    assert np.array_equal(unbroken.images(np.arange(len(early))), early)
+    resumed = DoorKeyEngine(7, 4)
+    resumed.restore(snapshot)
+    assert resumed.n_states == len(early)
+    assert np.array_equal(play(resumed, actions[300:]), expected)
+    assert np.array_equal(resumed.elapsed, unbroken.elapsed)
+    for other in (resumed, DoorKeyEngine(8, 4), DoorKeyEngine(7, 5)):
+        with pytest.raises(ValueError, match="snapshot"):
+            other.restore(snapshot)
+
+
+def test_wrong_arguments_are_refused() -> None:
+    """An action that does not exist, or a buffer of the wrong kind, never gives a wrong state or image."""
+    with pytest.raises(IndexError):
+        DoorKeyEngine(0, 2).step(np.array([0, 7]))
+    with pytest.raises(IndexError):
+        SingleDoorKey(0).step(7)
+    with pytest.raises(ValueError, match="uint8"):
+        DoorKeyEngine(0, 2).images(np.array([0, 0]), np.empty((2, 64, 64, 3), np.float32))

@@ -1,0 +1,105 @@
+"""An ensemble predicts what its members say, and comes back from its state (Spec C5, A8, G2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import torch_generator
+from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble
+from hypogoal.hypotheses.networks import as_input
+
+SHAPE = (48, 48, 3)
+
+
+def ensemble_of(members: int = 3) -> Ensemble:
+    """Fresh members."""
+    return Ensemble("doorkey", SHAPE, members, torch_generator(1, "weights"))
+
+
+def images_of(kind: str, count: int) -> NDArray[np.uint8]:
+    """Noise, or images of few distinct patches."""
+    rng = np.random.default_rng(2)
+    if kind == "noise":
+        return rng.integers(256, size=(count, *SHAPE), dtype=np.uint8)
+    cells = rng.choice([10, 90, 200], size=(count, 6, 6, 3), p=(0.9, 0.05, 0.05)).astype(np.uint8)
+    return cells.repeat(8, axis=1).repeat(8, axis=2)
+
+
+@pytest.mark.parametrize("kind", ["noise", "tiles"])
+@pytest.mark.parametrize("count", [0, 1, 4, 70, PATCHES_FROM + 1])
+def test_predict_is_what_each_member_says(kind: str, count: int) -> None:
+    """Spec C1: float32 (N, K), the softmax of a plain forward pass of each member, in whatever way it is computed."""
+    ensemble = ensemble_of().train()
+    observations = images_of(kind, count)
+    found = ensemble.predict(observations)
+    assert found.shape == (count, 3)
+    assert found.dtype == np.float32
+    assert ensemble.training, "predict leaves the mode as it was"
+    ensemble.eval()
+    with torch.no_grad():
+        inputs = as_input(torch.from_numpy(observations))
+        expected = [member(inputs).softmax(dim=-1)[:, 1].numpy() for member in ensemble.members]
+    np.testing.assert_allclose(found, np.stack(expected, axis=1), rtol=0, atol=2e-6)
+
+
+def test_predicting_changes_nothing() -> None:
+    """Spec C5: no running statistics move, not even of an ensemble in training mode."""
+    ensemble = ensemble_of().train()
+    before = ensemble.state()
+    ensemble.predict(images_of("tiles", PATCHES_FROM + 1))
+    ensemble.predict(images_of("noise", 3))
+    assert all(torch.equal(value, before[name]) for name, value in ensemble.state().items())
+
+
+def test_an_ensemble_comes_back_from_its_state(tmp_path: Path) -> None:
+    """Spec A8, G2: through safetensors, bit for bit."""
+    ensemble = ensemble_of()
+    observations = images_of("noise", 6)
+    save_file(ensemble.state(), tmp_path / "goal.safetensors")
+    back = Ensemble.from_state("doorkey", SHAPE, 3, load_file(tmp_path / "goal.safetensors"))
+    assert len(back) == 3
+    assert not back.training
+    np.testing.assert_array_equal(back.predict(observations), ensemble.predict(observations))
+
+
+def test_the_state_is_a_copy() -> None:
+    """Spec G1: a state that was taken does not move when training goes on."""
+    ensemble = ensemble_of(1)
+    state = ensemble.state()
+    with torch.no_grad():
+        for weight in ensemble.parameters():
+            weight.add_(1.0)
+    assert not torch.equal(state["members.0.0.weight"], ensemble.state()["members.0.0.weight"])
+
+
+def test_foreign_weights_are_one_clear_line() -> None:
+    """Spec G2: too few members, another size, a missing tensor, NaN."""
+    state = ensemble_of().state()
+    name = "members.0.13.weight"
+    cases = [
+        (2, state),
+        (4, state),
+        (3, {key: value for key, value in state.items() if key != name}),
+        (3, state | {name: state[name][:1]}),
+        (3, state | {"extra": torch.zeros(1)}),
+    ]
+    for members, foreign in cases:
+        with pytest.raises(UserError, match="the weights do not fit the ensemble"):
+            Ensemble.from_state("doorkey", SHAPE, members, foreign)
+    with pytest.raises(UserError, match=r"NaN or Inf \(at members\.0\.13\.weight\)"):
+        Ensemble.from_state("doorkey", SHAPE, 3, state | {name: torch.full_like(state[name], torch.nan)})
+
+
+def test_foreign_observations_are_one_clear_line() -> None:
+    """Spec G2."""
+    with pytest.raises(UserError, match=r"float64 \(2, 48, 48, 3\)\. Give uint8 \(N, 48, 48, 3\)"):
+        ensemble_of(1).predict(np.zeros((2, *SHAPE)))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"uint8 \(48, 48, 3\)"):
+        ensemble_of(1).predict(np.zeros(SHAPE, dtype=np.uint8))

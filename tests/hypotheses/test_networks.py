@@ -1,0 +1,122 @@
+"""Member networks: shapes, sizes, sharing of weights, DeepLift (Spec C5)."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network, reordered
+
+SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4)}
+
+
+def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -> nn.Sequential:
+    """A fresh network with BatchNorm statistics that are not those of a fresh one."""
+    generator = torch.Generator().manual_seed(seed)
+    network = build_network(name, shape or SHAPES[name], generator)
+    for layer in network:
+        if isinstance(layer, nn.BatchNorm2d):
+            for value in (layer.weight, layer.bias, layer.running_mean, layer.running_var):
+                nn.init.uniform_(value, 0.5, 1.5, generator=generator)
+    return network
+
+
+@pytest.mark.parametrize(
+    ("name", "convolutions", "dense", "parameters"),
+    [
+        # 32x3x25 + 64 + 64x32x9 + 128, 64 x 2 x 2 = 256 features: 256x750 + 750 + 750x100 + 100 + 100x2 + 2
+        ("doorkey", 2, 3, 2400 + 64 + 18432 + 128 + 192750 + 75100 + 202),
+        # 32x4x64 + 64 + 64x32x16 + 128 + 64x64x9 + 128, 64 x 7 x 7 = 3136 features: 3136x512 + 512 + 512x2 + 2
+        ("montezuma", 3, 2, 8192 + 64 + 32768 + 128 + 36864 + 128 + 1606144 + 1026),
+    ],
+)
+def test_the_layers_are_the_papers(name: str, convolutions: int, dense: int, parameters: int) -> None:
+    """Spec C5: the number of layers of each kind; the number of weights worked by hand."""
+    layers = list(network_of(name))
+    kinds = [type(layer) for layer in layers]
+    assert kinds.count(nn.Conv2d) == kinds.count(nn.BatchNorm2d) == convolutions
+    assert kinds.count(nn.Linear) == dense
+    assert len({id(layer) for layer in layers}) == len(layers)
+    assert sum(weight.numel() for layer in layers for weight in layer.parameters()) == parameters
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_logits_of_each_state(name: str) -> None:
+    """Spec C5: float (N, C, H, W) -> (N, 2), each state on its own in evaluation mode."""
+    network = network_of(name).eval()
+    height, width, channels = SHAPES[name]
+    images = torch.rand(5, channels, height, width, generator=torch.Generator().manual_seed(1))
+    logits = network(images)
+    assert logits.shape == (5, 2)
+    torch.testing.assert_close(network(images[3:4]), logits[3:4])
+
+
+@pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36)])
+def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
+    """Spec C5, G2: the dense layers take what the convolutions leave; too small an image is one clear line."""
+    shape = (smallest, smallest + 9, 1)
+    assert network_of(name, shape).eval()(torch.zeros(1, 1, smallest, smallest + 9)).shape == (1, 2)
+    with pytest.raises(UserError, match=rf"too small for the network '{name}': observation shape \({smallest - 1},"):
+        network_of(name, (smallest - 1, smallest, 1))
+
+
+def test_wrong_names_and_shapes_are_one_clear_line() -> None:
+    """Spec G2."""
+    with pytest.raises(UserError, match="unknown network: resnet. Choose one of doorkey, montezuma"):
+        network_of("resnet", (64, 64, 3))
+    with pytest.raises(UserError, match=r"need images \(H, W, C\): observation shape \(8,\)"):
+        network_of("doorkey", (8,))
+
+
+def test_weights_come_from_the_generator_alone() -> None:
+    """Spec G1: the global random state is neither read nor moved."""
+    torch.manual_seed(7)
+    first = network_of("doorkey").state_dict()
+    drawn = torch.rand(1)
+    torch.manual_seed(7)
+    assert torch.equal(drawn, torch.rand(1))
+    second, third = network_of("doorkey").state_dict(), network_of("doorkey", seed=1).state_dict()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["0.weight"], third["0.weight"])
+
+
+def test_the_faster_order_is_the_same_function() -> None:
+    """Spec C5: ReLU behind the pooling: same values, same gradients, same weights, ReLU really moved."""
+    network = network_of("doorkey").double()
+    faster = reordered(network)
+    assert [type(layer) for layer in list(faster)[2:4]] == [nn.MaxPool2d, nn.ReLU]
+    images = torch.rand(3, 3, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    gradients = []
+    for one in (network, faster):
+        network.zero_grad()
+        logits = one(images)
+        logits.square().sum().backward()
+        gradients.append([logits.detach(), *(weight.grad.clone() for weight in network.parameters())])  # type: ignore[union-attr]
+    torch.testing.assert_close(gradients[0], gradients[1])
+
+
+def test_as_input_scales_and_turns() -> None:
+    """Spec B1: uint8 (N, H, W, C) -> float (N, C, H, W) in 0..1."""
+    observations = torch.zeros(2, 4, 5, 3, dtype=torch.uint8)
+    observations[1, 2, 3, 0] = 255
+    inputs = as_input(observations)
+    assert inputs.shape == (2, 3, 4, 5)
+    assert inputs[1, 0, 2, 3] == 1.0
+    assert inputs.sum() == 1.0
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+@pytest.mark.filterwarnings("ignore:Setting forward, backward hooks:UserWarning")
+def test_deeplift_is_complete(name: str) -> None:
+    """Spec F2, C5: attributions sum to the output's difference from the baseline's, so DeepLift may be used."""
+    captum = pytest.importorskip("captum.attr")
+    network = network_of(name).eval()
+    height, width, channels = SHAPES[name]
+    image = torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    baseline = torch.full_like(image, 0.5)
+    attributions = captum.DeepLift(network).attribute(image, baseline, target=1)
+    difference = (network(image) - network(baseline))[0, 1]
+    assert abs(difference) > 1e-3
+    assert attributions.sum().item() == pytest.approx(difference.item(), rel=1e-3)

@@ -1,0 +1,78 @@
+"""Working on distinct patches is the plain network: values, gradients and running statistics (Spec C5)."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from hypogoal.hypotheses import patches
+from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network
+
+
+def grid_world(count: int, cells: int, seed: int = 0, channels: int = 3) -> NDArray[np.uint8]:
+    """Images of 8x8 tiles, of which there are four."""
+    rng = np.random.default_rng(seed)
+    tiles = rng.integers(256, size=(4, 8, 8, channels), dtype=np.uint8)
+    grid = rng.choice(4, size=(count, cells, cells), p=(0.85, 0.05, 0.05, 0.05))
+    return tiles[grid].transpose(0, 1, 3, 2, 4, 5).reshape(count, cells * 8, cells * 8, channels)
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+@pytest.mark.parametrize("training", [True, False])
+def test_it_is_the_plain_network(name: str, training: bool) -> None:
+    """Spec C5: in double precision the two agree to rounding, with a repeated image in the batch."""
+    images = grid_world(40, 6 if name == "doorkey" else 5, channels=3)
+    plain = build_network(name, images.shape[1:], torch.Generator().manual_seed(1)).double().train(training)
+    tabled = copy.deepcopy(plain)
+    tables = patches._tables(images, patches.windows_of(plain) or [])
+    chosen = np.array([3, 17, 3, 29, 0])
+    batch = patches.take(tables, chosen)
+    wide = patches.Batch(
+        batch.colours.double(), batch.parts, tuple(s.double() for s in batch.shares), batch.places, batch.last
+    )
+    inputs = as_input(torch.from_numpy(images[chosen]))
+    expected, found = plain(inputs.double()), patches.forward(tabled, wide)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7)  # shares were rounded to float32
+    expected.square().sum().backward()
+    found.square().sum().backward()
+    for (key, one), two in zip(plain.named_parameters(), tabled.parameters(), strict=True):
+        assert one.grad is not None
+        assert two.grad is not None
+        assert (one.grad - two.grad).norm() <= 1e-4 * one.grad.norm(), key
+    for one, two in zip(plain.buffers(), tabled.buffers(), strict=True):
+        torch.testing.assert_close(two, one, rtol=1e-5, atol=1e-7)
+
+
+def test_tables_by_hand() -> None:
+    """Two 3x3 images of two colours, windows of 2x2: four distinct windows at 8 places."""
+    ink = np.array([[[1, 1, 1], [1, 1, 1], [1, 1, 0]], [[1, 1, 1], [1, 1, 1], [1, 1, 1]]], dtype=np.uint8)
+    tables = patches._tables(ink[..., None] * 255, [(2, 1)])
+    colour_of = tables.colours[:, 0].tolist()
+    assert sorted(colour_of) == [0.0, 1.0]
+    (level,) = tables.levels
+    ids = level.rows[level.lines]
+    windows = [[colour_of[part] for part in level.parts[patch]] for patch in ids.reshape(-1)]
+    assert windows == [[1.0] * 4] * 3 + [[1.0, 1.0, 1.0, 0.0]] + [[1.0] * 4] * 4
+    assert len(level.parts) == 2
+    batch = patches.take(tables, np.array([0]))
+    assert sorted(batch.shares[0][0].tolist()) == [0.25, 0.75]
+    assert batch.places == (4,)
+
+
+def test_only_what_repeats_is_tabled() -> None:
+    """Noise and photographs take the plain way; so do layers that tables do not know."""
+    network = build_network("doorkey", (48, 48, 3), torch.Generator())
+    windows = patches.windows_of(network)
+    assert windows == [(5, 2), (3, 2), (3, 2), (4, 2)]
+    noise = np.random.default_rng(0).integers(256, size=(8, 48, 48, 3), dtype=np.uint8)
+    assert patches.make_tables(noise, windows) is None
+    assert patches.make_tables(grid_world(80, 6), windows) is not None
+    assert patches.make_tables(grid_world(80, 6)[:0], windows) is None
+    assert patches.make_tables(grid_world(80, 6), None) is None
+    for layer in (nn.Conv2d(3, 4, 3, padding=1), nn.Conv2d(3, 3, 3, groups=3), nn.Conv2d(3, 3, (3, 1)), nn.Dropout()):
+        assert patches.windows_of(nn.Sequential(layer)) is None

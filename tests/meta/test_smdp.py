@@ -1,0 +1,81 @@
+"""SMDP returns and the meta-policy's loss (Spec E1-E3)."""
+
+import numpy as np
+import pytest
+import torch
+from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork
+from hypogoal.meta.ppo import clipped_surrogate
+from hypogoal.meta.smdp import smdp_advantages
+
+
+def test_advantages_by_hand() -> None:
+    """Spec E1: two options of 3 and 2 steps, gamma .9, lambda .5, the second reaches the goal with reward 1."""
+    discounts = np.array([0.9**3, 0.9**2])
+    returns = np.array([0.0, 0.9])  # reward 1 at the option's second step
+    advantages = smdp_advantages(
+        returns, discounts, np.array([0.4, 0.6]), np.array([0.6, 7.0]), np.array([False, True]), np.array([False, True]), 0.5
+    )
+    last = 0.9 - 0.6
+    first = 0.9**3 * 0.6 - 0.4 + 0.9**3 * 0.5 * last
+    np.testing.assert_allclose(advantages, [first, last])
+
+
+def test_a_cut_episode_bootstraps_and_does_not_leak_into_the_next() -> None:
+    """Spec D2, E1: truncation is not termination."""
+    advantages = smdp_advantages(
+        np.array([0.0, 1.0]),
+        np.array([0.5, 0.5]),
+        np.zeros(2),
+        np.array([2.0, 0.0]),
+        np.array([False, True]),
+        np.array([True, True]),
+        1.0,
+    )
+    np.testing.assert_allclose(advantages, [1.0, 1.0])
+
+
+def test_lambda_one_is_the_discounted_return_minus_the_value() -> None:
+    """Spec E1: with lambda 1 the values of states between cancel, whatever the durations."""
+    rng = np.random.default_rng(0)
+    returns, values = rng.random(6), rng.random(6)
+    discounts = 0.95 ** rng.integers(1, 11, size=6)
+    next_values = np.append(values[1:], 9.0)
+    ended = np.array([False] * 5 + [True])
+    advantages = smdp_advantages(returns, discounts, values, next_values, ended, ended, 1.0)
+    total = 0.0
+    for t in reversed(range(6)):
+        total = returns[t] + discounts[t] * total
+        assert advantages[t] == pytest.approx(total - values[t])
+
+
+def test_the_clipped_surrogate_by_hand() -> None:
+    """Spec E1: Eq. (7) of Schulman et al. 2017."""
+    ratio = torch.tensor([1.5, 0.5, 1.1])
+    advantages = torch.tensor([1.0, -1.0, 2.0])
+    loss = clipped_surrogate(ratio.log(), torch.zeros(3), advantages, 0.2)
+    assert float(loss) == pytest.approx(-(1.2 - 0.8 + 2.2) / 3)
+
+
+def test_masked_options_are_never_drawn() -> None:
+    """Spec D6, E2: neither head draws an option that is not offered, and the categorical gives it no probability."""
+    scores = torch.tensor([[50.0, 0.0, 0.0, 1.0]]).repeat(500, 1)
+    offered = torch.tensor([[False, True, False, True]]).repeat(500, 1)
+    generator = torch.Generator().manual_seed(0)
+    for head in (CategoricalHead(4), GaussianHead(4)):
+        options, drawn = head.draw(scores, offered, generator)
+        assert set(options.tolist()) == {1, 3}
+        log_prob, entropy = head.log_prob(scores, offered, drawn)
+        assert torch.isfinite(log_prob).all() and torch.isfinite(entropy).all()
+        assert int(head.best(scores, offered)[0]) == 3
+    log_prob, entropy = CategoricalHead(4).log_prob(scores[:1], offered[:1], torch.tensor([[3.0]]))
+    assert float(log_prob.detach()) == pytest.approx(1 - np.log(np.exp(1) + 1))
+    p = np.exp(1) / (1 + np.exp(1))
+    assert float(entropy.detach()) == pytest.approx(-(p * np.log(p) + (1 - p) * np.log(1 - p)), rel=1e-5)
+
+
+@pytest.mark.parametrize("network", [LightMetaNetwork, PaperMetaNetwork])
+def test_networks_give_a_score_per_option_and_a_value(network: type) -> None:
+    """Spec E2: shared features, an actor and a critic; early choices are nearly uniform."""
+    out = network((64, 64, 3), 15)(torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8))
+    assert out.shape == (2, 16)
+    assert float(out[:, :15].softmax(1).max()) < 0.08

@@ -1,0 +1,164 @@
+"""Spec E7, A7: the baselines are in working order and their artefacts say what happened."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.tensors import load_tensors
+from hypogoal.domains.base import Step
+from hypogoal.learners.baselines.agents import epsilon, train
+from hypogoal.learners.baselines.engine_env import EngineEnv
+from hypogoal.learners.baselines.networks import NETWORKS
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, hyperparameters
+from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
+
+EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 6_000, ("dqn", "tuned"): 12_000}
+
+
+class Corridor:
+    """Five cells in a row: action 2 steps right, action 0 left, the others do nothing; the goal is the last cell."""
+
+    n_actions, observation_shape, max_steps, n_states = 7, (64, 64, 3), 20, 5
+
+    def __init__(self, count: int, max_steps: int = 20):
+        self.count, self.max_steps = count, max_steps
+        self.ids = np.zeros(count, dtype=np.int64)
+        self.elapsed = np.zeros(count, dtype=np.int64)
+        self.steps_seen = 0
+
+    def reset(self):
+        self.ids[:], self.elapsed[:] = 0, 0
+        return self.ids.copy()
+
+    def step(self, actions):
+        following = np.clip(self.ids + (actions == 2).astype(int) - (actions == 0).astype(int), 0, 4)
+        self.elapsed += 1
+        terminated = following == 4
+        truncated = ~terminated & (self.elapsed >= self.max_steps)
+        over = terminated | truncated
+        self.ids = np.where(over, 0, following)
+        self.elapsed = np.where(over, 0, self.elapsed)
+        return Step(following, terminated.astype(np.float32), terminated, truncated)
+
+    @property
+    def tiles(self):
+        return np.stack([np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), (255, 40, 40), np.uint8)])
+
+    def codes(self, ids):
+        codes = np.zeros((len(ids), 64), dtype=np.uint8)
+        codes[np.arange(len(ids)), 9 + np.asarray(ids)] = 1
+        return codes
+
+    def images(self, ids, out=None):
+        drawn = self.tiles[self.codes(ids)].reshape(-1, 8, 8, 8, 8, 3)
+        return drawn.transpose(0, 1, 3, 2, 4, 5).reshape(-1, 64, 64, 3)
+
+    def labels(self, ids):
+        return (np.asarray(ids) == 4)[:, None]
+
+
+@pytest.mark.parametrize(("agent", "setting"), list(HYPERPARAMETERS))
+def test_solves_an_easy_task(agent, setting):
+    """Spec E7: every baseline, in either setting, learns a corridor that random play rarely finishes in time."""
+    chosen = hyperparameters(agent, setting)
+    env = EngineEnv(Corridor(chosen.environments))
+    trained = train(env, chosen, steps=EASY_STEPS[agent, setting], seed=1)
+    assert np.mean([terminated for *_, terminated in env.episodes[:20]]) < 0.8
+    trial = EngineEnv(Corridor(1))
+    observation = trial.reset()
+    while not trial.episodes:
+        observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
+    assert trial.episodes == [(4, 4, 1.0, 1)]  # the shortest way, by the greedy policy
+
+
+def test_a_time_limit_is_not_a_terminal_state():
+    """Spec E7, D2: an episode that is cut is told to the agent as truncated, with the state it was cut in."""
+    env = EngineEnv(Corridor(2, max_steps=3))
+    env.reset()
+    for _ in range(2):
+        assert not env.step(np.array([1, 2]))[2].any()
+    observations, rewards, done, infos = env.step(np.array([1, 2]))
+    assert done.tolist() == [True, True]
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, True]
+    assert infos[1]["terminal_observation"].tolist() == env.engine.codes(np.array([3]))[0].tolist()
+    assert observations.tolist() == env.engine.codes(np.array([0, 0])).tolist()  # the next episode's start
+    assert env.episodes == [(6, 3, 0.0, 0), (6, 3, 0.0, 0)]
+
+
+def test_reaching_the_goal_is_a_terminal_state():
+    """Spec E7: the goal ends the episode without a truncation mark, also on the last step before the limit."""
+    env = EngineEnv(Corridor(1, max_steps=4))
+    env.reset()
+    for _ in range(3):
+        env.step(np.array([2]))
+    _, rewards, done, infos = env.step(np.array([2]))
+    assert done[0]
+    assert rewards[0] == 1.0
+    assert infos[0]["TimeLimit.truncated"] is False
+    assert env.episodes == [(4, 4, 1.0, 1)]
+
+
+@pytest.mark.parametrize("network", list(NETWORKS))
+def test_tile_codes_say_what_the_image_says(network):
+    """Spec E7: with a table of tiles the network gives what the same weights give for the RGB image itself."""
+    from hypogoal.domains.doorkey_engine import DoorKeyEngine
+
+    engine = DoorKeyEngine(3, 4)
+    ids = engine.reachable()[::37]
+    images = torch.from_numpy(engine.images(ids)).permute(0, 3, 1, 2).float() / 255
+    codes = torch.from_numpy(engine.codes(ids)).float()
+    by_code = NETWORKS[network](spaces.Box(0, 255, (64,), np.uint8), tiles=engine.tiles, rows=8)
+    by_image = NETWORKS[network](spaces.Box(0, 255, (3, 64, 64), np.uint8))
+    by_image.load_state_dict(by_code.state_dict())
+    assert torch.allclose(by_code(codes), by_image(images), atol=1e-5)
+
+
+def test_epsilon_waits_for_the_first_goal():
+    """Spec E7, Table 4: 1 -> 0.01 over 8,000 steps from the start; the tuned one falls from its first goal on."""
+    paper, tuned = hyperparameters("dqn", "paper"), hyperparameters("dqn", "tuned")
+    assert [round(epsilon(paper, step, None), 3) for step in (0, 4_000, 8_000, 9_000)] == [1.0, 0.505, 0.01, 0.01]
+    assert epsilon(tuned, 200_000, None) == 1.0
+    assert epsilon(tuned, 24_000, first_goal=20_000) == pytest.approx(0.525)
+
+
+def test_the_paper_setting_is_the_papers():
+    """Spec E3, D3, E7: the numbers of Tables 4 and 5."""
+    ppo, dqn = hyperparameters("ppo", "paper"), hyperparameters("dqn", "paper")
+    assert (ppo.rollout, ppo.entropy, ppo.gae_lambda, ppo.batch, ppo.epochs) == (100, 0.01, 0.97, 64, 10)
+    assert (dqn.replay, dqn.target_interval, dqn.epsilon_steps, dqn.epsilon_final) == (100_000, 10, 8_000, 0.01)
+    assert (dqn.learning_rate, dqn.batch, dqn.environments) == (2.5e-4, 32, 4)
+
+
+def test_the_artefact_says_what_happened(tmp_path):
+    """Spec A7, A8: episodes, layout, hyperparameters, weights without pickle; the same seed gives the same run."""
+    config = BaselineConfig(agent="dqn", steps=2_560, max_episode_steps=40, random_episodes=20)
+    numbers = train_baseline("doorkey", config, tmp_path / "a", seed=4, quiet=True)
+    train_baseline("doorkey", config, tmp_path / "b", seed=4, quiet=True)
+    artefact = open_artefact(tmp_path / "a", "baseline")
+    assert artefact.config["hyperparameters"]["epsilon_from"] == "first-goal"
+    assert artefact.config["environments"] == 32
+    assert numbers["steps"] == 2_560
+    rows = list(csv.DictReader((tmp_path / "a" / "episodes.csv").read_text().splitlines()))
+    assert len(rows) == numbers["episodes"] == 64
+    facts = json.loads((tmp_path / "a" / "layout.json").read_text())
+    assert facts["shortest_path"] >= 9
+    assert facts["random_episodes"] == 20
+    assert load_tensors(tmp_path / "a" / "policy.safetensors")["q_net.q_net.0.weight"].shape == (7, 128)
+    names = {path.name for path in artefact.path.iterdir()}
+    assert names == {"manifest.json", "episodes.csv", "layout.json", "metrics.jsonl", "policy.safetensors"}
+    for name in names - {"manifest.json"}:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_global_randomness_is_given_back():
+    """Spec E7: the library draws from global generators; ours are where they were afterwards."""
+    torch.manual_seed(5)
+    expected = torch.rand(1)
+    torch.manual_seed(5)
+    train(EngineEnv(Corridor(4)), hyperparameters("ppo", "paper"), steps=100, seed=0)
+    assert torch.rand(1) == expected
