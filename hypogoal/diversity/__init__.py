@@ -39,7 +39,7 @@ def load_objective(name: str) -> PairLoss:
         UserError: no such objective, or the entry point cannot be loaded or is not an objective.
     """
     if name in OBJECTIVES:
-        return importlib.import_module(f"{__name__}.{name}").pair_loss  # type: ignore[no-any-return]
+        return importlib.import_module(f"{__name__}.{name}").pair_loss
     entries = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if name not in entries:
         known = ", ".join(sorted({*OBJECTIVES, *entries}))
@@ -47,8 +47,12 @@ def load_objective(name: str) -> PairLoss:
     try:
         found = entries[name].load()
     except (ImportError, AttributeError) as error:
-        raise UserError(f"the diversity objective cannot be loaded ({error})", name, "Check its package.") from None
+        raise UserError(
+            f"the diversity objective cannot be loaded ({error})", name, "Check its package."
+        ) from None
     found = getattr(found, "pair_loss", found)
     if not callable(found):
-        raise UserError("the entry point is no diversity objective", name, "Give a pair_loss(logits_a, logits_b).")
-    return found  # type: ignore[no-any-return]
+        raise UserError(
+            "the entry point is no diversity objective", name, "Give a pair_loss(logits_a, logits_b)."
+        )
+    return found

@@ -91,7 +91,9 @@ class DoorKeyEngine:
         self.states = states or DoorKeyStates(layout_of(layout_seed), keyring, door_label)
         self._tiles = _tile_rows()
         self._canvas = draw(np.repeat(self.states.codes(np.array([START])), count, axis=0))
-        self._canvas_cells = _cells_of(self._canvas)
+        self._canvas_rows = _cells_of(self._canvas).reshape(-1)
+        cell = np.arange(count * CELLS)  # and where in the canvas each one's first pixel row is
+        self._first_rows = cell // SIZE * (SIZE * TILE) + cell % SIZE
         self._drawn = self.states.codes(np.full(count, START))  # the codes that the canvas shows
         self.ids = np.full(count, START, np.int64)
         self.elapsed = np.zeros(count, np.int64)
@@ -134,10 +136,9 @@ class DoorKeyEngine:
             copy: False, no copy: the engine's own buffer, read-only, drawn over at the next call.
         """
         codes = self.states.codes(self.ids)
-        changed = np.flatnonzero(codes != self._drawn)
-        environment, cell = changed // CELLS, changed % CELLS
-        where = (environment, cell // SIZE, slice(None), cell % SIZE)
-        self._canvas_cells[where] = self._tiles.take(codes.ravel().take(changed), axis=0)
+        changed = (codes != self._drawn).ravel().nonzero()[0]
+        where = self._first_rows.take(changed)[:, None] + np.arange(TILE) * SIZE
+        self._canvas_rows[where] = self._tiles.take(codes.ravel().take(changed), axis=0)
         self._drawn = codes
         if not copy:
             shown = self._canvas.view()

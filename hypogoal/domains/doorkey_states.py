@@ -23,7 +23,7 @@ from hypogoal.domains.doorkey_env import DOOR_COLOUR, KEY_COLOURS, SIZE, TILE, L
 N_ACTIONS = len(Actions)
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = (int(action) for action in Actions)
 CELLS = SIZE * SIZE
-POSES = CELLS * 4  # pose = cell * 4 + direction
+POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
 HELD = CELLS  # a key's place: its cell, or HELD + rank on the ring (rank 0 was picked up first)
 OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers
 START = 0  # the id of the start state
@@ -46,12 +46,14 @@ MOVES = np.tile(_POSE, (N_ACTIONS, 1))
 MOVES[LEFT] = (_POSE & ~3) | ((_POSE - 1) & 3)
 MOVES[RIGHT] = (_POSE & ~3) | ((_POSE + 1) & 3)
 MOVES[FORWARD] = AHEAD * 4 + (_POSE & 3)
+TURN_OR_WALK = MOVES - _POSE  # as what is added to the pose
 # Given the action and the code ahead: which row of MOVES applies, and may the configuration change?
 MOVE_AS = np.full((N_ACTIONS, N_CODES), DONE)
 MOVE_AS[LEFT], MOVE_AS[RIGHT] = LEFT, RIGHT
 MOVE_AS[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = FORWARD
 MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), np.bool_)
 MAY_CHANGE[PICKUP, KEY : KEY + 3] = MAY_CHANGE[DROP, EMPTY] = MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
+_AHEAD, _AGENT_ON = AHEAD.tolist(), AGENT_ON.tolist()  # one look-up in a list is faster than in an array
 
 Configuration = tuple[int, int, int, int]  # the door; the places of the blue, the green and the red key
 
@@ -92,11 +94,15 @@ class DoorKeyStates:
         self._configurations: list[Configuration] = []
         self._index: dict[Configuration, int] = {}
         self._changes: dict[int, int] = {}
-        self._codes = np.zeros((16, CELLS), np.uint8)
+        self._bare_codes = np.zeros((16, CELLS), np.uint8)  # of each configuration, without the agent
         self._places = np.zeros((16, 4), np.uint8)
         self._id_at = np.full((16, POSES), UNKNOWN, np.int64)  # the id of (configuration, pose)
-        self._configuration_of = np.zeros(256, np.int64)
-        self._pose_of = np.zeros(256, np.int64)
+        # Of each id: configuration * POSES + pose; where in the bare codes the cell ahead is; and so on.
+        self._site = np.zeros(256, np.int64)
+        self._ahead = np.zeros(256, np.int64)
+        self._codes = np.zeros((256, CELLS), np.uint8)
+        self._code_bytes = self._codes.data.cast("B")  # writes a row several times faster than NumPy
+        self._on_goal = np.zeros(256, np.bool_)
         start = layout.start * 4 + layout.direction
         self._new_id(self._index_of((LOCKED, *layout.keys)) * POSES + start)
 
@@ -107,17 +113,16 @@ class DoorKeyStates:
 
     def step(self, ids: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
         """MiniGrid's rules: the states that follow, int64 (n,), on actions int (n,) of 0 .. 6."""
-        configuration, pose = self._configuration_of.take(ids), self._pose_of.take(ids)
-        front = AHEAD.take(pose)
-        ahead = self._codes.ravel().take(configuration * CELLS + front)
-        case = np.asarray(actions, np.int64) * N_CODES + ahead
-        for index in np.flatnonzero(MAY_CHANGE.take(case)).tolist():
-            here = configuration.item(index)
-            configuration[index] = self.change(here, front.item(index), int(actions[index]))
-        site = configuration * POSES + MOVES.take(MOVE_AS.take(case) * POSES + pose)
-        following = self._id_at.ravel().take(site)
-        for index in np.flatnonzero(following < 0).tolist():
-            following[index] = self._new_id(site.item(index))
+        site = self._site.take(ids)
+        case = np.asarray(actions, np.int64) * N_CODES + self._bare_codes.ravel().take(self._ahead.take(ids))
+        following_site = site + TURN_OR_WALK.take(MOVE_AS.take(case) * POSES + (site & (POSES - 1)))
+        for index in MAY_CHANGE.take(case).nonzero()[0].tolist():
+            configuration, pose = divmod(site.item(index), POSES)
+            changed = self.change(configuration, _AHEAD[pose], int(actions[index]))
+            following_site[index] = changed * POSES + pose
+        following = self._id_at.ravel().take(following_site)
+        for index in (following < 0).nonzero()[0].tolist():
+            following[index] = self._new_id(following_site.item(index))
         return following
 
     def change(self, configuration: int, front: int, action: int) -> int:
@@ -143,19 +148,15 @@ class DoorKeyStates:
 
     def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
         """What each cell shows, uint8 (n, 64) row by row: with ``tiles()`` it says the whole image."""
-        codes = self._codes.take(self._configuration_of.take(ids), axis=0)
-        pose = self._pose_of.take(ids)
-        agent = np.arange(len(codes)) * CELLS + (pose >> 2)
-        codes.ravel()[agent] = AGENT_ON.take(codes.ravel().take(agent)) + (pose & 3)
-        return codes
+        return self._codes.take(ids, axis=0)
 
     def at_goal(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the agent is on the goal, bool (n,)."""
-        return self._pose_of.take(ids) >> 2 == self.layout.goal
+        return self._on_goal.take(ids)
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Spec B2: true sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
-        configuration, pose = self._configuration_of[ids], self._pose_of[ids]
+        configuration, pose = np.divmod(self._site.take(ids), POSES)
         door, keys = self._places[configuration, 0], self._places[configuration, 1:]
         facing = AHEAD[pose] == self.layout.door
         return sub_goals_reached(keys >= HELD, door == OPEN, facing, self.at_goal(ids), self.door_label)
@@ -166,7 +167,7 @@ class DoorKeyStates:
         ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked); ``keys_held`` has bit 0 for the blue, 1 for
         the green, 2 for the red key.
         """
-        configuration, pose = self._configuration_of[ids], self._pose_of[ids]
+        configuration, pose = np.divmod(self._site.take(ids), POSES)
         held = self._places[configuration, 1:] >= HELD
         return {
             "agent_x": (pose >> 2) % SIZE,
@@ -210,11 +211,9 @@ class DoorKeyStates:
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         """All ids given so far, as arrays: ``restore`` on fresh states of the layout gives the same ids."""
-        known = slice(self.n_states)
         return {
             "configurations": np.array(self._configurations, np.uint8),
-            "configuration_of": self._configuration_of[known].copy(),
-            "pose_of": self._pose_of[known].copy(),
+            "sites": self._site[: self.n_states].copy(),
         }
 
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
@@ -224,23 +223,31 @@ class DoorKeyStates:
             ValueError: states were met already, or the snapshot is of another layout.
         """
         first = [tuple(configuration) for configuration in snapshot["configurations"][:1].tolist()]
-        if self.n_states != 1 or first != self._configurations or snapshot["pose_of"][0] != self._pose_of[0]:
+        if self.n_states != 1 or first != self._configurations or snapshot["sites"][0] != self._site[0]:
             raise ValueError("a snapshot is restored onto the fresh states of its own layout")
         for door, *keys in snapshot["configurations"].tolist():
             self._index_of((door, keys[0], keys[1], keys[2]))
-        for site in (snapshot["configuration_of"] * POSES + snapshot["pose_of"]).tolist():
+        for site in snapshot["sites"].tolist():
             self._new_id(site)
 
     def _new_id(self, site: int) -> int:
         known = self._id_at.item(site)
         if known != UNKNOWN:  # met twice in one vector step
             return known
-        if self.n_states == len(self._pose_of):
-            self._configuration_of = _doubled(self._configuration_of)
-            self._pose_of = _doubled(self._pose_of)
         new = self.n_states
-        self._configuration_of[new], self._pose_of[new] = divmod(site, POSES)
-        self._id_at[divmod(site, POSES)] = new
+        if new == len(self._site):
+            self._site, self._ahead, self._codes, self._on_goal = (
+                _doubled(table) for table in (self._site, self._ahead, self._codes, self._on_goal)
+            )
+            self._code_bytes = self._codes.data.cast("B")
+        configuration, pose = divmod(site, POSES)
+        cell = pose >> 2
+        row = bytearray(self.rows[configuration])
+        row[cell] = _AGENT_ON[row[cell]] + (pose & 3)
+        self._code_bytes[new * CELLS : (new + 1) * CELLS] = row
+        self._site[new], self._ahead[new] = site, configuration * CELLS + _AHEAD[pose]
+        self._on_goal[new] = cell == self.layout.goal
+        self._id_at[configuration, pose] = new
         self.n_states += 1
         return new
 
@@ -249,9 +256,9 @@ class DoorKeyStates:
         if known is not None:
             return known
         new = len(self._configurations)
-        if new == len(self._codes):
-            self._codes, self._places, self._id_at = (
-                _doubled(self._codes),
+        if new == len(self._bare_codes):
+            self._bare_codes, self._places, self._id_at = (
+                _doubled(self._bare_codes),
                 _doubled(self._places),
                 _doubled(self._id_at, UNKNOWN),
             )
@@ -266,7 +273,7 @@ class DoorKeyStates:
         self._index[configuration] = new
         self._configurations.append(configuration)
         self.rows.append(bytes(row))
-        self._codes[new] = np.frombuffer(row, np.uint8)
+        self._bare_codes[new] = np.frombuffer(row, np.uint8)
         self._places[new] = configuration
         return new
 

@@ -1,12 +1,12 @@
 """Spec C5: member networks, chosen by name.
 
-Each is a plain ``nn.Sequential`` of modules used once, from float (N, C, H, W) in 0..1 to logits (N, 2), column 1
-being "sub-goal reached". DeepLift attributes rightly only through such modules, and only with each ReLU before its
-MaxPool. :func:`reordered` gives the same function in the order that is faster to train.
+Each is a plain ``nn.Sequential`` of modules used once, from float (N, C, H, W) in 0..1 to logits (N, 2),
+column 1 being "sub-goal reached". DeepLift attributes rightly only through such modules, and only with each
+ReLU before its MaxPool. :func:`reordered` gives the same function in the order that is faster to train.
 
-The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors' public
-code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of 0.1 in DoorKey's
-network is left out, since the paper has none.
+The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors'
+public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of
+0.1 in DoorKey's network is left out, since the paper has none.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CLASSES = 2
 
 
 def doorkey(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
-    """Spec C5: DoorKey, two convolutions (+ BatchNorm + ReLU) and three dense layers; at least 41x41 pixels.
+    """Spec C5: DoorKey, two convolutions (+ BatchNorm + ReLU) and three dense layers; from 41x41 pixels.
 
     Source: the paper's appendix; sizes from the authors' code (minigrid_cnn.py).
     """
@@ -41,7 +41,7 @@ def doorkey(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
 
 
 def montezuma(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
-    """Spec C5: Montezuma, three convolutions (+ BatchNorm + ReLU) and two dense layers; at least 36x36 pixels.
+    """Spec C5: Montezuma, three convolutions (+ BatchNorm + ReLU) and two dense layers; from 36x36 pixels.
 
     Source: the paper's appendix; sizes from the authors' code (monte_cnn.py).
     """
@@ -94,7 +94,9 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
             with torch.no_grad():
                 features = nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
         except RuntimeError:
-            raise UserError(f"images too small for the network {name!r}", where, "Give larger ones.") from None
+            raise UserError(
+                f"images too small for the network {name!r}", where, "Give larger ones."
+            ) from None
         layers.append(nn.Flatten())
         for inputs, outputs in pairwise((features.numel(), *hidden)):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
@@ -105,8 +107,8 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
 def reordered(network: nn.Sequential) -> nn.Sequential:
     """The same function with each ReLU after its MaxPool; the modules, and so the weights, are shared.
 
-    ReLU is monotone, so the order does not matter to values or gradients, but behind the pooling it has a quarter
-    of the work. Only attribution needs the other order.
+    ReLU is monotone, so the order does not matter to values or gradients, but behind the pooling it has a
+    quarter of the work. Only attribution needs the other order.
     """
     layers = list(network)
     for index, (layer, following) in enumerate(pairwise(network)):

@@ -1,9 +1,9 @@
 """Convolutions over images that are made of few distinct patches: each distinct patch is computed once.
 
-A grid world's image repeats a few tiles, so of the thousands of places where a convolution or a pooling looks in a
-batch of images, few differ. Here a layer works on a table of the distinct patches, and BatchNorm weighs each by how
-often it occurs. Up to rounding this is the plain network, values, gradients and running statistics alike, several
-times faster on a CPU.
+A grid world's image repeats a few tiles, so of the thousands of places where a convolution or a pooling
+looks in a batch of images, few differ. Here a layer works on a table of the distinct patches, and BatchNorm
+weighs each by how often it occurs. Up to rounding this is the plain network, values, gradients and running
+statistics alike, several times faster on a CPU.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Tables:
-    """The distinct patches of N images: colours float32 (U, C) in 0..1, and a level per convolution or pooling."""
+    """Distinct patches of N images: colours float32 (U, C) in 0..1; a level per convolution or pooling."""
 
     colours: Tensor
     levels: tuple[Level, ...]
@@ -109,8 +109,10 @@ def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]])
     return Tables(torch.from_numpy(colours.astype(np.float32)).div_(255.0), tuple(levels))
 
 
-def _level(rows: NDArray[np.int64], lines: NDArray[np.int64], distinct: int, kernel: int, stride: int) -> Level:
-    """The distinct kernel x kernel windows: bands of ``kernel`` rows first, then windows in the distinct bands."""
+def _level(
+    rows: NDArray[np.int64], lines: NDArray[np.int64], distinct: int, kernel: int, stride: int
+) -> Level:
+    """Distinct kernel x kernel windows: first bands of ``kernel`` rows, then windows in distinct bands."""
     lines, bands = _join(_strided(lines, kernel, stride), np.arange(len(rows))[:, None])
     high = rows[bands]  # (R, kernel, W)
     pieces = [piece for row in range(kernel) for piece in _strided(high[:, row], kernel, stride)]
@@ -174,7 +176,7 @@ def take(tables: Tables, images: NDArray[np.int64]) -> Batch:
 
 
 def forward(network: nn.Sequential, batch: Batch) -> Tensor:
-    """What ``network`` gives for the images of ``batch``, in its training or evaluation mode: logits (B, 2)."""
+    """Logits (B, 2) that ``network`` gives the images of ``batch``, in its training or evaluation mode."""
     rows, level = batch.colours, -1
     for layer in network:
         if isinstance(layer, nn.Conv2d):

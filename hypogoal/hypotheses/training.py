@@ -1,4 +1,4 @@
-"""Training an ensemble: agree on the labelled states, disagree on the unlabelled ones (Eq. (1), Spec C2-C4)."""
+"""Training an ensemble: agree on labelled states, disagree on unlabelled ones (Eq. (1), Spec C2-C4)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fit(
     *,
     device: torch.device | str = "cpu",
 ) -> Ensemble:
-    """Eq. (1): the trained members of one sub-goal. On one machine's CPU the same arguments give the same bytes.
+    """Eq. (1): the trained members of one sub-goal. On one CPU the same arguments give the same bytes.
 
     Args:
         observations: uint8 (N, H, W, C), the labelled states.
@@ -48,8 +48,8 @@ def fit(
         config: the settings.
         seed: of the initial weights and the batches.
         on_step: called every ``REPORT_EVERY`` steps and at the last one with the number of steps done, of
-            ``total_steps(config)``, and with that step's ``loss``, ``labelled`` (mean over the members in training)
-            and ``diversity`` (the inner sums of Eq. (1), before their weight).
+            ``total_steps(config)``, and with that step's ``loss``, ``labelled`` (mean over the members in
+            training) and ``diversity`` (the inner sums of Eq. (1), before their weight).
         device: where to train; the ensemble stays there.
 
     Returns:
@@ -59,15 +59,23 @@ def fit(
         UserError: labels of one class only, or no unlabelled states though members are to differ.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
-    ensemble = Ensemble(config.network, observations.shape[1:], config.members, torch_generator(seed, "weights"))
+    ensemble = Ensemble(
+        config.network, observations.shape[1:], config.members, torch_generator(seed, "weights")
+    )
     ensemble.to(device)
     networks = ensemble.networks()
     states = TrainingStates(observations, labels, unlabelled, networks[0], torch.device(device))
     if _diverse(config) and len(unlabelled) == 0:
         raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
-    rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
+    rounds = (
+        [[m] for m in range(config.members)]
+        if config.schedule == "sequential"
+        else [[*range(config.members)]]
+    )
     for done, members in enumerate(rounds):
-        _fit_members(networks, members, states, config, seed_for(seed, "batches", done), done * config.steps, on_step)
+        _fit_members(
+            networks, members, states, config, seed_for(seed, "batches", done), done * config.steps, on_step
+        )
     return ensemble.eval()
 
 
@@ -85,13 +93,15 @@ def _fit_members(
     steps_before: int,
     on_step: OnStep | None,
 ) -> None:
-    """Train ``members`` against each other and against those before them, which are frozen (none, or sequential)."""
+    """Train ``members`` against each other and against those before them, which are frozen."""
     trained = [networks[member].train() for member in members]
     diverse = _diverse(config)
     frozen = states.unlabelled_logits(networks[: members[0]]) if diverse else []
     objective = load_objective(config.diversity)
     class_weights = torch.tensor(
-        [config.class_weight_negative, config.class_weight_positive], dtype=torch.float32, device=states.device
+        [config.class_weight_negative, config.class_weight_positive],
+        dtype=torch.float32,
+        device=states.device,
     )
     optimiser = torch.optim.Adam(
         [weight for network in trained for weight in network.parameters()],
@@ -103,7 +113,10 @@ def _fit_members(
     for labelled, unlabelled in states.batches(config, seed):
         targets = states.targets(labelled)
         label_losses = torch.stack(
-            [nn.functional.cross_entropy(logits, targets, class_weights) for logits in states.forward(trained, labelled)]
+            [
+                nn.functional.cross_entropy(logits, targets, class_weights)
+                for logits in states.forward(trained, labelled)
+            ]
         )
         pair_losses = label_losses.new_zeros(0)
         if diverse or (config.unlabelled_bn and len(unlabelled)):
@@ -125,8 +138,8 @@ def _pair_losses(
 ) -> Tensor:
     """Eq. (1), the inner sums: a loss (P,) for each pair, first of those in training, then with the frozen.
 
-    The double sum meets each pair in training in both orders: a factor of 2. Its i = m is left out: disagreement with
-    itself would push every member to p = 1/2.
+    The double sum meets each pair in training in both orders: a factor of 2. Its i = m is left out:
+    disagreement with itself would push every member to p = 1/2.
     """
     losses = [2.0 * objective(one, other) for one, other in combinations(logits, 2)]
     losses += [objective(old, one) for one in logits for old in frozen]
@@ -152,11 +165,19 @@ class _Watch:
     """Reports the losses and stops at the first that is NaN or Inf, looking every ``REPORT_EVERY`` steps."""
 
     def __init__(
-        self, members: Sequence[int], frozen: int, config: EnsembleConfig, steps_before: int, on_step: OnStep | None
+        self,
+        members: Sequence[int],
+        frozen: int,
+        config: EnsembleConfig,
+        steps_before: int,
+        on_step: OnStep | None,
     ):
         self._names = [f"the labelled loss of member {member}" for member in members]
         if _diverse(config):
-            pairs = [*combinations(members, 2), *((old, member) for member in members for old in range(frozen))]
+            pairs = [
+                *combinations(members, 2),
+                *((old, member) for member in members for old in range(frozen)),
+            ]
             self._names += [f"the diversity loss of members {one} and {other}" for one, other in pairs]
         self._members, self._config = members, config
         self._before, self._on_step = steps_before, on_step
@@ -188,4 +209,6 @@ class _Watch:
         """Check that the last step left finite weights."""
         for member, network in zip(self._members, networks, strict=True):
             if not all(bool(value.isfinite().all()) for value in network.state_dict().values()):
-                raise NumericalError(f"a weight of member {member} is NaN or Inf after step {self._before + self._done}")
+                raise NumericalError(
+                    f"a weight of member {member} is NaN or Inf after step {self._before + self._done}"
+                )

@@ -150,7 +150,7 @@ class MetaPolicy:
 
     def _step(self, loss: Tensor) -> None:
         if not torch.isfinite(loss):
-            raise NumericalError(f"the meta-policy's loss is {float(loss)} at update {self.updates}")
+            raise NumericalError(f"the meta-policy's loss is {float(loss.detach())} at update {self.updates}")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, GRADIENT_NORM, foreach=True)

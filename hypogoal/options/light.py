@@ -170,7 +170,7 @@ class LightLearner:
 
     def _step(self, loss: Tensor) -> None:
         if not torch.isfinite(loss):
-            raise NumericalError(f"the option loss is {float(loss)} at update {self.updates}; nothing was saved over")
+            raise NumericalError(f"the option loss is {float(loss.detach())} at update {self.updates}; nothing was saved over")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.online.parameters(), GRADIENT_NORM, foreach=True)

@@ -35,7 +35,7 @@ def images_of(kind: str, count: int) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("kind", ["noise", "tiles"])
 @pytest.mark.parametrize("count", [0, 1, 4, 70, PATCHES_FROM + 1])
 def test_predict_is_what_each_member_says(kind: str, count: int) -> None:
-    """Spec C1: float32 (N, K), the softmax of a plain forward pass of each member, in whatever way it is computed."""
+    """Spec C1: float32 (N, K), the softmax of each member's plain forward pass, however it is computed."""
     ensemble = ensemble_of().train()
     observations = images_of(kind, count)
     found = ensemble.predict(observations)

@@ -18,8 +18,9 @@ def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -
     network = build_network(name, shape or SHAPES[name], generator)
     for layer in network:
         if isinstance(layer, nn.BatchNorm2d):
-            for value in (layer.weight, layer.bias, layer.running_mean, layer.running_var):
-                nn.init.uniform_(value, 0.5, 1.5, generator=generator)
+            for value in layer.state_dict().values():
+                if value.is_floating_point():
+                    nn.init.uniform_(value, 0.5, 1.5, generator=generator)
     return network
 
 
@@ -28,7 +29,7 @@ def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -
     [
         # 32x3x25 + 64 + 64x32x9 + 128, 64 x 2 x 2 = 256 features: 256x750 + 750 + 750x100 + 100 + 100x2 + 2
         ("doorkey", 2, 3, 2400 + 64 + 18432 + 128 + 192750 + 75100 + 202),
-        # 32x4x64 + 64 + 64x32x16 + 128 + 64x64x9 + 128, 64 x 7 x 7 = 3136 features: 3136x512 + 512 + 512x2 + 2
+        # 32x4x64 + 64 + 64x32x16 + 128 + 64x64x9 + 128, 64 x 7 x 7 features: 3136x512 + 512 + 512x2 + 2
         ("montezuma", 3, 2, 8192 + 64 + 32768 + 128 + 36864 + 128 + 1606144 + 1026),
     ],
 )
@@ -55,16 +56,18 @@ def test_logits_of_each_state(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36)])
 def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
-    """Spec C5, G2: the dense layers take what the convolutions leave; too small an image is one clear line."""
+    """Spec C5, G2: dense layers take what the convolutions leave; too small an image is one clear line."""
     shape = (smallest, smallest + 9, 1)
     assert network_of(name, shape).eval()(torch.zeros(1, 1, smallest, smallest + 9)).shape == (1, 2)
-    with pytest.raises(UserError, match=rf"too small for the network '{name}': observation shape \({smallest - 1},"):
+    with pytest.raises(
+        UserError, match=rf"too small for the network '{name}': observation shape \({smallest - 1},"
+    ):
         network_of(name, (smallest - 1, smallest, 1))
 
 
 def test_wrong_names_and_shapes_are_one_clear_line() -> None:
     """Spec G2."""
-    with pytest.raises(UserError, match="unknown network: resnet. Choose one of doorkey, montezuma"):
+    with pytest.raises(UserError, match=r"unknown network: resnet\. Choose one of doorkey, montezuma"):
         network_of("resnet", (64, 64, 3))
     with pytest.raises(UserError, match=r"need images \(H, W, C\): observation shape \(8,\)"):
         network_of("doorkey", (8,))
@@ -110,11 +113,13 @@ def test_as_input_scales_and_turns() -> None:
 @pytest.mark.parametrize("name", sorted(NETWORKS))
 @pytest.mark.filterwarnings("ignore:Setting forward, backward hooks:UserWarning")
 def test_deeplift_is_complete(name: str) -> None:
-    """Spec F2, C5: attributions sum to the output's difference from the baseline's, so DeepLift may be used."""
+    """Spec F2, C5: attributions sum to the output's difference from the baseline's, as they should."""
     captum = pytest.importorskip("captum.attr")
     network = network_of(name).eval()
     height, width, channels = SHAPES[name]
-    image = torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    image = torch.rand(
+        1, channels, height, width, generator=torch.Generator().manual_seed(2)
+    ).requires_grad_()
     baseline = torch.full_like(image, 0.5)
     attributions = captum.DeepLift(network).attribute(image, baseline, target=1)
     difference = (network(image) - network(baseline))[0, 1]

@@ -40,10 +40,10 @@ def test_it_is_the_plain_network(name: str, training: bool) -> None:
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7)  # shares were rounded to float32
     expected.square().sum().backward()
     found.square().sum().backward()
-    for (key, one), two in zip(plain.named_parameters(), tabled.parameters(), strict=True):
-        assert one.grad is not None
-        assert two.grad is not None
-        assert (one.grad - two.grad).norm() <= 1e-4 * one.grad.norm(), key
+    for (key, weight), same in zip(plain.named_parameters(), tabled.parameters(), strict=True):
+        assert weight.grad is not None
+        assert same.grad is not None
+        assert (weight.grad - same.grad).norm() <= 1e-4 * weight.grad.norm(), key
     for one, two in zip(plain.buffers(), tabled.buffers(), strict=True):
         torch.testing.assert_close(two, one, rtol=1e-5, atol=1e-7)
 
@@ -74,5 +74,10 @@ def test_only_what_repeats_is_tabled() -> None:
     assert patches.make_tables(grid_world(80, 6), windows) is not None
     assert patches.make_tables(grid_world(80, 6)[:0], windows) is None
     assert patches.make_tables(grid_world(80, 6), None) is None
-    for layer in (nn.Conv2d(3, 4, 3, padding=1), nn.Conv2d(3, 3, 3, groups=3), nn.Conv2d(3, 3, (3, 1)), nn.Dropout()):
+    for layer in (
+        nn.Conv2d(3, 4, 3, padding=1),
+        nn.Conv2d(3, 3, 3, groups=3),
+        nn.Conv2d(3, 3, (3, 1)),
+        nn.Dropout(),
+    ):
         assert patches.windows_of(nn.Sequential(layer)) is None

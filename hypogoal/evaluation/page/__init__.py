@@ -1,0 +1,50 @@
+"""The report as one HTML page: sections made of blocks, drawn by a template (Spec F7)."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+from hypogoal.evaluation.page.agents import curves_section, summary_section
+from hypogoal.evaluation.page.blocks import Material, listed
+from hypogoal.evaluation.page.choices import choices_section, terminations_section
+from hypogoal.evaluation.page.hypotheses import examples_section, hypotheses_section
+from hypogoal.evaluation.page.provenance import provenance_section
+
+__all__ = ["Material", "render"]
+
+SECTIONS = (
+    summary_section,
+    curves_section,
+    hypotheses_section,
+    examples_section,
+    terminations_section,
+    choices_section,
+    provenance_section,
+)
+
+
+def render(material: Material, version: str) -> str:
+    """Spec F7: the page, self-contained; ``material.figures`` is filled on the way.
+
+    Args:
+        material: the evaluation's numbers and arrays.
+        version: hypogoal's.
+    """
+    import jinja2
+
+    loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    about = material.metrics["provenance"]
+    domains = sorted({data["domain"] for data in about["data"]} | _domains_of(about["artefacts"]))
+    return environment.get_template("report.html").render(
+        title=f"hypogoal: {material.metrics['run']}",
+        subtitle=f"{listed(domains)}; {len(about['artefacts'])} artefacts evaluated; hypogoal {version}",
+        version=version,
+        css=resources.files("hypogoal.evaluation").joinpath("templates/report.css").read_text(encoding="utf-8"),
+        sections=[make(material) for make in SECTIONS],
+        footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
+    )
+
+
+def _domains_of(artefacts: list[dict]) -> set[str]:
+    return {artefact["config"]["domain"] for artefact in artefacts if "domain" in artefact["config"]}

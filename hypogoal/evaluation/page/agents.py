@@ -1,0 +1,214 @@
+"""The sections on what the agents achieved: headline table, curves, runs and layouts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hypogoal.evaluation.agents import LEARNED, ORACLE, ORACLE_RANDOM, PRETRAINING, RANDOM
+from hypogoal.evaluation.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Line, learning_curves
+from hypogoal.evaluation.page.blocks import Block, Material, fixed, figure, interval, listed, row, section, spread, table
+from hypogoal.evaluation.summary import percent, solved, thousands
+
+COLOURS = {
+    LEARNED: (BLUE, False),
+    RANDOM: (ORANGE, False),
+    PRETRAINING: (ORANGE, True),
+    ORACLE: (GREEN, False),
+    ORACLE_RANDOM: (GREEN, True),
+    "PPO tuned": (VERMILLION, False),
+    "PPO paper": (VERMILLION, True),
+    "DQN tuned": (PURPLE, False),
+    "DQN paper": (PURPLE, True),
+}
+OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True))
+
+
+def summary_section(material: Material) -> Block:
+    """What was asked, what came out."""
+    metrics = material.metrics
+    asked = (
+        "Each sub-goal is known from one layout only. An ensemble of classifiers holds several hypotheses about what the "
+        "sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by the task "
+        "alone. Does that agent solve layouts that no data came from, and does it come to prefer the hypotheses that "
+        "are true there?"
+    )
+    return section("summary", "Summary", [asked, _answer(material)], [_headline(material)], metrics["missing"])
+
+
+def _answer(material: Material) -> str:
+    named = {agent["name"]: agent for agent in material.agents()}
+    agent = named.get(LEARNED)
+    if agent is None:
+        return ""
+    text = (
+        f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last 100 training episodes, "
+        f"taking {fixed(agent['length']['mean'], 0)} steps, {fixed(agent['length_over_shortest']['mean'], 1)} times the "
+        f"shortest path ({_runs(agent)})."
+    )
+    control = named.get(RANDOM)
+    if control is not None:
+        text += (
+            f" Uniformly random choice among the same options succeeded in {percent(control['success']['mean'])}, "
+            f"in {fixed(control['length']['mean'], 0)} steps: where success ties, length tells the two apart."
+        )
+    return text
+
+
+def _runs(agent: Mapping[str, Any]) -> str:
+    runs = agent["runs"]
+    layouts = sorted({run["layout_seed"] for run in runs})
+    seeds = sorted({run["seed"] for run in runs})
+    count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
+    return (
+        f"{count}: layout seed{'s' if len(layouts) > 1 else ''} {listed(layouts)}, "
+        f"run seed{'s' if len(seeds) > 1 else ''} {listed(seeds)}"
+    )
+
+
+def _headline(material: Material) -> Block:
+    rows = []
+    for agent in material.agents():
+        rows.append(
+            row(
+                agent["name"],
+                str(len(agent["runs"])),
+                spread(agent["success"], 1, 100),
+                spread(agent["length"], 0),
+                spread(agent["length_over_shortest"], 2),
+                spread(agent["discounted_return"], 2),
+                solved(agent["steps_to_95"]),
+                mark="main" if agent["name"] == LEARNED else "",
+            )
+        )
+    return table(
+        ("agent", "runs", "success, %", "steps", "× shortest", "discounted return", "95 % at"),
+        rows,
+        caption="Over the last 100 training episodes of each run: mean over runs ± standard error. Steps: length of an "
+        "episode, failures counted at the cap; × shortest: against the layout's shortest path. Discounted return: 0.99 per "
+        "step. 95 % at: median number of environment steps, in thousands, at which 95 of the last 100 episodes succeeded, "
+        "or how many runs got there; steps of train-options count.",
+    )
+
+
+def curves_section(material: Material) -> Block:
+    """Figure 6 with controls and baselines, and every run's numbers."""
+    agents = material.agents()
+    text = (
+        "Success at a cap of 500 steps cannot show by itself that choices are learned, so episode length stands beside it. "
+        "Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive actions on the same "
+        "observations and budget."
+    )
+    if not agents:
+        nothing = "It needs options, meta or baseline artefacts: train-meta, train-baseline."
+        return section("curves", "Learning curves", [], [figure(material, "reward", "Reward", None, missing=nothing)])
+    blocks = [_curve(material, "reward"), _curve(material, "length")]
+    blocks += [_intervals(agents), _every_run(agents), _layouts(material)]
+    return section("curves", "Learning curves", [text], blocks)
+
+
+def _curve(material: Material, quantity: str) -> Block:
+    metrics, grid = material.metrics, material.arrays["curves/grid"]
+    others = iter(OTHERS * len(metrics["agents"]))
+    lines = []
+    for index, agent in enumerate(metrics["agents"]):
+        colour, dashed = COLOURS.get(agent["name"]) or next(others)
+        lines.append(Line(agent["name"], material.arrays[f"curves/{index}/{quantity}"], colour, dashed))
+    layouts = metrics["layouts"]
+    if quantity == "reward":
+        random = [layout["random_success"] for layout in layouts if layout["random_success"] is not None]
+        references = [("random play", float(np.mean(random)))] if random else []
+        label, axis, bounds = "Undiscounted reward per episode", "reward per episode (1: goal reached)", (-0.02, 1.04)
+    else:
+        shortest = [layout["shortest_path"] for layout in layouts if layout["shortest_path"]]
+        references = [("shortest path", float(np.mean(shortest)))] if shortest else []
+        label, axis, bounds = "Episode length", "episode length (steps)", (0.0, None)
+    drawn = learning_curves(grid, lines, axis, references, bounds)
+    number = "Figure 6 of the paper" if quantity == "reward" else "Beside Figure 6 of the paper"
+    first = metrics["agents"][0]
+    dotted = "uniformly random play" if quantity == "reward" else "the shortest path"
+    caption = (
+        f"{number}: {label.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
+        f"bands: ± one standard error over runs. {first['name']}: {_runs(first)}; "
+        f"the other agents: {_others(metrics['agents'])}. Dotted: mean over layouts of {dotted}."
+    )
+    return figure(material, quantity, label, drawn, caption)
+
+
+def _others(agents: Sequence[Mapping[str, Any]]) -> str:
+    if len(agents) < 2:
+        return "none"
+    counts = sorted({len(agent["runs"]) for agent in agents[1:]})
+    same = all(
+        {(run["layout_seed"], run["seed"]) for run in agent["runs"]}
+        == {(run["layout_seed"], run["seed"]) for run in agents[0]["runs"]}
+        for agent in agents[1:]
+    )
+    return "the same layouts and seeds" if same else f"{listed(counts)} runs each, see the table of runs"
+
+
+def _intervals(agents: Sequence[Mapping[str, Any]]) -> Block:
+    rows = [
+        row(
+            agent["name"],
+            interval(agent["success"], 1, 100),
+            interval(agent["length"], 0),
+            interval(agent["discounted_return"], 2),
+            f"{agent['success']['n']}",
+        )
+        for agent in agents
+    ]
+    over = sorted({agent["success"]["interval_over"] for agent in agents})
+    return table(
+        ("agent", "success, %", "steps", "discounted return", "runs"),
+        rows,
+        heading="Interquartile means",
+        caption="Interquartile mean over runs with its 95 % bootstrap interval (2,000 resamples of "
+        f"{listed(over)}), over the last 100 episodes of each run.",
+    )
+
+
+def _every_run(agents: Sequence[Mapping[str, Any]]) -> Block:
+    rows = []
+    for agent in agents:
+        for index, run in enumerate(agent["runs"]):
+            rows.append(
+                row(
+                    agent["name"] if index == 0 else "",
+                    str(run["layout_seed"]),
+                    str(run["seed"]),
+                    thousands(run["steps"]),
+                    str(run["episodes"]),
+                    percent(run["success"]),
+                    fixed(run["length"], 1),
+                    fixed(run["length_over_shortest"], 2),
+                    fixed(run["discounted_return"], 2),
+                    thousands(run["steps_to_95"]) if run["steps_to_95"] is not None else "never",
+                    mark="first" if index == 0 else "",
+                )
+            )
+    return table(
+        ("agent", "layout", "seed", "budget", "episodes", "success", "steps", "× shortest", "return", "95 % at"),
+        rows,
+        folded="Every run",
+    )
+
+
+def _layouts(material: Material) -> Block:
+    rows = [
+        row(
+            str(layout["layout_seed"]),
+            fixed(layout["shortest_path"], 0),
+            percent(layout["random_success"]),
+            str(layout["random_episodes"]),
+        )
+        for layout in material.metrics["layouts"]
+    ]
+    return table(
+        ("layout seed", "shortest path, steps", "random play succeeds", "episodes of random play"),
+        rows,
+        heading="How hard the layouts are",
+        caption="Random play: uniformly random primitive actions, the same cap.",
+    )

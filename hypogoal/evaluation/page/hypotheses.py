@@ -1,0 +1,172 @@
+"""The sections on the ensembles: accuracy and disagreement of members, and example states."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hypogoal.evaluation.figures import best_mean_worst_members
+from hypogoal.evaluation.page.blocks import (
+    Block,
+    Material,
+    figure,
+    fixed,
+    listed,
+    picture,
+    row,
+    section,
+    spread,
+    table,
+)
+
+KINDS = {
+    "disagree": "members disagree",
+    "wrong": "all members wrong",
+    "right yes": "all right",
+    "right no": "all right",
+}
+
+
+def hypotheses_section(material: Material) -> Block:
+    """Figure 3's question on held-out layouts: best, mean and worst member, and how much members disagree."""
+    metrics = material.metrics
+    text = (
+        "Members are judged on layouts whose states were in no training set. The best member shows whether a hypothesis "
+        "that transfers is in the ensemble at all; mean and worst show what the agent has to choose among. Balanced "
+        "accuracy is 0.5 for a member that always says the same."
+    )
+    if not metrics["ensembles"]:
+        nothing = figure(material, "members", "Members' accuracy", None, missing="It needs an ensemble artefact: train-ensemble.")
+        return section("hypotheses", "Hypotheses", [], [nothing])
+    return section("hypotheses", "Hypotheses", [text], [_dots(material), _table(metrics), *_members(metrics)])
+
+
+def _dots(material: Material) -> Block:
+    rows = material.metrics["hypotheses"]
+    sub_goals = list(dict.fromkeys(entry["sub_goal"] for entry in rows))
+    kinds = []
+    for name in dict.fromkeys(entry["name"] for entry in rows):
+        values = np.full((len(sub_goals), 3), np.nan)
+        for entry in rows:
+            if entry["name"] == name:
+                means = [entry[which]["mean"] for which in ("best", "mean", "worst")]
+                values[sub_goals.index(entry["sub_goal"])] = [np.nan if mean is None else mean for mean in means]
+        kinds.append((name, values))
+    drawn = best_mean_worst_members(sub_goals, kinds) if np.isfinite([values for _, values in kinds]).any() else None
+    seeds = sorted({ensemble["seed"] for ensemble in material.metrics["ensembles"]})
+    caption = (
+        "The quantity of the paper's Figure 3, for one labelled layout: balanced accuracy on held-out layouts, pooled over "
+        "them. Filled: best member; bar: mean of members; hollow: worst member; each a mean over ensemble seeds "
+        f"({listed(seeds)}). Dotted: always the same answer."
+    )
+    missing = "No held-out states have both classes."
+    return figure(material, "members", "Members' balanced accuracy on held-out layouts", drawn, caption, missing)
+
+
+def _table(metrics: Mapping[str, Any]) -> Block:
+    rows = []
+    last = ""
+    for entry in metrics["hypotheses"]:
+        rows.append(
+            row(
+                entry["name"] if entry["name"] != last else "",
+                entry["sub_goal"],
+                *(spread(entry[which], 3) for which in ("best", "mean", "worst")),
+                spread(entry["disagreement_unlabelled"], 3),
+                spread(entry["disagreement_heldout"], 3),
+                str(entry["ensembles"]),
+                mark="first" if entry["name"] != last else "",
+            )
+        )
+        last = entry["name"]
+    return table(
+        ("ensemble", "sub-goal", "best", "mean", "worst", "disagree, unlabelled", "disagree, held-out", "seeds"),
+        rows,
+        texts=2,
+        caption="Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of states on which "
+        "two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
+    )
+
+
+def _members(metrics: Mapping[str, Any]) -> list[Block]:
+    blocks = []
+    for ensemble in metrics["ensembles"]:
+        rows = []
+        for goal in ensemble["sub_goals"]:
+            for index, member in enumerate(goal["members"]):
+                names = ("balanced_accuracy", "precision", "recall", "accuracy", "f1", "says_yes_unlabelled")
+                rows.append(
+                    row(
+                        goal["sub_goal"] if index == 0 else "",
+                        f"member {member['member']}",
+                        *(fixed(member[name], 3) for name in names),
+                        mark="first" if index == 0 else "",
+                    )
+                )
+        goal = ensemble["sub_goals"][0] if ensemble["sub_goals"] else {"states": 0, "by_layout": []}
+        blocks.append(
+            table(
+                ("sub-goal", "member", "bal. acc.", "precision", "recall", "accuracy", "F1", "yes, unlabelled"),
+                rows,
+                texts=2,
+                folded=f"Every member of {ensemble['path']} ({ensemble['name']}, seed {ensemble['seed']})",
+                caption=f"Pooled over {goal['states']} held-out states of {len(goal['by_layout'])} layouts; the last column "
+                "is the share of unlabelled states that the member calls positive.",
+            )
+        )
+    return blocks
+
+
+def examples_section(material: Material) -> Block:
+    """Held-out states with each member's verdict beside the truth."""
+    names = [name for name in material.arrays if name.startswith("examples/") and name.endswith("/observations")]
+    if not names:
+        missing = ["No example states: they need an ensemble artefact."]
+        return section("examples", "Example states", [], [], missing)
+    source = material.metrics["ensembles"][0]
+    text = (
+        f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its probability that "
+        "the sub-goal is reached. Coloured: verdicts that differ from the truth. Chosen to show each kind, so their "
+        "frequency here says nothing."
+    )
+    order = [goal["sub_goal"] for goal in source["sub_goals"]]
+    names.sort(key=lambda name: order.index(name.split("/")[1]))
+    return section("examples", "Example states", [text], [_cards(material, name.split("/")[1]) for name in names])
+
+
+def _cards(material: Material, sub_goal: str) -> Block:
+    arrays = {
+        key: material.arrays[f"examples/{sub_goal}/{key}"]
+        for key in ("observations", "probabilities", "labels", "layout_seeds", "kinds")
+    }
+    threshold = material.metrics["settings"]["threshold"]
+    cards = []
+    for index, kind in enumerate(_texts(arrays["kinds"])):
+        truth = bool(arrays["labels"][index])
+        lines = []
+        for member, probability in enumerate(arrays["probabilities"][index]):
+            verdict = bool(probability > threshold)
+            said = "yes" if verdict else "no"
+            mark = "wrong" if verdict != truth else "yes" if verdict else "no"
+            lines.append({"class": mark, "text": f"member {member}: {said} ({probability:.2f})"})
+        seed = int(arrays["layout_seeds"][index])
+        place = f", layout {seed}" if seed >= 0 else ""
+        cards.append(
+            {
+                "png": picture(arrays["observations"][index]),
+                "alt": f"A held-out state; {sub_goal} is {'reached' if truth else 'not reached'}.",
+                "title": f"{KINDS[kind]}; truth: {'yes' if truth else 'no'}{place}",
+                "lines": lines,
+            }
+        )
+    return {"kind": "cards", "heading": sub_goal, "cards": cards}
+
+
+def _texts(packed: Any) -> Sequence[str]:
+    raw = packed.item() if isinstance(packed, np.ndarray) else packed
+    return list(json.loads(raw.decode() if isinstance(raw, bytes) else raw))
+
+

@@ -1,0 +1,77 @@
+"""Spec A5, F7: draw an evaluated run as one self-contained HTML page, and its figures as files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
+from hypogoal.core.errors import UserError
+
+
+def report(run: Path, *, force: bool = False) -> Path:
+    """Draw the report of an evaluated run.
+
+    Args:
+        run: a folder with an evaluation artefact in it; that in ``run/evaluation`` where there are several.
+        force: replace an existing report.
+
+    Returns:
+        The page, ``run/report/index.html``. Beside it ``figures/*.svg`` and ``figures/*.png``.
+
+    Raises:
+        UserError: the run was not evaluated, the evaluation is damaged, or the report exists.
+    """
+    from hypogoal.evaluation.figures import to_png, to_svg
+    from hypogoal.evaluation.page import Material, render
+
+    out = run / "report"
+    source = _evaluation_of(run)
+    claim(out, force=force)
+    material = Material(_metrics(source), _arrays(source.path / "arrays.h5"))
+    page = render(material, versions().get("hypogoal", "unknown"))
+    with create_artefact(out, kind="report", config={}, seed=0, inputs=[source.path], force=force) as folder:
+        (folder / "index.html").write_text(page, encoding="utf-8")
+        (folder / "figures").mkdir()
+        for name, figure in material.figures.items():
+            (folder / "figures" / f"{name}.svg").write_text(to_svg(figure, name), encoding="utf-8")
+            (folder / "figures" / f"{name}.png").write_bytes(to_png(figure))
+    return out / "index.html"
+
+
+def _evaluation_of(run: Path) -> Artefact:
+    found = find_artefacts(run, "evaluation")
+    if not found:
+        raise UserError("this run was not evaluated", run, f"First run: hypogoal evaluate {run}")
+    preferred = [artefact for artefact in found if artefact.path == run / "evaluation"]
+    return (preferred or found)[0]
+
+
+def _metrics(source: Artefact) -> dict[str, Any]:
+    path = source.path / "metrics.json"
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
+    return dict(metrics)
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    import h5py
+
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def read(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            arrays[name] = np.asarray(item[()])
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(read)
+    except OSError:
+        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
+    return arrays

@@ -1,0 +1,121 @@
+"""Artefacts: complete or absent, and refused when they are not what is needed (Spec A8, G2)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for, seed_for, torch_generator
+from hypogoal.core.tensors import load_tensors, save_tensors
+
+
+def make(out: Path, kind: str = "meta", inputs: tuple[Path, ...] = (), force: bool = False) -> Path:
+    with create_artefact(out, kind=kind, config={"steps": 3}, seed=7, inputs=inputs, force=force) as folder:
+        (folder / "episodes.csv").write_text("step\n1\n")
+    return out
+
+
+def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
+    """Spec A8: kind, format, configuration, seed, hashes of files and of inputs, versions."""
+    first = make(tmp_path / "ensemble", "ensemble")
+    artefact = open_artefact(make(tmp_path / "meta", inputs=(first,)), "meta")
+    assert artefact.config == {"steps": 3} and artefact.seed == 7
+    assert artefact.input("ensemble") == first.resolve()
+    assert set(artefact.manifest["files"]) == {"episodes.csv"}
+    assert {"python", "torch", "numpy"} <= set(artefact.manifest["versions"])
+    assert check_files(artefact) == []
+
+
+def test_a_failed_stage_leaves_nothing(tmp_path: Path) -> None:
+    """Spec G2: no half-written output, and what stood there before stands there still."""
+    out = make(tmp_path / "meta")
+    with pytest.raises(RuntimeError, match="broke"), create_artefact(out, kind="meta", config={}, seed=0, force=True) as folder:
+        (folder / "half").write_text("x")
+        raise RuntimeError("broke")
+    assert [path.name for path in tmp_path.iterdir()] == ["meta"]
+    assert open_artefact(out).config == {"steps": 3}
+
+
+def test_moved_runs_find_their_inputs(tmp_path: Path) -> None:
+    """Spec A8: inputs are found beside the artefact when the run was moved as a whole."""
+    (tmp_path / "run").mkdir()
+    first = make(tmp_path / "run" / "ensemble", "ensemble")
+    make(tmp_path / "run" / "meta", inputs=(first,))
+    (tmp_path / "run").rename(tmp_path / "moved")
+    assert open_artefact(tmp_path / "moved" / "meta").input("ensemble") == (tmp_path / "moved" / "ensemble").resolve()
+
+
+def test_refusals(tmp_path: Path) -> None:
+    """Spec G2: each says what, where and what to do, in one line."""
+    out = make(tmp_path / "meta")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").write_text("precious")
+    cases = [
+        (lambda: claim(out), "exists already"),
+        (lambda: claim(tmp_path / "other", force=True), "no manifest"),
+        (lambda: open_artefact(tmp_path / "none"), "no such artefact"),
+        (lambda: open_artefact(tmp_path / "other"), "not an artefact"),
+        (lambda: open_artefact(out, "ensemble"), "'ensemble' is needed|but ensemble is needed"),
+        (lambda: find_artefacts(tmp_path / "none", "meta"), "no such run"),
+    ]
+    for case, words in cases:
+        with pytest.raises(UserError, match=words) as caught:
+            case()
+        assert "\n" not in str(caught.value)
+    assert (tmp_path / "other" / "mine.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": 99}, "newer"),
+        ({"files": 3}, "'files'"),
+        ({"kind": None}, "'kind'"),
+        (None, "not valid JSON"),
+        ("[]", "not a JSON object"),
+    ],
+)
+def test_damaged_and_newer_manifests(tmp_path: Path, change: object, words: str) -> None:
+    """Spec G2."""
+    out = make(tmp_path / "meta")
+    path = out / "manifest.json"
+    text = json.dumps(json.loads(path.read_text()) | change) if isinstance(change, dict) else change or "{"
+    path.write_text(str(text))
+    with pytest.raises(UserError, match=words):
+        open_artefact(out)
+
+
+def test_changed_missing_and_foreign_files_are_found(tmp_path: Path) -> None:
+    """Spec G2: hashes are checked, and a manifest cannot point outside its folder."""
+    out = make(tmp_path / "meta")
+    (out / "episodes.csv").write_text("changed")
+    assert check_files(open_artefact(out)) == ["episodes.csv: changed since it was written"]
+    (out / "episodes.csv").unlink()
+    assert check_files(open_artefact(out)) == ["episodes.csv: missing"]
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["files"] = {"../../etc/passwd": "0"}
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    assert check_files(open_artefact(out)) == ["../../etc/passwd: outside the artefact"]
+
+
+def test_damaged_weights(tmp_path: Path) -> None:
+    """Spec G2: a truncated safetensors file is one clear line."""
+    path = tmp_path / "weights.safetensors"
+    save_tensors(path, {"a": torch.arange(100.0)})
+    torch.testing.assert_close(load_tensors(path)["a"], torch.arange(100.0))
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(UserError, match="damaged"):
+        load_tensors(path)
+    with pytest.raises(UserError, match="missing"):
+        load_tensors(tmp_path / "none")
+
+
+def test_streams_are_named_and_reproducible() -> None:
+    """Randomness is passed in: same seed and name, same stream; another name, another stream."""
+    assert seed_for(1, "a", 2) == seed_for(1, "a", 2) != seed_for(1, "a", 3)
+    np.testing.assert_array_equal(rng_for(1, "a").random(3), rng_for(1, "a").random(3))
+    assert rng_for(1, "a").random() != rng_for(1, "b").random()
+    assert torch.equal(torch.rand(3, generator=torch_generator(1, "a")), torch.rand(3, generator=torch_generator(1, "a")))

@@ -1,0 +1,113 @@
+"""Settings, presets and their errors (the command line's contract in the house rules)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
+from hypogoal.core.errors import UserError
+from hypogoal.stages.run import CONFIGS, config_class_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+
+@dataclass(frozen=True)
+class Example:
+    steps: int = setting(10, "steps", unit="steps", low=1, high=1000)
+    rate: float = setting(0.5, "rate", low=0.0)
+    kind: str = setting("a", "kind", choices=("a", "b"))
+    on: bool = setting(True, "switch")
+    seeds: tuple[int, ...] = setting((1, 2), "seeds", low=0)
+
+
+def resolved(*assignments: str, **options: object) -> Example:
+    return resolve(Example, stage="example", options=options, assignments=assignments)
+
+
+def test_precedence_is_set_over_option_over_preset_over_default(tmp_path: Path) -> None:
+    """--set > option > preset > default."""
+    preset = tmp_path / "own.toml"
+    preset.write_text("[example]\nsteps = 20\nrate = 1\nkind = 'b'\n")
+    config = resolve(
+        Example, stage="example", preset=str(preset), options={"steps": 30, "rate": 2.0, "kind": None}, assignments=["steps=40"]
+    )
+    assert config == Example(steps=40, rate=2.0, kind="b", on=True, seeds=(1, 2))
+
+
+def test_texts_become_values() -> None:
+    config = resolved("steps=1_000", "rate=1e-3", "on=false", "seeds=3,4,5")
+    assert config == Example(steps=1000, rate=1e-3, on=False, seeds=(3, 4, 5))
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("step=3", "Did you mean 'steps'"),
+        ("steps=0", "Allowed: 1 .. 1000"),
+        ("steps=1001", "out of range"),
+        ("steps=many", "It must be int"),
+        ("steps=2.5", "It must be int"),
+        ("rate=nan", "not finite"),
+        ("kind=c", "Choose one of a, b"),
+        ("on=perhaps", "true or false"),
+        ("seeds=1,-1", "out of range"),
+        ("steps", "key=value"),
+    ],
+)
+def test_each_mistake_gets_one_line(assignment: str, words: str) -> None:
+    with pytest.raises(UserError) as caught:
+        resolved(assignment)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_unknown_and_broken_presets(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.toml"
+    broken.write_text("[example\n")
+    for preset, words in (("nosuch", "demo"), (str(broken), "not valid TOML"), (str(tmp_path / "no.toml"), "no such")):
+        with pytest.raises(UserError, match=words):
+            resolve(Example, stage="example", preset=preset)
+
+
+@pytest.mark.parametrize("preset", ["demo", "paper"])
+@pytest.mark.parametrize("stage", ["collect", *CONFIGS])
+def test_the_presets_resolve_for_every_stage(stage: str, preset: str) -> None:
+    """Every key of a preset is a setting, with a value in range."""
+    config = resolve(config_class_of(stage), stage=stage, preset=preset)
+    assert from_values(type(config), as_dict(config), stage) == config
+
+
+def test_the_paper_preset_has_the_papers_tables() -> None:
+    """Spec C6, D3, E3: Tables 3, 4 and 5 to the letter."""
+    ensemble = resolve(config_class_of("train-ensemble"), stage="train-ensemble", preset="paper")
+    assert (ensemble.learning_rate, ensemble.diversity_weight, ensemble.members) == (2e-4, 1e-4, 3)
+    assert (ensemble.l2_weight, ensemble.batch_size) == (1e-4, 64)
+    assert (ensemble.class_weight_negative, ensemble.class_weight_positive) == (0.5, 0.5)
+    meta = resolve(config_class_of("train-meta"), stage="train-meta", preset="paper")
+    assert (meta.replay, meta.update_interval, meta.target_interval, meta.target_tau) == (100_000, 4, 10, 1.0)
+    assert (meta.epsilon_steps, meta.epsilon_final, meta.epsilon_from) == (8_000, 0.01, "start")
+    assert (meta.option_learning_rate, meta.option_batch, meta.option_timeout) == (2.5e-4, 32, 10)
+    assert (meta.decisions, meta.entropy, meta.gae_lambda, meta.meta_batch, meta.epochs) == (100, 0.01, 0.97, 64, 10)
+    assert (meta.steps, meta.max_episode_steps, meta.experience, meta.network) == (1_500_000, 500, "own", "paper")
+    assert (meta.meta_network, meta.head) == ("paper", "gaussian")
+    run = resolve(config_class_of("run"), stage="run", preset="paper")
+    assert len(run.layout_seeds) == 10 and not run.pretrain
+    collect = resolve(config_class_of("collect"), stage="collect", preset="paper")
+    assert collect.door_label == "in-front" and collect.regime == "fixed"
+
+
+@pytest.mark.parametrize("stage", ["collect", *CONFIGS])
+def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> None:
+    """'hypogoal config' says something of each setting."""
+    config_class = config_class_of(stage)
+    assert all(row["meaning"] for row in describe(config_class))
+    from_values(config_class, as_dict(config_class()), stage)
+
+
+@given(st.text(max_size=40))
+def test_no_text_crashes_the_parser(text: str) -> None:
+    """Any --set text either resolves or is a UserError."""
+    for key in ("steps", "rate", "kind", "on", "seeds"):
+        try:
+            resolved(f"{key}={text}")
+        except UserError as error:
+            assert "\n" not in str(error)

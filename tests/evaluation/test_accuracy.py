@@ -1,0 +1,129 @@
+"""Spec F1, F2, F6: scores, disagreement and preference against values worked by hand."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.accuracy import METRICS, best_mean_worst, member_scores, scores_by_layout
+from hypogoal.evaluation.disagreement import mean_disagreement, pairwise_disagreement
+from hypogoal.evaluation.examples import overlay, pick_examples
+from hypogoal.evaluation.selection import most_and_least, preference, rank_correlation, rank_correlations, shares
+
+YES, NO = True, False
+LABELS = np.array([YES, YES, YES, YES, NO, NO])
+VERDICTS = np.array(
+    [
+        # right, one miss, always yes, never
+        [YES, YES, YES, NO],
+        [YES, YES, YES, NO],
+        [YES, YES, YES, NO],
+        [YES, NO, YES, NO],
+        [NO, NO, YES, NO],
+        [NO, YES, YES, NO],
+    ]
+)
+
+
+def test_scores_by_hand():
+    """Spec F1: four members on six states; always-yes has the better F1 of one that sees something."""
+    scores = member_scores(VERDICTS, LABELS)
+    assert set(scores) == set(METRICS)
+    np.testing.assert_allclose(scores["recall"], [1, 3 / 4, 1, 0])
+    np.testing.assert_allclose(scores["balanced_accuracy"], [1, (3 / 4 + 1 / 2) / 2, 1 / 2, 1 / 2])
+    np.testing.assert_allclose(scores["precision"], [1, 3 / 4, 4 / 6, np.nan])
+    np.testing.assert_allclose(scores["accuracy"], [1, 4 / 6, 4 / 6, 2 / 6])
+    np.testing.assert_allclose(scores["f1"], [1, 6 / 8, 8 / 10, 0])
+
+
+def test_scores_without_a_class_are_not_numbers():
+    """Spec F1: nothing is made up where a class is missing, and no warning is raised."""
+    negatives = member_scores(VERDICTS[4:], LABELS[4:])
+    assert np.isnan(negatives["balanced_accuracy"]).all()
+    assert np.isnan(negatives["recall"]).all()
+    np.testing.assert_allclose(negatives["accuracy"], [1, 1 / 2, 0, 1])
+    nothing = member_scores(VERDICTS[:0], LABELS[:0])
+    assert all(np.isnan(values).all() and values.shape == (4,) for values in nothing.values())
+    with pytest.raises(ValueError, match="6 verdicts for 2 labels"):
+        member_scores(VERDICTS, LABELS[:2])
+
+
+def test_member_order_does_not_matter():
+    """Spec F1, F2: members are a set: scores follow their member, disagreement stays."""
+    order = [2, 0, 3, 1]
+    for name, values in member_scores(VERDICTS[:, order], LABELS).items():
+        np.testing.assert_array_equal(values, member_scores(VERDICTS, LABELS)[name][order])
+    assert mean_disagreement(VERDICTS[:, order]) == pytest.approx(mean_disagreement(VERDICTS))
+
+
+def test_scores_of_each_layout():
+    """Spec F1: a layout's scores are those of its states alone."""
+    seeds = np.array([7, 7, 9, 9, 7, 9])
+    found = scores_by_layout(VERDICTS, LABELS, seeds)
+    assert list(found) == [7, 9]
+    np.testing.assert_allclose(found[9]["balanced_accuracy"], [1, (1 / 2 + 0) / 2, 1 / 2, 1 / 2])
+
+
+def test_best_mean_and_worst_member():
+    """Spec F1: the paper shows only the best; members without a score are left out."""
+    assert best_mean_worst(np.array([0.5, np.nan, 0.9, 0.7])) == pytest.approx({"best": 0.9, "mean": 0.7, "worst": 0.5})
+    assert np.isnan(best_mean_worst(np.array([np.nan]))["best"])
+
+
+def test_disagreement_by_hand():
+    """Spec F2: shares of states on which two members differ."""
+    rates = pairwise_disagreement(VERDICTS)
+    np.testing.assert_allclose(rates[0], [0, 2 / 6, 2 / 6, 4 / 6])
+    np.testing.assert_array_equal(rates, rates.T)
+    assert mean_disagreement(VERDICTS) == pytest.approx((2 + 2 + 4 + 2 + 4 + 6) / 6 / 6)
+    assert np.isnan(mean_disagreement(VERDICTS[:, :1]))
+    assert np.isnan(mean_disagreement(VERDICTS[:0]))
+
+
+def test_preference_of_an_uncaring_chooser_is_one():
+    """Spec F6: however unevenly options are offered; the raw share of the rarely offered one is small all the same."""
+    rng = np.random.default_rng(0)
+    offered = rng.random((40_000, 3)) < np.array([0.1, 0.5, 1.0])
+    expected = (offered / offered.sum(1, keepdims=True)).sum(0)
+    choices = np.where(offered, rng.random(offered.shape), -1).argmax(1)
+    chosen = np.bincount(choices, minlength=3)
+    np.testing.assert_allclose(preference(chosen, expected), 1, atol=0.05)
+    assert shares(chosen)[0] < 0.1
+    assert shares(chosen).sum() == pytest.approx(1)
+    np.testing.assert_array_equal(preference(np.array([3, 0]), np.array([2.0, 0.0])), [1.5, np.nan])
+
+
+def test_rank_correlation_by_hand():
+    """Spec F6: Spearman's with ties: ranks (1, 2.5, 2.5, 4) and (1, 3, 2, 4) give 9/sqrt(90)."""
+    first, second = np.array([1.0, 2.0, 2.0, 9.0]), np.array([0.1, 0.3, 0.2, 0.4])
+    assert rank_correlation(first, second) == pytest.approx(4.5 / np.sqrt(4.5 * 5))
+    assert rank_correlation(first, -(second**3)) == pytest.approx(-4.5 / np.sqrt(4.5 * 5))
+    assert np.isnan(rank_correlation(np.ones(3), second[:3]))
+    assert np.isnan(rank_correlation(np.array([1.0, np.nan]), second[:2]))
+
+
+def test_a_favourite_sub_goal_does_not_hide_the_ranking_within():
+    """Spec F6: within sub-goals the better member is preferred, over all options it looks the other way round."""
+    preferred = np.array([10.0, 11.0, 1.0, 2.0])
+    match = np.array([0.5, 0.6, 0.8, 0.9])
+    found = rank_correlations(preferred, match, members=2)
+    assert found["within"] == pytest.approx(1)
+    assert found["all"] == pytest.approx(-0.6)
+    assert most_and_least(preferred[2:]) == (1, 0)
+    assert most_and_least(np.array([np.nan, 3.0])) == (1, 1)
+    assert most_and_least(np.array([np.nan])) == (None, None)
+
+
+def test_examples_show_every_kind():
+    """Spec F7: disagreement, error and agreement, each with the state that shows it best."""
+    probabilities = np.array([[0.9, 0.1], [0.6, 0.4], [0.8, 0.9], [0.99, 0.97], [0.1, 0.2], [0.45, 0.7]], np.float32)
+    labels = np.array([YES, YES, NO, YES, NO, NO])
+    assert pick_examples(probabilities, labels) == [
+        (0, "disagree"), (5, "disagree"), (2, "wrong"), (3, "right yes"), (4, "right no"),
+    ]  # fmt: skip
+
+
+def test_overlay_is_the_mean_image():
+    """Figures 7 and 8: what all states share stays, the rest fades."""
+    states = np.zeros((4, 1, 2, 3), np.uint8)
+    states[:, 0, 0] = 200
+    states[0, 0, 1] = 200
+    assert overlay(states)[0, :, 0].tolist() == [200, 50]

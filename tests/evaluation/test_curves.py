@@ -1,0 +1,111 @@
+"""Spec F5: curves over environment steps, numbers over runs, against values worked by hand."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.curves import Episodes, curves, discounted_return, run_numbers, steps_to_solve, trailing_mean
+from hypogoal.evaluation.statistics import aggregate, bootstrap_interval, interquartile_mean, mean_and_error
+
+
+def episodes(terminated, length=10):
+    count = len(terminated)
+    done = np.array(terminated, dtype=bool)
+    return Episodes(np.arange(1, count + 1) * length, np.full(count, length), done.astype(float), done)
+
+
+def test_trailing_mean_by_hand():
+    """Spec F5: the last two values known at each grid point, fewer at first, none before the first."""
+    found = trailing_mean(np.array([10, 20, 20, 50]), np.array([1.0, 3.0, 5.0, 7.0]), np.array([0, 10, 19, 20, 49, 50]), 2)
+    np.testing.assert_array_equal(found, [np.nan, 1, 1, 4, 4, 6])
+
+
+def test_curves_of_a_run_that_learns():
+    """Figure 6: success rises when the episodes do, and not before they are over."""
+    run = episodes([0] * 50 + [1] * 50)
+    found = curves(run, np.array([500, 509, 510, 1000]), window=50)
+    np.testing.assert_allclose(found["success"], [0, 0, 1 / 50, 1])
+    np.testing.assert_allclose(found["reward"], found["success"])
+    np.testing.assert_allclose(found["length"], 10)
+
+
+def test_steps_to_solve_needs_a_full_window():
+    """Spec F5: the 100 episodes that end at step 1950 are the first of which 95 succeeded."""
+    run = episodes([0] * 100 + [1] * 120)
+    assert steps_to_solve(run) == 1950
+    assert steps_to_solve(episodes([1] * 99)) is None
+    assert steps_to_solve(episodes([1] * 100)) == 1000
+    assert steps_to_solve(episodes([1, 0] * 100)) is None
+
+
+def test_discounted_return_tells_short_from_long():
+    """Spec F5: 0.99 ** (length - 1) for a success, 0 for a failure."""
+    assert discounted_return(episodes([1, 1], length=3)) == pytest.approx(0.9801)
+    assert discounted_return(episodes([1, 0], length=3)) == pytest.approx(0.9801 / 2)
+    assert np.isnan(discounted_return(episodes([])))
+
+
+def test_numbers_of_a_run():
+    """Spec F5: over the last 100 episodes, and length against the shortest path."""
+    numbers = run_numbers(episodes([0] * 100 + [1] * 99 + [0], length=20), shortest_path=16)
+    assert numbers["success"] == 0.99
+    assert numbers["length_over_shortest"] == 1.25
+    assert numbers["episodes"] == 200
+    assert numbers["window"] == 100
+    assert numbers["steps_to_95"] == 195 * 20
+    nothing = run_numbers(episodes([]), None)
+    assert nothing["episodes"] == 0
+    assert np.isnan(nothing["success"])
+    assert nothing["steps_to_95"] is None
+
+
+def test_mean_and_standard_error_by_hand():
+    """Spec F5: of 2, 4, 6: mean 4, variance 4, error 2 / sqrt(3)."""
+    assert mean_and_error(np.array([2.0, 4.0, 6.0])) == pytest.approx((4, 2 / np.sqrt(3)))
+    mean, error = mean_and_error(np.array([3.0]))
+    assert mean == 3
+    assert np.isnan(error)
+    assert np.isnan(mean_and_error(np.array([]))).all()
+
+
+def test_interquartile_mean_by_hand():
+    """Spec F5: of eight values the middle four; one outlier more or less does not move it."""
+    values = np.array([0.0, 1, 2, 3, 4, 5, 6, 1000])
+    assert interquartile_mean(values) == 3.5
+    assert interquartile_mean(values[::-1]) == 3.5
+
+
+def test_bootstrap_interval_is_stratified():
+    """Spec F5: resampling within layouts that do not vary gives no width, over all runs it does."""
+    rng = np.random.default_rng(0)
+    values = np.array([0.0, 0.0, 1.0, 1.0])
+    assert bootstrap_interval(values, [1, 1, 2, 2], rng) == (0.5, 0.5, "runs within layouts")
+    low, high, over = bootstrap_interval(values, [1, 2, 3, 4], rng)
+    assert (low, high, over) == (0.0, 1.0, "runs")
+    low, high, over = bootstrap_interval(values[:1], [1], rng)
+    assert np.isnan([low, high]).all()
+    assert over == "one run: no interval"
+    assert bootstrap_interval(np.ones(3), [1, 2, 3], rng) == (1.0, 1.0, "runs")
+
+
+def test_bootstrap_interval_covers():
+    """Spec F5: about 95 % of intervals of 20 normal runs hold the true value, and the seed fixes them."""
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(60):
+        low, high, _ = bootstrap_interval(rng.normal(3, 1, 20), list(range(20)), rng)
+        covered += low <= 3 <= high
+    assert covered >= 50
+    values = np.arange(6.0)
+    first = bootstrap_interval(values, [0] * 6, np.random.default_rng(2))
+    assert first == bootstrap_interval(values, [0] * 6, np.random.default_rng(2))
+
+
+def test_aggregate_leaves_out_what_is_not_a_number():
+    """Spec F5: n says how many runs there were a number of."""
+    found = aggregate([1.0, float("nan"), 3.0], [5, 6, 7], "steps", np.random.default_rng(0))
+    assert (found["mean"], found["n"], found["unit"], found["interval_over"]) == (2.0, 2, "steps", "runs")
+    assert found["interval"] == [1.0, 3.0]
+    empty = aggregate([], [], "steps", np.random.default_rng(0))
+    assert empty["n"] == 0
+    assert np.isnan(empty["mean"])
+    assert np.isnan(empty["iqm"])

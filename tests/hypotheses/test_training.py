@@ -1,0 +1,242 @@
+"""Training: the toy where diversity is needed, both schedules, determinism, NaN (Spec C1-C4, C6, G1-G3)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.seeding import torch_generator
+from hypogoal.diversity import OBJECTIVES
+from hypogoal.hypotheses import batches, training
+from hypogoal.hypotheses.batches import TrainingStates
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.training import EnsembleConfig, fit, total_steps
+
+TOY = EnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, diversity_weight=0.03)
+
+
+def toy_states(easy: NDArray[np.bool_], hard: NDArray[np.bool_], seed: int) -> NDArray[np.uint8]:
+    """Images of 6x6 cells of 8x8 pixels: the easy feature lights half of them, the hard one tints two."""
+    rng = np.random.default_rng(seed)
+    cells = np.full((len(easy), 6, 6, 3), 40, dtype=np.uint8)
+    cells[np.arange(len(easy)), rng.integers(6, size=len(easy)), rng.integers(6, size=len(easy))] = 70
+    cells[easy, :3] = 200
+    cells[hard, 4, 3:5, 2] = 150
+    return cells.repeat(8, axis=1).repeat(8, axis=2)
+
+
+def toy(seed: int = 0) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.uint8]]:
+    """Labelled states in which both features say the same, unlabelled ones in which they are independent."""
+    labels = np.arange(64) % 2 == 0
+    free = np.arange(128)
+    return toy_states(labels, labels, seed), labels, toy_states(free % 2 == 0, free % 4 < 2, seed + 1)
+
+
+def follows(ensemble: Ensemble) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How often each member (K,) goes with the easy, and with the hard feature where the two contradict."""
+    easy = np.arange(100) % 2 == 0
+    says = ensemble.predict(toy_states(easy, ~easy, seed=9)) > 0.5
+    return (says == easy[:, None]).mean(axis=0), (says == ~easy[:, None]).mean(axis=0)
+
+
+@pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
+def test_diversity_finds_the_feature_that_is_hidden(schedule: str) -> None:
+    """Spec C1, C4: without diversity every member takes the easy feature; with D-BAT one takes the other."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, schedule=schedule)
+    alike = fit(observations, labels, unlabelled, dataclasses.replace(config, diversity="none"), seed=1)
+    diverse = fit(observations, labels, unlabelled, config, seed=1)
+    for ensemble in (alike, diverse):
+        assert ((ensemble.predict(observations) > 0.5) == labels[:, None]).mean() > 0.95, (
+            "all explain the labels"
+        )
+    assert (follows(alike)[0] > 0.9).all()
+    easy, hard = follows(diverse)
+    assert easy.max() > 0.9
+    assert hard.max() > 0.9
+
+
+def test_a_single_member_is_the_plain_cnn() -> None:
+    """Spec C1: K = 1 has no pairs, needs no unlabelled states, and learns."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, members=1)
+    reports: list[dict[str, float]] = []
+    ensemble = fit(
+        observations, labels, unlabelled[:0], config, 0, lambda _, numbers: reports.append(numbers)
+    )
+    assert ensemble.predict(observations).shape == (64, 1)
+    assert ((ensemble.predict(observations)[:, 0] > 0.5) == labels).all()
+    assert {numbers["diversity"] for numbers in reports} == {0.0}
+
+
+@pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
+def test_the_same_seed_gives_the_same_bytes(schedule: str) -> None:
+    """Spec G1: and another seed other ones; the global random state is neither read nor moved."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=3, schedule=schedule)
+    torch.manual_seed(1)
+    first = fit(observations, labels, unlabelled, config, seed=3).state()
+    drawn = torch.rand(1)
+    torch.manual_seed(1)
+    assert torch.equal(drawn, torch.rand(1))
+    second = fit(observations, labels, unlabelled, config, seed=3).state()
+    other = fit(observations, labels, unlabelled, config, seed=4).state()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["members.0.0.weight"], other["members.0.0.weight"])
+
+
+def test_members_start_the_same_whatever_the_ensemble() -> None:
+    """Spec C1: a single CNN is the first member of an ensemble without diversity: a fair comparison."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=4, diversity="none")
+    three = fit(observations, labels, unlabelled, dataclasses.replace(config, members=3), seed=3)
+    one = fit(observations, labels, unlabelled, dataclasses.replace(config, members=1), seed=3)
+    np.testing.assert_allclose(three.predict(observations)[:, :1], one.predict(observations), atol=1e-6)
+
+
+def test_tables_of_patches_do_not_change_what_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C4: some steps through the plain network end where those through distinct patches end."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=4)
+    tabled = fit(observations, labels, unlabelled, config, seed=0)
+    with monkeypatch.context() as patch:
+        patch.setattr(batches.patches, "make_tables", lambda *_: None)
+        plain = fit(observations, labels, unlabelled, config, seed=0)
+    np.testing.assert_allclose(tabled.predict(unlabelled), plain.predict(unlabelled), atol=2e-3)
+    untrained = Ensemble("doorkey", (48, 48, 3), 2, torch_generator(0, "weights"))
+    assert abs(tabled.predict(unlabelled) - untrained.predict(unlabelled)).max() > 0.05
+
+
+@pytest.mark.parametrize("diversity", OBJECTIVES)
+def test_reports_are_the_losses_of_equation_1(diversity: str) -> None:
+    """Eq. (1): loss = sum of labelled losses + weight x sum over ordered pairs; reported every ten steps."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, members=3, steps=12, diversity=diversity, diversity_weight=0.5)
+    reports: list[tuple[int, dict[str, float]]] = []
+    fit(observations, labels, unlabelled, config, 0, lambda *report: reports.append(report))
+    assert [step for step, _ in reports] == [10, 12]
+    for _, numbers in reports:
+        assert numbers["loss"] == pytest.approx(
+            3 * numbers["labelled"] + 0.5 * numbers["diversity"], rel=1e-5
+        )
+        assert (numbers["diversity"] > 0) == (diversity != "none")
+
+
+def test_the_double_sum_by_hand() -> None:
+    """Eq. (1), Spec C4: each pair in training counts in both orders, pairs with frozen members once."""
+    logits = [torch.full((1, 2), float(value)) for value in (1, 2, 4)]
+
+    def distance(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+        return (one - other).abs().mean()
+
+    assert training._pair_losses(distance, logits, []).tolist() == [2 * 1, 2 * 3, 2 * 2]
+    assert training._pair_losses(distance, logits[:1], logits[1:]).tolist() == [1, 3]
+    assert training._pair_losses(distance, logits[:1], []).tolist() == []
+
+
+def test_sequential_members_do_not_move_once_trained() -> None:
+    """Spec C4: D-BAT's own order: an ensemble of two begins with the ensemble of one."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=5, schedule="sequential")
+    steps: list[int] = []
+    one = fit(observations, labels, unlabelled, dataclasses.replace(config, members=1), seed=0).state()
+    two = fit(observations, labels, unlabelled, config, 0, lambda step, _: steps.append(step)).state()
+    weights = [name for name in one if "running" not in name and "num_batches" not in name]
+    assert all(torch.equal(one[name], two[name]) for name in weights)
+    assert steps == [5, 10]
+    assert total_steps(config) == 10
+
+
+@pytest.mark.parametrize("unlabelled_bn", [True, False])
+def test_which_batches_count_in_running_statistics(unlabelled_bn: bool) -> None:
+    """Spec C6: the switch decides whether unlabelled states move BatchNorm's running mean."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=2, unlabelled_bn=unlabelled_bn)
+    means = []
+    for others in (unlabelled, 255 - unlabelled):
+        state = fit(observations, labels, others, dataclasses.replace(config, members=1), seed=0).state()
+        means.append(state["members.0.1.running_mean"])
+    assert torch.equal(means[0], means[1]) != unlabelled_bn
+
+
+@pytest.mark.parametrize("balance", ["batch", "none"])
+def test_batches_are_balanced_where_asked(balance: str) -> None:
+    """Spec C6: Table 3's weights of 0.5 and 0.5 with few positives; every state before any comes again."""
+    labels = np.arange(164) < 3
+    images = np.zeros((164, 8, 8, 3), dtype=np.uint8)
+    network = torch.nn.Sequential(torch.nn.Flatten())
+    states = TrainingStates(images, labels, images[:100], network, torch.device("cpu"))
+    config = EnsembleConfig(batch_size=40, class_balance=balance, steps=41)
+    labelled, unlabelled = (np.stack(drawn) for drawn in zip(*states.batches(config, 0), strict=True))
+    assert labelled.shape == unlabelled.shape == (41, 40)
+    positives = labels[labelled].sum(axis=1)
+    assert (
+        (positives == 20).all()
+        if balance == "batch"
+        else positives.mean() == pytest.approx(40 * 3 / 164, abs=0.01)
+    )
+    assert unlabelled.min() == 164
+    np.testing.assert_array_equal(np.unique(unlabelled.ravel()[:100]), np.arange(164, 264))
+    counts = np.bincount(labelled.ravel(), minlength=164)
+    assert np.ptp(counts[labels]) <= 1
+    assert np.ptp(counts[~labels]) <= 1
+
+
+def test_class_weights_weigh_the_classes() -> None:
+    """Spec C3, C6: weights of 0.95 and 0.05 push the members towards the heavier class."""
+    observations, labels, unlabelled = toy()
+    rng = np.random.default_rng(0)
+    labels = rng.permutation(labels)  # nothing to learn but the prior
+    config = dataclasses.replace(TOY, members=1, steps=30)
+    says = []
+    for negative in (0.95, 0.05):
+        weighted = dataclasses.replace(
+            config, class_weight_negative=negative, class_weight_positive=1 - negative
+        )
+        says.append(fit(observations, labels, unlabelled, weighted, seed=0).predict(unlabelled).mean())
+    assert says[0] < 0.4 < 0.6 < says[1]
+
+
+def test_nan_stops_the_run_and_names_the_member() -> None:
+    """Spec G3: member and step; a learning rate that explodes is found when it happens."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, learning_rate=1e30)
+    with pytest.raises(NumericalError, match=r"^the labelled loss of member 0 is (nan|inf) at step [23]$"):
+        fit(observations, labels, unlabelled, config, seed=0)
+    with pytest.raises(NumericalError, match=r"of member [01] is NaN or Inf after step 1$"):
+        fit(
+            observations, labels, unlabelled, dataclasses.replace(config, learning_rate=1e39, steps=1), seed=0
+        )
+
+
+def test_an_objective_that_gives_nan_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G3: the pair of members whose diversity loss broke."""
+    observations, labels, unlabelled = toy()
+    broken = {"calls": 0}
+
+    def pair_loss(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+        broken["calls"] += 1
+        loss = (one - other).abs().mean()
+        return loss * torch.nan if broken["calls"] == 3 * 4 + 2 else loss
+
+    monkeypatch.setattr(training, "load_objective", lambda _: pair_loss)
+    with pytest.raises(NumericalError, match="the diversity loss of members 0 and 2 is nan at step 5"):
+        fit(observations, labels, unlabelled, dataclasses.replace(TOY, members=3), seed=0)
+
+
+def test_data_that_cannot_be_learned_from_are_one_clear_line() -> None:
+    """Spec G2: one class only, no unlabelled states, shapes that do not fit."""
+    observations, labels, unlabelled = toy()
+    with pytest.raises(UserError, match="both classes are needed: 0 positives of 64"):
+        fit(observations, labels & False, unlabelled, TOY, seed=0)
+    with pytest.raises(UserError, match="unlabelled states are needed"):
+        fit(observations, labels, unlabelled[:0], TOY, seed=0)
+    with pytest.raises(UserError, match="do not fit together"):
+        fit(observations, labels[:5], unlabelled, TOY, seed=0)
+    with pytest.raises(UserError, match="unknown diversity objective: spread"):
+        fit(observations, labels, unlabelled, dataclasses.replace(TOY, diversity="spread"), seed=0)

@@ -1,0 +1,289 @@
+"""The option loop, masks, records, and learners that learn (Spec A3, D1-D3, D6, D8, E5, E6)."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import OptionLoop, Outcome, RandomChooser, offered_options
+from hypogoal.options.light import LightLearner
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork, apply_to_states
+from hypogoal.options.recording import Recorder
+from hypogoal.options.recurrent import RecurrentLearner
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+sys.path.insert(0, str(Path(__file__).parent))
+from corridor import LENGTH, Corridor
+
+QUICK = {"environments": 4, "warm_up": 50, "update_interval": 4, "option_batch": 32, "epsilon_steps": 300}
+
+
+class Scripted:
+    """A learner that always plays one action, and remembers what it was told."""
+
+    def __init__(self, action: int):
+        self.action, self.seen = action, []
+
+    def act(self, ids, options, age, *, explore=True):
+        return np.full(len(ids), self.action)
+
+    def observe(self, ids, actions, next_ids, options, *, terminated, timed_out, ended):
+        self.seen.append((ids.copy(), next_ids.copy(), options.copy(), timed_out.copy(), ended.copy()))
+
+    def learn(self):
+        return {}
+
+
+class FirstOption:
+    """A chooser that takes the first offered option and keeps the outcomes."""
+
+    def __init__(self):
+        self.outcomes: list[Outcome] = []
+
+    def choose(self, environments, ids, offered):
+        return offered.argmax(1)
+
+    def record(self, outcome):
+        self.outcomes.append(outcome)
+
+    def learn(self):
+        return {}
+
+
+def loop_of(engine, learner, chooser, **changes):
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    config = OptionConfig(**{"option_timeout": 10, **changes})
+    recorder = Recorder(2, window=50)
+    return OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=0.9), recorder
+
+
+def test_an_option_ends_at_its_own_sub_goal_and_pays_the_smdp_return() -> None:
+    """Spec D1, E1: option left-end walks 2 steps and ends there; nothing was earned; tau is 2."""
+    chooser = FirstOption()
+    loop, recorder = loop_of(Corridor(1), Scripted(0), chooser)
+    for _ in range(2):
+        loop.step()
+    (outcome,) = chooser.outcomes
+    assert outcome.returns[0] == 0.0 and outcome.discounts[0] == pytest.approx(0.9**2)
+    assert outcome.next_ids[0] == 0 and not outcome.terminated[0]
+    # There its sub-goal holds: only the other option is offered (Spec D6).
+    np.testing.assert_array_equal(outcome.next_offered[0], [False, True])
+    assert list(recorder.stops[0]) == [0]
+
+
+def test_reward_inside_an_option_is_discounted_from_its_start_and_the_end_of_the_task_ends_it() -> None:
+    """Spec D1, E1: option left-end pushed right reaches the end of the task at its third step."""
+    chooser = FirstOption()
+    loop, recorder = loop_of(Corridor(1), Scripted(1), chooser)
+    for _ in range(3):
+        loop.step()
+    (outcome,) = chooser.outcomes
+    assert outcome.returns[0] == pytest.approx(0.9**2) and outcome.terminated[0]
+    assert recorder.episodes == [(3, 3, 1.0, 1)]
+    assert loop.engine.ids[0] == 2
+
+
+def test_a_timeout_ends_the_option_but_is_no_terminal_state() -> None:
+    """Spec D1, D2: the learner is told timed_out, and the meta level sees neither end."""
+    learner, chooser = Scripted(0), FirstOption()
+    loop, _recorder = loop_of(Corridor(1), learner, chooser, option_timeout=1)
+    loop.step()
+    assert learner.seen[0][3].tolist() == [True] and learner.seen[0][4].tolist() == [True]
+    assert not chooser.outcomes[0].terminated[0] and not chooser.outcomes[0].truncated[0]
+
+
+def test_a_cut_episode_is_truncated_not_terminated() -> None:
+    """Spec D2: the cap is no terminal state."""
+    chooser = FirstOption()
+    loop, recorder = loop_of(Corridor(1, max_steps=1), Scripted(0), chooser)
+    loop.step()
+    assert chooser.outcomes[0].truncated[0] and not chooser.outcomes[0].terminated[0]
+    assert recorder.episodes == [(1, 1, 0.0, 0)]
+
+
+def test_offered_options() -> None:
+    """Spec D6: what holds is masked; if all hold none is masked; the mask can be switched off."""
+    verdicts = np.array([[True, False], [True, True]])
+    np.testing.assert_array_equal(offered_options(verdicts, True), [[False, True], [True, True]])
+    assert offered_options(verdicts, False).all()
+
+
+def test_random_choice_is_uniform_over_what_is_offered() -> None:
+    """Spec E6."""
+    offered = np.tile([True, False, True, True], (6000, 1))
+    chosen = RandomChooser(np.random.default_rng(0)).choose(np.arange(6000), np.zeros(6000, np.int64), offered)
+    shares = np.bincount(chosen, minlength=4) / 6000
+    np.testing.assert_allclose(shares, [1 / 3, 0, 1 / 3, 1 / 3], atol=0.03)
+
+
+def test_choices_are_counted_per_window(tmp_path: Path) -> None:
+    """Spec E5: offered, chosen, expected under uniform choice, reached and duration add up."""
+    engine = Corridor(4)
+    loop, recorder = loop_of(engine, Scripted(0), RandomChooser(np.random.default_rng(0)))
+    for _ in range(100):
+        loop.step()
+    recorder.write(tmp_path, engine.images)
+    rows = [line.split(",") for line in (tmp_path / "choices.csv").read_text().splitlines()[1:]]
+    chosen = sum(int(row[3]) for row in rows)
+    assert sum(float(row[4]) for row in rows) == pytest.approx(chosen, abs=1e-3)
+    assert all(int(row[3]) <= int(row[2]) for row in rows)
+    assert len({row[0] for row in rows}) >= 4
+    assert sum(int(row[6]) for row in rows) <= recorder.steps == 400
+
+
+def test_verdicts_are_asked_once_per_state() -> None:
+    """Spec D1: the cache gives what the classifier gives and asks it once for each state."""
+    engine, asked = Corridor(1), []
+
+    def classify(ids):
+        asked.extend(ids.tolist())
+        return engine.labels(ids)
+
+    verdicts = Verdicts(classify, 2)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        ids = rng.integers(LENGTH, size=7)
+        np.testing.assert_array_equal(verdicts.of(ids), engine.labels(ids))
+    assert sorted(asked) == list(range(LENGTH))
+    far = np.array([5000])
+    Verdicts(lambda ids: np.ones((len(ids), 2), dtype=bool), 2).of(far)
+
+
+def test_the_tile_path_is_the_image_path() -> None:
+    """Spec D2 (light): values and gradients from tile codes equal those from the images."""
+    engine = DoorKeyEngine(3, 8)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        engine.step(rng.integers(7, size=8))
+    ids = np.arange(engine.n_states)
+    torch.manual_seed(0)
+    network = LightQNetwork(engine.observation_shape, 15, 7)
+    by_image = network(torch.from_numpy(engine.images(ids)))
+    by_tile = apply_to_states(network, engine, ids)
+    torch.testing.assert_close(by_tile, by_image)
+    gradients = []
+    for out in (by_image, by_tile):
+        network.zero_grad()
+        out.square().sum().backward()
+        gradients.append([parameter.grad.clone() for parameter in network.parameters()])
+    for image, tile in zip(*gradients, strict=True):
+        torch.testing.assert_close(image, tile, rtol=1e-4, atol=1e-3)
+
+
+def test_the_paper_network_unrolls_its_memory() -> None:
+    """Spec D2: step by step with the hidden state, and the whole sequence at once, are the same function."""
+    torch.manual_seed(0)
+    network = PaperQNetwork((64, 64, 3), 7).eval()
+    images = torch.randint(0, 256, (1, 5, 64, 64, 3), dtype=torch.uint8)
+    with torch.no_grad():
+        embedded = network.embed(images[0])[None]
+        whole, _ = network(embedded)
+        hidden, steps = None, []
+        for t in range(5):
+            values, hidden = network(embedded[:, t : t + 1], hidden)
+            steps.append(values)
+        alone, _ = network(embedded[:, 4:5])
+    torch.testing.assert_close(torch.cat(steps, 1), whole)
+    assert not torch.allclose(alone[:, 0], whole[:, 4])
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(10.5e6, rel=0.02)
+
+
+def run_corridor(learner_class: type, steps: int, seed: int = 0, **changes):
+    engine = Corridor(4)
+    config = OptionConfig(**(QUICK | changes))
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner = learner_class(engine, verdicts, config, seed)
+    loop = OptionLoop(
+        engine, verdicts, learner, RandomChooser(np.random.default_rng(seed)), Recorder(2), config, gamma=0.99
+    )
+    for _ in range(steps // 4):
+        loop.step()
+    return learner
+
+
+def greedy(learner) -> list[list[int]]:
+    """The cells that each option's greedy policy visits from the start, until its sub-goal or ten steps."""
+    paths = []
+    for option, end in enumerate((0, LENGTH - 1)):
+        engine = Corridor(1)
+        learner.hidden = torch.zeros(1, 512)
+        path = [2]
+        while path[-1] != end and len(path) < 10:
+            cell = np.array(path[-1:])
+            action = learner.act(cell, np.array([option]), np.array([len(path) - 1]), explore=False)
+            path.append(int(engine.step(action).next_ids[0]))
+        paths.append(path)
+    return paths
+
+
+@pytest.mark.parametrize("experience", ["own", "shared"])
+def test_the_light_learner_learns_both_options(experience: str) -> None:
+    """Spec D2, D8: option left-end and option right-end go straight to their ends."""
+    learner = run_corridor(LightLearner, 1600, experience=experience)
+    assert greedy(learner) == [[2, 1, 0], [2, 3, 4, 5]]
+
+
+def test_the_paper_learner_learns_both_options() -> None:
+    """Spec D2, D3: independent conv-GRU networks, own experience, prioritised replay, full target copies."""
+    learner = run_corridor(
+        RecurrentLearner, 800, experience="own", network="paper", option_batch=16, option_gamma=0.9,
+        target_tau=1.0, target_interval=5, option_learning_rate=1e-3,
+    )  # fmt: skip
+    assert greedy(learner) == [[2, 1, 0], [2, 3, 4, 5]]
+
+
+def test_shared_experience_needs_the_light_network() -> None:
+    """Spec D2: a clear line, not a silent change."""
+    with pytest.raises(UserError, match="experience=shared"):
+        run_corridor(RecurrentLearner, 4, experience="shared")
+
+
+def test_same_seed_same_bytes() -> None:
+    """The project's rule: randomness is passed in."""
+    one, two, other = (run_corridor(LightLearner, 600, seed=seed) for seed in (1, 1, 2))
+    for name, value in one.state().items():
+        assert torch.equal(value, two.state()[name]), name
+    assert any(not torch.equal(value, other.state()[name]) for name, value in one.state().items())
+
+
+def test_a_nan_stops_training() -> None:
+    """Spec G3: a NaN in the loss names itself."""
+    learner = run_corridor(LightLearner, 600)
+    with torch.no_grad():
+        learner.online.heads.bias.fill_(float("nan"))
+    with pytest.raises(NumericalError, match="option loss"):
+        learner._update()
+
+
+def test_the_meta_policy_learns_which_option_pays() -> None:
+    """Spec E1-E3: with options that work, PPO comes to choose the one that earns the reward."""
+    for head in ("categorical", "gaussian"):
+        engine = Corridor(8)
+        config = OptionConfig(environments=8)
+        verdicts = Verdicts(oracle_terminations(engine), 2)
+        learner = Perfect()
+        policy = MetaPolicy(engine, 2, MetaConfig(head=head, decisions=64, meta_batch=32, meta_learning_rate=3e-3), seed=0)
+        loop = OptionLoop(engine, verdicts, learner, policy, Recorder(2), config, gamma=0.9)
+        for _ in range(600):
+            loop.step()
+        start = np.array([2])
+        assert policy.best(start, np.ones((1, 2), dtype=bool))[0] == 1, head
+        restored = MetaPolicy(engine, 2, MetaConfig(head=head), seed=9)
+        restored.load(policy.state())
+        assert restored.best(start, np.ones((1, 2), dtype=bool))[0] == 1
+
+
+class Perfect(Scripted):
+    """Option 0 goes left, option 1 right."""
+
+    def __init__(self):
+        super().__init__(0)
+
+    def act(self, ids, options, age, *, explore=True):
+        return options.copy()

@@ -1,0 +1,248 @@
+"""Spec A5, F, F7: a run of real, tiny artefacts is evaluated and drawn; what is missing is named."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import h5py
+import numpy as np
+import pytest
+from rich.console import Console
+
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
+from hypogoal.evaluation.summary import hypotheses_summary
+from hypogoal.stages.collect import collect
+from hypogoal.stages.evaluate import evaluate, summary_table
+from hypogoal.stages.report import report
+from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
+from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
+from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
+from hypogoal.stages.train_options import TrainOptionsConfig, train_options
+
+QUIET = {"quiet": True}
+SHORT = {"max_episode_steps": 64, "random_episodes": 20, "layout_seed": 100}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run as the stages leave it: two ensembles, an agent with pre-trained options, a control, a baseline."""
+    run = tmp_path_factory.mktemp("runs") / "tiny"
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=2, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
+    for name, diversity in (("ensemble", "dbat"), ("ensemble-none", "none")):
+        config = TrainEnsembleConfig(steps=4, members=2, diversity=diversity, workers=1)
+        train_ensemble(run / "data.h5", config, run / name, **QUIET)
+    source = run / "ensemble"
+    train_options(source, TrainOptionsConfig(steps=2_048, **SHORT), run / "options", **QUIET)
+    learned = TrainMetaConfig(steps=4_096, **SHORT)
+    train_meta(source, learned, run / "meta", options=run / "options", **QUIET)
+    train_meta(source, TrainMetaConfig(steps=4_096, chooser="random", **SHORT), run / "meta-random", **QUIET)
+    train_meta(source, TrainMetaConfig(steps=4_096, termination="oracle", **SHORT), run / "meta-oracle", **QUIET)
+    train_baseline("doorkey", BaselineConfig(steps=4_096, **SHORT), run / "ppo", **QUIET)
+    return run
+
+
+@pytest.fixture(scope="module")
+def metrics(run):
+    return evaluate(run, run / "evaluation", **QUIET)
+
+
+@pytest.fixture(scope="module")
+def page(run, metrics):
+    return report(run).read_text(encoding="utf-8")
+
+
+def test_agents_are_grouped_and_counted_whole(run, metrics):
+    """Spec F5, E6, E7: the steps of train-options count, and its artefact is not an agent of its own."""
+    agents = {agent["name"]: agent for agent in metrics["agents"]}
+    assert list(agents) == ["options (learned members)", "random choice", "oracle terminations", "PPO tuned"]
+    (own,) = agents["options (learned members)"]["runs"]
+    assert own["steps"] == 2_048 + 4_096
+    rows = (run / "meta" / "episodes.csv").read_text().splitlines()[1:]
+    assert own["episodes"] == len(rows)
+    last = np.array([row.split(",") for row in rows[-100:]], dtype=float)
+    assert own["length"] == pytest.approx(last[:, 1].mean())
+    assert own["success"] == pytest.approx(last[:, 3].mean())
+    assert own["length_over_shortest"] == pytest.approx(last[:, 1].mean() / own["shortest_path"])
+
+
+def test_members_are_judged_on_heldout_states(run, metrics):
+    """Spec F1, F2: numbers of each ensemble, sub-goal and member, recomputed here from the file and the weights."""
+    from hypogoal.dataset import open_dataset
+    from hypogoal.hypotheses.storage import read_ensemble
+
+    assert [ensemble["name"] for ensemble in metrics["ensembles"]] == ["dbat, K=2", "no diversity, K=2"]
+    source = open_artefact(run / "ensemble")
+    goal = metrics["ensembles"][0]["sub_goals"][2]
+    split = open_dataset(run / "data.h5").heldout("collect-red-key")
+    yes = read_ensemble(source.path, source.config, "collect-red-key").predict(split.observations) > 0.5
+    recall, rejections = yes[split.labels].mean(0), (~yes)[~split.labels].mean(0)
+    found = [member["balanced_accuracy"] for member in goal["members"]]
+    np.testing.assert_allclose(found, (recall + rejections) / 2)
+    assert goal["disagreement"]["heldout"] == pytest.approx((yes[:, 0] != yes[:, 1]).mean())
+    assert [place["layout_seed"] for place in goal["by_layout"]] == sorted(set(split.origins["layout_seed"].tolist()))
+    assert len(metrics["hypotheses"]) == 2 * len(SUB_GOALS)
+
+
+def test_selection_counts_every_decision(run, metrics):
+    """Spec F6: what was chosen and offered, and the random chooser's control beside it; oracle has no members."""
+    assert [agent["name"] for agent in metrics["selection"]] == ["options (learned members)", "random choice"]
+    table = np.genfromtxt(run / "meta-random" / "choices.csv", delimiter=",", names=True)
+    (random,) = metrics["selection"][1]["runs"]
+    members = [member for goal in random["sub_goals"] for member in goal["members"]]
+    assert [member["option"] for member in members] == list(range(10))
+    assert sum(member["chosen"] for member in members) == table["chosen"].sum()
+    assert sum(member["expected"] for member in members) == pytest.approx(sum(member["chosen"] for member in members))
+    often = [member for member in members if member["expected"] > 100]
+    assert often
+    assert all(0.6 < member["preference"] < 1.5 for member in often)
+    assert all(0 <= member["match"] <= 1 for member in members)
+
+
+def test_metrics_are_written_as_returned(run, metrics):
+    """Spec A5, A8: strict JSON, each number's unit beside it, and the inputs' hashes in the manifest."""
+    artefact = open_artefact(run / "evaluation", "evaluation")
+
+    def refuse(name):
+        raise AssertionError(name)
+
+    text = (run / "evaluation" / "metrics.json").read_text()
+    assert json.loads(text, parse_constant=refuse) == metrics
+    for key in ("success", "length", "discounted_return"):
+        aggregated = metrics["agents"][0][key]
+        assert {"mean", "standard_error", "iqm", "interval", "interval_over", "n", "unit"} == set(aggregated)
+    assert set(metrics["ensembles"][0]["sub_goals"][0]["members"][0]) - {"member"} <= set(metrics["quantities"])
+    kinds = sorted(entry["kind"] for entry in artefact.manifest["inputs"])
+    assert kinds == ["baseline", "data", "ensemble", "ensemble", "meta", "meta", "meta"]
+
+
+def test_what_is_missing_is_named(run, metrics, tmp_path):
+    """Spec F: no silent absence, in the metrics, on the page and in an evaluation of a run with a baseline only."""
+    assert metrics["missing"] == [f"no agent '{name}' in {run}" for name in ("PPO paper", "DQN tuned", "DQN paper")]
+    train_baseline("doorkey", BaselineConfig(steps=640, **SHORT), tmp_path / "only" / "ppo", **QUIET)
+    alone = evaluate(tmp_path / "only", tmp_path / "only" / "evaluation", **QUIET)
+    assert alone["missing"][0].startswith("no ensemble")
+    assert alone["ensembles"] == alone["selection"] == []
+    text = report(tmp_path / "only").read_text(encoding="utf-8")
+    assert "It needs an ensemble artefact" in text
+    assert "train-meta" in text
+
+
+def test_an_ensemble_alone_can_be_evaluated(run, tmp_path):
+    """Spec F1, F7: hypotheses without agents."""
+    config = TrainEnsembleConfig(steps=2, members=1, workers=1, sub_goals=("open-red-door",))
+    train_ensemble(run / "data.h5", config, tmp_path / "ensemble", **QUIET)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    assert [row["name"] for row in metrics["hypotheses"]] == ["single CNN"]
+    assert metrics["hypotheses"][0]["disagreement_heldout"]["mean"] is None
+    assert "train-baseline" in report(tmp_path).read_text(encoding="utf-8")
+
+
+def test_tables_fit_a_terminal(metrics):
+    """Spec A5: the summary is readable at 80 columns."""
+    for table in (summary_table(metrics), hypotheses_summary(metrics)):
+        console = Console(width=80, record=True, file=open("/dev/null", "w"))
+        console.print(table)
+        lines = console.export_text().splitlines()
+        assert max(map(len, lines)) <= 80
+        assert any("collect-red-key" in line or "PPO tuned" in line for line in lines)
+
+
+class Structure(HTMLParser):
+    """Open tags that are never closed, ids, and whatever would be fetched."""
+
+    VOID = {"meta", "img", "link", "br", "input", "hr"}
+
+    def __init__(self, text):
+        super().__init__()
+        self.stack, self.ids, self.links, self.tags = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        given = dict(attributes)
+        self.ids += [given["id"]] if "id" in given else []
+        self.links += [given[key] for key in ("src", "href", "xlink:href") if key in given]
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in self.VOID:
+            self.stack.pop()
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+
+def test_the_page_is_whole_and_needs_nothing_else(page):
+    """Spec F7: well-formed, unique ids, every link inside the page, no script, no network."""
+    found = Structure(page)
+    assert found.stack == []
+    assert len(found.ids) == len(set(found.ids))
+    inside = {f"#{identity}" for identity in found.ids}
+    assert all(link.startswith("data:image/png;base64,") or link in inside for link in found.links)
+    assert not {"script", "link", "iframe", "object"} & set(found.tags)
+    assert not re.search(r"url\((?!#)|@import", page)
+    assert all(target in inside for target in re.findall(r"url\((#[^)]*)\)", page))
+
+
+def test_the_page_shows_all_of_it(run, page):
+    """Spec F5, F6, F7: curves, hypotheses, examples, overlays, choices, provenance, with seeds in the captions."""
+    for title in (
+        "Summary", "Learning curves", "Hypotheses", "Example states", "Where options stop",
+        "Which hypotheses are chosen", "Data, settings, provenance",
+    ):  # fmt: skip
+        assert f"<h2>{title}</h2>" in page
+    assert page.count("<figure") == 4
+    assert "1 run: layout seed 100, run seed 0" in page
+    assert "Figure 6 of the paper" in page
+    assert "no agent &#39;DQN tuned&#39;" in page
+    assert page.count("data:image/png;base64,") > 20
+    assert sorted(path.name for path in (run / "report" / "figures").iterdir()) == sorted(
+        f"{name}.{kind}" for name in ("reward", "length", "members", "preference") for kind in ("svg", "png")
+    )
+
+
+def test_the_report_is_the_same_each_time(run, page):
+    """Spec G1, F7: nothing in it depends on when it is made."""
+    assert report(run, force=True).read_text(encoding="utf-8") == page
+
+
+def test_arrays_say_what_the_report_draws(run, metrics):
+    """Spec F5, F6: curves per agent, overlays per option, examples per sub-goal, in plain HDF5."""
+    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+        grid = arrays["curves/grid"][()]
+        assert grid[0] == 0
+        assert grid[-1] == 2_048 + 4_096
+        for index, agent in enumerate(metrics["agents"]):
+            assert arrays[f"curves/{index}/reward"].shape == (len(agent["runs"]), len(grid))
+        assert set(arrays["examples"]) == set(SUB_GOALS)
+        some = next(iter(arrays["terminations/meta"].values()))
+        assert some.shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize("damage", ["episodes.csv", "choices.csv", "layout.json", "terminations.h5"])
+def test_a_damaged_artefact_is_one_line(run, tmp_path, damage):
+    """Spec G2: a truncated file is named, and no half-written evaluation is left."""
+    import shutil
+
+    shutil.copytree(run, tmp_path / "copy")
+    path = tmp_path / "copy" / "meta" / damage
+    path.write_bytes(path.read_bytes()[:-40] if damage.endswith("h5") else b"step,wrong\n1\n")
+    with pytest.raises(UserError, match=damage):
+        evaluate(tmp_path / "copy", tmp_path / "copy" / "again", **QUIET)
+    assert not list((tmp_path / "copy").glob("*again*"))
+
+
+def test_mistakes_are_one_line(run, metrics, tmp_path):
+    """Spec G2: nothing to evaluate, not evaluated, existing output."""
+    with pytest.raises(UserError, match="nothing to evaluate"):
+        evaluate(tmp_path, tmp_path / "evaluation")
+    with pytest.raises(UserError, match="no such run"):
+        evaluate(tmp_path / "nowhere", tmp_path / "evaluation")
+    with pytest.raises(UserError, match="was not evaluated"):
+        report(tmp_path)
+    with pytest.raises(UserError, match="exists"):
+        evaluate(run, run / "evaluation")

@@ -1,0 +1,193 @@
+"""The command line end to end on a toy scale, and each mistake's one line (Spec A1-A8, G2)."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import hypogoal
+import numpy as np
+import pytest
+from hypogoal.cli import main
+
+SMALL = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1"]
+QUICK = ["--set", "environments=8", "--set", "warm_up=100", "--set", "max_episode_steps=60", "--set", "random_episodes=5"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of every stage, a few steps each."""
+    run = tmp_path_factory.mktemp("run")
+    assert main(["collect", "doorkey", "--out", str(run / "data.h5"), *SMALL, "-q"]) == 0
+    ensemble = ["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "--set", "steps=4", "-q"]
+    assert main([*ensemble, "--set", "workers=1"]) == 0
+    options = ["train-options", str(run / "ensemble"), "--out", str(run / "options"), "--set", "steps=600", *QUICK, "-q"]
+    assert main(options) == 0
+    meta = ["train-meta", str(run / "ensemble"), "--options", str(run / "options"), "--out", str(run / "meta")]
+    assert main([*meta, "--set", "steps=800", "--set", "decisions=32", *QUICK, "-q"]) == 0
+    return run
+
+
+def one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
+    """Run a command that must fail with code 2 and a single line on stderr; returns the line."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("hypogoal: "), captured.err
+    assert captured.out == ""
+    return lines[0]
+
+
+def test_steps_of_both_stages_count(made: Path) -> None:
+    """Spec A3, A4, F5: train-meta continues; its curve begins with the episodes of train-options."""
+    rows = [line.split(",") for line in (made / "meta" / "episodes.csv").read_text().splitlines()[1:]]
+    assert int(rows[0][0]) <= 600 < int(rows[-1][0]) <= 1400 + 8
+    manifest = json.loads((made / "meta" / "manifest.json").read_text())
+    assert manifest["config"]["options_steps"] == 600
+    assert {entry["kind"] for entry in manifest["inputs"]} == {"ensemble", "options"}
+    layout = json.loads((made / "meta" / "layout.json").read_text())
+    assert layout["layout_seed"] == 100 and layout["shortest_path"] >= 9
+
+
+def test_show_and_verify(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A8: what is this, is it whole."""
+    for part, kind in (("data.h5", "data"), ("ensemble", "ensemble"), ("meta", "meta"), ("", "run")):
+        capsys.readouterr()
+        assert main(["show", str(made / part), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["kind"] == kind
+        assert main(["show", str(made / part)]) == 0
+        assert main(["verify", str(made / part)]) == 0
+        assert "whole" in capsys.readouterr().out
+
+
+def test_verify_finds_damage(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2."""
+    copy = tmp_path / "ensemble"
+    shutil.copytree(made / "ensemble", copy)
+    weights = copy / "go-to-goal.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    assert main(["verify", str(copy), "--json"]) == 2
+    assert "go-to-goal.safetensors: changed" in json.loads(capsys.readouterr().out)["faults"][0]
+
+
+def test_python_interface(made: Path) -> None:
+    """The contract of the Python interface; Spec E1."""
+    ensemble = hypogoal.load_ensemble(made / "ensemble", "open-red-door")
+    probabilities = ensemble.predict(np.zeros((2, 64, 64, 3), dtype=np.uint8))
+    assert probabilities.shape == (2, 3) and probabilities.dtype == np.float32
+    for part in ("options", "meta"):
+        options = hypogoal.load_options(made / part)
+        env = hypogoal.OptionEnv(gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=100), options)
+        assert env.action_space == gymnasium.spaces.Discrete(15)
+        env.reset(seed=0)
+        rng = np.random.default_rng(0)
+        for _ in range(5):
+            masks = env.action_masks()
+            assert masks.shape == (15,) and masks.any()
+            observation, reward, terminated, truncated, info = env.step(int(rng.choice(np.flatnonzero(masks))))
+            assert env.observation_space.contains(observation)
+            assert 1 <= info["duration"] <= 10
+            if terminated or truncated:
+                env.reset()
+
+
+def test_resume_keeps_what_is_complete(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A6."""
+    before = (made / "ensemble" / "manifest.json").read_bytes()
+    assert main(["train-ensemble", str(made / "data.h5"), "--out", str(made / "ensemble"), "--resume"]) == 0
+    assert (made / "ensemble" / "manifest.json").read_bytes() == before
+    assert capsys.readouterr().out.strip().endswith("ensemble")
+
+
+def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:
+    """Same seed, same machine, same bytes: every stage."""
+    assert main(["collect", "doorkey", "--out", str(tmp_path / "data.h5"), *SMALL, "-q"]) == 0
+    arguments = ["--set", "steps=4", "--set", "workers=2", "-q"]
+    assert main(["train-ensemble", str(made / "data.h5"), "--out", str(tmp_path / "ensemble"), *arguments]) == 0
+    meta = ["train-meta", str(made / "ensemble"), "--options", str(made / "options"), "--out", str(tmp_path / "meta")]
+    assert main([*meta, "--set", "steps=800", "--set", "decisions=32", *QUICK, "-q"]) == 0
+    for name in ("ensemble/open-red-door.safetensors", "ensemble/metrics.jsonl", "meta/meta.safetensors",
+                 "meta/options.safetensors", "meta/episodes.csv", "meta/choices.csv", "meta/metrics.jsonl"):  # fmt: skip
+        assert (made / name).read_bytes() == (tmp_path / name).read_bytes(), name
+
+
+def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: missing input, wrong kind, existing --out, unknown names, values out of range: one line, nothing written."""
+    data, ensemble, out = str(made / "data.h5"), str(made / "ensemble"), str(tmp_path / "new")
+    truncated = tmp_path / "cut.h5"
+    truncated.write_bytes((made / "data.h5").read_bytes()[:5000])
+    newer = tmp_path / "newer"
+    shutil.copytree(made / "ensemble", newer)
+    manifest = json.loads((newer / "manifest.json").read_text())
+    (newer / "manifest.json").write_text(json.dumps(manifest | {"format": 2}))
+    cases = [
+        (["train-ensemble", str(tmp_path / "none.h5"), "--out", out], "no such data file"),
+        (["train-ensemble", ensemble, "--out", out], "a folder where a data file is needed"),
+        (["train-meta", data, "--out", out], "not an artefact"),
+        (["train-meta", str(made / "options"), "--out", out], "'options' artefact, but ensemble is needed"),
+        (["train-meta", ensemble, "--options", ensemble, "--out", out], "but options is needed"),
+        (["train-ensemble", data, "--out", ensemble], "exists already"),
+        (["collect", "doorkey", "--out", data], "exists already"),
+        (["train-ensemble", data, "--out", out, "--set", "sub_goals=fly"], "unknown sub-goal: fly"),
+        (["collect", "chess", "--out", out], "unknown domain: chess"),
+        (["collect", "nosuchmodule:DOMAIN", "--out", out], "cannot be loaded"),
+        (["run", "doorkey", "--out", out, "--preset", "turbo"], "unknown preset: turbo"),
+        (["run", "chess", "--out", out], "unknown experiment: chess"),
+        (["run", "doorkey", "--out", out, "--set", "train-meta.stepz=3"], "has no setting: stepz"),
+        (["run", "doorkey", "--out", out, "--set", "bake.steps=3"], "no such stage"),
+        (["run", "doorkey", "--out", str(made)], "exists already"),
+        (["train-meta", ensemble, "--out", out, "--set", "stepz=3"], "Did you mean 'steps'"),
+        (["train-meta", ensemble, "--out", out, "--set", "steps=0"], "out of range"),
+        (["train-ensemble", data, "--out", out, "--members", "0"], "out of range"),
+        (["train-ensemble", data, "--out", out, "--diversity", "magic"], "magic"),
+        (["train-ensemble", str(truncated), "--out", out], "truncated or not HDF5"),
+        (["show", str(truncated)], "truncated or not HDF5"),
+        (["train-meta", str(newer), "--out", out], "newer"),
+        (["train-meta", ensemble, "--out", out, "--device", "tpu"], "unknown device"),
+        (["train-meta", ensemble, "--options", str(made / "options"), "--out", out, "--layout-seed", "3"], "layout_seed"),
+        (["evaluate", str(tmp_path / "nothing")], "nothing to evaluate"),
+        (["report", str(tmp_path / "nothing")], "nothing"),
+        (["config", "bake"], "no such stage"),
+        (["train-meta"], "--help"),
+        (["frobnicate"], "--help"),
+    ]
+    for arguments, words in cases:
+        line = one_line(capsys, arguments)
+        assert words in line, (arguments, line)
+        assert not Path(out).exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.h5", "newer"]
+
+
+def test_a_failed_force_keeps_the_old_artefact(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: nothing lost."""
+    copy = tmp_path / "ensemble"
+    shutil.copytree(made / "ensemble", copy)
+    one_line(capsys, ["train-ensemble", str(tmp_path / "none.h5"), "--out", str(copy), "--force"])
+    assert main(["verify", str(copy)]) == 0
+
+
+def test_config_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    """'hypogoal config STAGE': default, unit, meaning, source."""
+    assert main(["config", "train-meta"]) == 0
+    text = capsys.readouterr().out
+    assert "gae_lambda = 0.95" in text and "paper: 0.97" in text
+    assert main(["config", "train-meta", "--json"]) == 0
+    assert any(row["name"] == "steps" for row in json.loads(capsys.readouterr().out))
+
+
+def test_dry_run_lists_commands_and_runs_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A6: a run is ordinary commands."""
+    out = tmp_path / "run"
+    assert main(["run", "doorkey", "--preset", "paper", "--out", str(out), "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("train-meta" in line and "chooser" not in line and "termination" not in line for line in lines) == 10
+    assert not out.exists()
+
+
+def test_help_is_quick_and_needs_no_torch() -> None:
+    """The house: 'hypogoal --help' imports torch inside commands only."""
+    code = "import sys; from hypogoal.cli import main; main(['--help']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
