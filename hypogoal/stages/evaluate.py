@@ -90,8 +90,8 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             h5py.File(folder / "arrays.h5", "w") as arrays,
             Progress("evaluate", total=len(inputs), quiet=quiet) as progress,
         ):
-            ensembles = evaluate_ensembles(found, arrays, progress)
             runs = [read_run(found, artefact) for artefact in found.agents]
+            ensembles = evaluate_ensembles(found, arrays, progress)
             groups = group_runs(runs)
             agents = [agent_metrics(name, same) for name, same in groups.items()]
             if runs:

@@ -152,23 +152,25 @@ def _cells(
     ensembles = {
         seed: add("ensemble", "train-ensemble", (str(data),), seed, None, (data,)) for seed in config.seeds
     }
-    for layout in config.layout_seeds:
-        for seed in config.seeds:
-            source = ensembles[seed]
-            extra: tuple[str, ...] = ()
-            needs: tuple[Path, ...] = (source,)
-            if config.pretrain:
-                options = add("options", "train-options", (str(source),), seed, layout, (source,))
-                extra, needs = ("--options", str(options)), (source, options)
-            agents.append(add("meta", "train-meta", (str(source), *extra), seed, layout, needs))
-            for control in config.controls:
-                change = "chooser=random" if control == "random" else "termination=oracle"
-                arguments = (str(source), "--set", change, "--set", f"steps={budget}")
-                agents.append(add(f"meta-{control}", "train-meta", arguments, seed, layout, (source,)))
-            for baseline in config.baselines:
-                agent, _, kind = baseline.partition("-")
-                arguments = (experiment, "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
-                agents.append(add(baseline, "train-baseline", arguments, seed, layout, ()))
+    cases = [(layout, seed) for layout in config.layout_seeds for seed in config.seeds]
+    for layout, seed in cases:
+        source = ensembles[seed]
+        extra: tuple[str, ...] = ()
+        needs: tuple[Path, ...] = (source,)
+        if config.pretrain:
+            options = add("options", "train-options", (str(source),), seed, layout, (source,))
+            extra, needs = ("--options", str(options)), (source, options)
+        agents.append(add("meta", "train-meta", (str(source), *extra), seed, layout, needs))
+    for control in config.controls:
+        change = "chooser=random" if control == "random" else "termination=oracle"
+        for layout, seed in cases:
+            arguments = (str(ensembles[seed]), "--set", change, "--set", f"steps={budget}")
+            agents.append(add(f"meta-{control}", "train-meta", arguments, seed, layout, (ensembles[seed],)))
+    for baseline in config.baselines:
+        agent, _, kind = baseline.partition("-")
+        for layout, seed in cases:
+            arguments = (experiment, "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
+            agents.append(add(baseline, "train-baseline", arguments, seed, layout, ()))
     evaluation = out / "evaluation"
     everything = (*ensembles.values(), *agents)
     cells.append(Cell("evaluate", ("evaluate", str(out), "--out", str(evaluation)), evaluation, everything))
