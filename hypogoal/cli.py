@@ -5,6 +5,7 @@ Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +24,8 @@ app = typer.Typer(
 Out = Annotated[Path, typer.Option("--out", help="What to write; it must not exist yet.")]
 Preset = Annotated[str | None, typer.Option("--preset", help="demo, paper, or an own .toml file.")]
 Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; see 'hypogoal config'.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; see 'hypogoal config'."),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything that is random.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what stands at --out.")]
@@ -87,7 +89,7 @@ def collect(
     if _complete(out, resume):
         return
     found = load_domain(domain)
-    config = resolve(found.config_class, stage="collect", preset=preset, assignments=set_ or ())
+    config: Any = resolve(found.config_class, stage="collect", preset=preset, assignments=set_ or ())
     counts = stage(found, config, out, seed=seed, force=force, quiet=quiet)
     if not quiet:
         for split in ("labelled", "heldout"):
@@ -119,9 +121,7 @@ def train_ensemble(
     if _complete(out, resume):
         return
     given = {"diversity": diversity, "members": members}
-    config = resolve(
-        TrainEnsembleConfig, stage="train-ensemble", preset=preset, options=given, assignments=set_ or ()
-    )
+    config = resolve(TrainEnsembleConfig, stage="train-ensemble", preset=preset, options=given, assignments=set_ or ())
     stage(data, config, out, seed=seed, force=force, quiet=quiet, device=device)
     typer.echo(out)
 
@@ -175,7 +175,10 @@ def train_meta(
         return
     given = {"layout_seed": layout_seed}
     config = resolve(TrainMetaConfig, stage="train-meta", preset=preset, options=given, assignments=set_ or ())
-    _outcome(stage(ensemble, config, out, options=options, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    _outcome(
+        stage(ensemble, config, out, options=options, seed=seed, force=force, quiet=quiet, device=device),
+        quiet,
+    )
     typer.echo(out)
 
 
@@ -314,7 +317,9 @@ def config(
 
 def _outcome(numbers: dict[str, Any], quiet: bool) -> None:
     if not quiet:
-        text = ", ".join(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in numbers.items())
+        text = ", ".join(
+            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in numbers.items()
+        )
         typer.echo(text)
 
 
@@ -339,6 +344,8 @@ def _echo(value: Any, as_json: bool, text: list[str]) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
+    if arguments is None:
+        signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
@@ -363,6 +370,10 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         return _fail(f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1)
+
+
+def _stop(signum: int, _frame: object) -> None:
+    raise KeyboardInterrupt(signum)
 
 
 def _fail(message: str, code: int) -> int:

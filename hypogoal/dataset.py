@@ -60,7 +60,13 @@ class Split:
 
 
 def write_dataset(
-    path: Path, collected: Collected, *, domain: str, config: Mapping[str, Any], seed: int, force: bool = False
+    path: Path,
+    collected: Collected,
+    *,
+    domain: str,
+    config: Mapping[str, Any],
+    seed: int,
+    force: bool = False,
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole."""
     import h5py
@@ -123,7 +129,9 @@ class Dataset:
             self.attributes = {key: _plain(value) for key, value in file.attrs.items()}
         if int(self.attributes.get("format", -1)) > FORMAT_VERSION:
             raise UserError(
-                f"format {self.attributes['format']} is newer than this hypogoal reads", path, "Upgrade hypogoal."
+                f"format {self.attributes['format']} is newer than this hypogoal reads",
+                path,
+                "Upgrade hypogoal.",
             )
         if "format" not in self.attributes or "sub_goals" not in self.attributes:
             raise UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
@@ -180,7 +188,9 @@ def open_dataset(path: Path) -> Dataset:
     if not path.exists():
         raise UserError("no such data file", path, "Make it with 'hypogoal collect'.")
     if path.is_dir():
-        raise UserError("a folder where a data file is needed", path, "Give the .h5 file that 'hypogoal collect' wrote.")
+        raise UserError(
+            "a folder where a data file is needed", path, "Give the .h5 file that 'hypogoal collect' wrote."
+        )
     return Dataset(path)
 
 

@@ -15,7 +15,13 @@ def describe_path(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
+        return {
+            "kind": "data",
+            "path": str(path),
+            **about,
+            "config": dataset.config,
+            "counts": dataset.counts(),
+        }
     if (path / MANIFEST).is_file():
         artefact = open_artefact(path)
         keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")

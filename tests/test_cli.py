@@ -7,13 +7,23 @@ import sys
 from pathlib import Path
 
 import gymnasium
-import hypogoal
 import numpy as np
 import pytest
+
+import hypogoal
 from hypogoal.cli import main
 
 SMALL = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1"]
-QUICK = ["--set", "environments=8", "--set", "warm_up=100", "--set", "max_episode_steps=60", "--set", "random_episodes=5"]
+QUICK = [
+    "--set",
+    "environments=8",
+    "--set",
+    "warm_up=100",
+    "--set",
+    "max_episode_steps=60",
+    "--set",
+    "random_episodes=5",
+]
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +31,35 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of every stage, a few steps each."""
     run = tmp_path_factory.mktemp("run")
     assert main(["collect", "doorkey", "--out", str(run / "data.h5"), *SMALL, "-q"]) == 0
-    ensemble = ["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "--set", "steps=4", "-q"]
+    ensemble = [
+        "train-ensemble",
+        str(run / "data.h5"),
+        "--out",
+        str(run / "ensemble"),
+        "--set",
+        "steps=4",
+        "-q",
+    ]
     assert main([*ensemble, "--set", "workers=1"]) == 0
-    options = ["train-options", str(run / "ensemble"), "--out", str(run / "options"), "--set", "steps=600", *QUICK, "-q"]
+    options = [
+        "train-options",
+        str(run / "ensemble"),
+        "--out",
+        str(run / "options"),
+        "--set",
+        "steps=600",
+        *QUICK,
+        "-q",
+    ]
     assert main(options) == 0
-    meta = ["train-meta", str(run / "ensemble"), "--options", str(run / "options"), "--out", str(run / "meta")]
+    meta = [
+        "train-meta",
+        str(run / "ensemble"),
+        "--options",
+        str(run / "options"),
+        "--out",
+        str(run / "meta"),
+    ]
     assert main([*meta, "--set", "steps=800", "--set", "decisions=32", *QUICK, "-q"]) == 0
     return run
 
@@ -87,7 +121,7 @@ def test_python_interface(made: Path) -> None:
         for _ in range(5):
             masks = env.action_masks()
             assert masks.shape == (15,) and masks.any()
-            observation, reward, terminated, truncated, info = env.step(int(rng.choice(np.flatnonzero(masks))))
+            observation, _reward, terminated, truncated, info = env.step(int(rng.choice(np.flatnonzero(masks))))
             assert env.observation_space.contains(observation)
             assert 1 <= info["duration"] <= 10
             if terminated or truncated:
@@ -107,7 +141,14 @@ def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:
     assert main(["collect", "doorkey", "--out", str(tmp_path / "data.h5"), *SMALL, "-q"]) == 0
     arguments = ["--set", "steps=4", "--set", "workers=2", "-q"]
     assert main(["train-ensemble", str(made / "data.h5"), "--out", str(tmp_path / "ensemble"), *arguments]) == 0
-    meta = ["train-meta", str(made / "ensemble"), "--options", str(made / "options"), "--out", str(tmp_path / "meta")]
+    meta = [
+        "train-meta",
+        str(made / "ensemble"),
+        "--options",
+        str(made / "options"),
+        "--out",
+        str(tmp_path / "meta"),
+    ]
     assert main([*meta, "--set", "steps=800", "--set", "decisions=32", *QUICK, "-q"]) == 0
     for name in ("ensemble/open-red-door.safetensors", "ensemble/metrics.jsonl", "meta/meta.safetensors",
                  "meta/options.safetensors", "meta/episodes.csv", "meta/choices.csv", "meta/metrics.jsonl"):  # fmt: skip
@@ -115,7 +156,7 @@ def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:
 
 
 def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec G2: missing input, wrong kind, existing --out, unknown names, values out of range: one line, nothing written."""
+    """Spec G2: missing input, wrong kind, unknown names, values out of range: one line, nothing written."""
     data, ensemble, out = str(made / "data.h5"), str(made / "ensemble"), str(tmp_path / "new")
     truncated = tmp_path / "cut.h5"
     truncated.write_bytes((made / "data.h5").read_bytes()[:5000])
@@ -147,7 +188,10 @@ def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["show", str(truncated)], "truncated or not HDF5"),
         (["train-meta", str(newer), "--out", out], "newer"),
         (["train-meta", ensemble, "--out", out, "--device", "tpu"], "unknown device"),
-        (["train-meta", ensemble, "--options", str(made / "options"), "--out", out, "--layout-seed", "3"], "layout_seed"),
+        (
+            ["train-meta", ensemble, "--options", str(made / "options"), "--out", out, "--layout-seed", "3"],
+            "layout_seed",
+        ),
         (["evaluate", str(tmp_path / "nothing")], "nothing to evaluate"),
         (["report", str(tmp_path / "nothing")], "nothing"),
         (["config", "bake"], "no such stage"),

@@ -25,7 +25,17 @@ from hypogoal.core.errors import UserError
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
 MAX_MANIFEST_BYTES = 16 * 2**20
-PACKAGES = ("hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "h5py", "safetensors", "stable-baselines3")
+PACKAGES = (
+    "hypogoal",
+    "torch",
+    "numpy",
+    "gymnasium",
+    "minigrid",
+    "ale-py",
+    "h5py",
+    "safetensors",
+    "stable-baselines3",
+)
 PARTIAL = ".partial"
 
 
@@ -93,7 +103,9 @@ def claim(out: Path, *, force: bool = False) -> Path:
     try:
         parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"the output's folder cannot be made ({error.strerror})", parent, "Choose another --out.") from None
+        raise UserError(
+            f"the output's folder cannot be made ({error.strerror})", parent, "Choose another --out."
+        ) from None
     if not os.access(parent, os.W_OK):
         raise UserError("no permission to write", parent, "Choose another --out.")
     return out
@@ -193,7 +205,9 @@ def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefa
         )
     for key, form in wanted.items():
         if not isinstance(manifest.get(key), form):
-            raise UserError(f"the manifest's {key!r} is missing or malformed", manifest_path, "Make the artefact again.")
+            raise UserError(
+                f"the manifest's {key!r} is missing or malformed", manifest_path, "Make the artefact again."
+            )
     kinds = (kind,) if isinstance(kind, str) else kind
     if kinds is not None and manifest["kind"] not in kinds:
         raise UserError(

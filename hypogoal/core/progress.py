@@ -48,6 +48,12 @@ class Progress:
         elif not self.quiet and kind is None:
             self._line("done")
 
+    def expect(self, total: int) -> None:
+        """How many units there will be, where that is known only now."""
+        self.total = total
+        if self._bar is not None:
+            self._bar.update(self._task, total=total)
+
     def advance(self, n: int = 1, **numbers: float) -> None:
         """``n`` more units are done; ``numbers`` are shown beside the bar."""
         self.update(self.done + n, **numbers)
@@ -67,7 +73,7 @@ class Progress:
         self._last = time.monotonic()
         seconds = max(self._last - self._start, 1e-9)
         rate = self.done / seconds
-        left = (self.total - self.done) / rate if rate > 0 else 0.0
+        left = max(self.total - self.done, 0) / rate if rate > 0 else 0.0
         tail = f", {text}" if text else ""
         print(
             f"{self.title}: {self.done}/{self.total} ({rate:.0f}/s, {left:.0f} s left){tail}",

@@ -39,9 +39,12 @@ class Engine(Protocol):
     count: int
     observation_shape: tuple[int, ...]
     max_steps: int
-    n_states: int
     ids: NDArray[np.int64]
     elapsed: NDArray[np.int64]
+
+    @property
+    def n_states(self) -> int:
+        """Ids known so far are 0 .. n_states - 1."""
 
     def reset(self) -> NDArray[np.int64]:
         """Put every environment at the start of an episode; returns the ids."""
@@ -88,7 +91,11 @@ def load_domain(name: str) -> Domain:
     try:
         domain = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise UserError(f"the domain cannot be loaded ({error})", name, "Check the module and the object.") from None
+        raise UserError(
+            f"the domain cannot be loaded ({error})", name, "Check the module and the object."
+        ) from None
     if not isinstance(domain, Domain):
-        raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
+        raise UserError(
+            "the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs."
+        )
     return domain

@@ -101,7 +101,7 @@ def collect(config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
     Args:
         config: see ``DoorKeyConfig``.
         seed: of the key placements and of the choice among their states; ``fixed`` does not depend on it.
-        progress: its ``advance()`` is called after each layout.
+        progress: told how many layouts there are, and of each that is done.
 
     Returns:
         Labels of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each:
@@ -114,6 +114,7 @@ def collect(config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
     sources = _labelled_layouts(config, seed)
     training = [(layout_seed, 0, layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]
     heldout = _heldout_layouts(config, avoid=[layout for _, _, layout in [*sources, *training]])
+    progress.expect(len(sources) + len(training) + len(heldout))
     swept = [
         [_sweep(config, *source, progress) for source in group] for group in (sources, training, heldout)
     ]

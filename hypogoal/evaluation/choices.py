@@ -63,9 +63,7 @@ def selection_of_run(
         "late_preference": preference(late.total("chosen", options), late.total("expected", options)),
         "share": shares(totals["chosen"]),
     }
-    duration = np.divide(
-        totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0
-    )
+    duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
     by_goal = []
     for index, sub_goal in enumerate(sub_goals):
         start = index * members

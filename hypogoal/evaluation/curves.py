@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 WINDOW = 100  # episodes
 SOLVED = 0.95  # share of the window's episodes
+FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
 GAMMA = 0.99  # per environment step, of the discounted return
 
 
@@ -35,7 +36,7 @@ class Episodes:
 
 
 def trailing_mean(
-    steps: NDArray[np.int64], values: NDArray[np.float64], grid: NDArray[np.int64], window: int = WINDOW
+    steps: NDArray[np.int64], values: NDArray[np.float64], grid: NDArray[np.int64], window: int = WINDOW, least: int = 1
 ) -> NDArray[np.float64]:
     """Spec F5: at each grid point the mean of the last ``window`` values that were known by then.
 
@@ -44,23 +45,24 @@ def trailing_mean(
         values: (n,).
         grid: int (G,).
         window: values; fewer are averaged at the beginning.
+        least: values below which there is no mean.
 
     Returns:
-        float64 (G,), NaN before the first value.
+        float64 (G,), NaN where fewer than ``least`` values are known.
     """
     sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
     end = np.searchsorted(steps, grid, side="right")
     start = np.maximum(0, end - window)
     counts = end - start
-    return np.where(counts > 0, (sums[end] - sums[start]) / np.maximum(counts, 1), np.nan)
+    return np.where(counts >= max(1, least), (sums[end] - sums[start]) / np.maximum(counts, 1), np.nan)
 
 
 def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = WINDOW) -> dict[str, NDArray[np.float64]]:
     """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`."""
     return {
-        "reward": trailing_mean(episodes.step, episodes.reward, grid, window),
-        "success": trailing_mean(episodes.step, episodes.terminated.astype(np.float64), grid, window),
-        "length": trailing_mean(episodes.step, episodes.length.astype(np.float64), grid, window),
+        "reward": trailing_mean(episodes.step, episodes.reward, grid, window, FIRST),
+        "success": trailing_mean(episodes.step, episodes.terminated.astype(np.float64), grid, window, FIRST),
+        "length": trailing_mean(episodes.step, episodes.length.astype(np.float64), grid, window, FIRST),
     }
 
 

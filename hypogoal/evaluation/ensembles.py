@@ -76,7 +76,11 @@ def _pairs(unlabelled: NDArray[np.bool_], heldout: NDArray[np.bool_]) -> list[di
     rates = pairwise_disagreement(unlabelled), pairwise_disagreement(heldout)
     members = heldout.shape[1]
     return [
-        {"members": [first, second], "unlabelled": float(rates[0][first, second]), "heldout": float(rates[1][first, second])}
+        {
+            "members": [first, second],
+            "unlabelled": float(rates[0][first, second]),
+            "heldout": float(rates[1][first, second]),
+        }
         for first in range(members)
         for second in range(first + 1, members)
     ]
@@ -92,7 +96,10 @@ def ensemble_name(config: Mapping[str, Any]) -> str:
 
 def ensemble_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of ensembles; those whose settings differ are kept apart, settings without effect left out."""
-    idle = {"single CNN": {"diversity", "diversity_weight", "schedule", "members"}, "no diversity": {"diversity_weight"}}
+    idle = {
+        "single CNN": {"diversity", "diversity_weight", "schedule", "members"},
+        "no diversity": {"diversity_weight"},
+    }
     bases = [ensemble_name(config) for config in configs]
     told = [
         {key: value for key, value in config.items() if key not in idle.get(base.partition(",")[0], set())}

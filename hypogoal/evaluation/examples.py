@@ -47,5 +47,11 @@ def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], count: int, kin
 
 
 def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Figures 7 and 8: the mean image of states uint8 (n, H, W, C), n at least 1: what they share stays sharp."""
-    return states.astype(np.float32).mean(axis=0).round().astype(np.uint8)
+    """Figures 7 and 8: termination states uint8 (n, H, W, C), n at least 1, laid over each other.
+
+    Pixels that all states share stay as they are; where states differ it is the root of the mean brightness, so that
+    what few of them show can still be seen.
+    """
+    mean = states.astype(np.float32).mean(axis=0)
+    varies = states.min(axis=0) != states.max(axis=0)
+    return np.where(varies, 255 * np.sqrt(mean / 255), mean).round().astype(np.uint8)

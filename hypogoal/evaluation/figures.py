@@ -101,9 +101,7 @@ def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
         axes.fill_between(steps[shown], low, high, color=line.colour, alpha=0.18, linewidth=0)
 
 
-def best_mean_worst_members(
-    sub_goals: Sequence[str], kinds: Sequence[tuple[str, NDArray[np.float64]]]
-) -> Figure:
+def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str, NDArray[np.float64]]]) -> Figure:
     """Figure 3's quantity for one labelled layout: balanced accuracy on held-out layouts, by kind of ensemble.
 
     Args:
@@ -128,7 +126,7 @@ def best_mean_worst_members(
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.set_xlim(min(0.45, float(np.nanmin([values.min() for _, values in kinds])) - 0.03), 1.02)
-        axes.set_xlabel("balanced accuracy on held-out layouts (0.5: no better than always yes)")
+        axes.set_xlabel("balanced accuracy on held-out layouts (0.5: chance)")
         figure.legend(loc="outside lower left", ncols=3)
         return figure
 

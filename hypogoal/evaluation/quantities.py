@@ -1,7 +1,10 @@
 """What each number in ``metrics.json`` is: its unit and its meaning."""
 
 QUANTITIES: dict[str, dict[str, str]] = {
-    "balanced_accuracy": {"unit": "fraction", "meaning": "mean of recall and of the share of negatives called negative"},
+    "balanced_accuracy": {
+        "unit": "fraction",
+        "meaning": "mean of recall and of the share of negatives called negative",
+    },
     "precision": {"unit": "fraction", "meaning": "positives among the states that a member calls positive"},
     "recall": {"unit": "fraction", "meaning": "share of positives that a member calls positive"},
     "accuracy": {"unit": "fraction", "meaning": "share of states that a member calls right"},
@@ -10,9 +13,15 @@ QUANTITIES: dict[str, dict[str, str]] = {
     "disagreement": {"unit": "fraction", "meaning": "share of states on which two members' verdicts differ"},
     "success": {"unit": "fraction", "meaning": "share of the last 100 training episodes that reached the goal"},
     "reward": {"unit": "reward", "meaning": "mean undiscounted reward of the last 100 training episodes"},
-    "length": {"unit": "steps", "meaning": "mean length of the last 100 training episodes, failures at the cap included"},
+    "length": {
+        "unit": "steps",
+        "meaning": "mean length of the last 100 training episodes, failures at the cap included",
+    },
     "length_over_shortest": {"unit": "ratio", "meaning": "length / the layout's shortest path"},
-    "discounted_return": {"unit": "reward", "meaning": "mean of 0.99 ** (length - 1) * reward over the last 100 episodes"},
+    "discounted_return": {
+        "unit": "reward",
+        "meaning": "mean of 0.99 ** (length - 1) * reward over the last 100 episodes",
+    },
     "steps_to_95": {
         "unit": "environment steps",
         "meaning": "first step at which 95 of the last 100 episodes succeeded; steps of train-options count",

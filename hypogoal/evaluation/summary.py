@@ -23,8 +23,8 @@ def summary_table(metrics: Mapping[str, Any]) -> Table:
             number(agent["length_over_shortest"]["mean"], 1),
             solved(agent["steps_to_95"]),
         )
-    for line in metrics["missing"]:
-        table.add_row(f"[dim]{line}[/dim]", *[""] * 5)
+    if metrics["missing"]:
+        table.caption, table.caption_justify = f"In this run: {'; '.join(metrics['missing'])}.", "left"
     return table
 
 

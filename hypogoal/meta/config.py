@@ -12,10 +12,16 @@ class MetaConfig:
     """PPO over options, with SMDP returns."""
 
     meta_network: str = setting(
-        "light", "the paper's three convolutions, or a small one on cells", source="Spec E2", choices=("light", "paper")
+        "light",
+        "the paper's three convolutions, or a small one on cells",
+        source="Spec E2",
+        choices=("light", "paper"),
     )
     head: str = setting(
-        "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")
+        "categorical",
+        "distribution over options",
+        source="gaussian: paper",
+        choices=("categorical", "gaussian"),
     )
     gamma: float = setting(0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="E1")
     gae_lambda: float = setting(0.95, "advantage trace per decision", source="paper: 0.97", low=0.0, high=1.0)

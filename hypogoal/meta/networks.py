@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -14,9 +16,7 @@ class LightMetaNetwork(nn.Module):
     def __init__(self, observation_shape: tuple[int, ...], options: int, width: int = 128):
         super().__init__()
         self.cells = CellEmbedding(observation_shape)
-        self.trunk = nn.Sequential(
-            nn.Linear(self.cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
-        )
+        self.trunk = nn.Sequential(nn.Linear(self.cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
         self.outputs = nn.Linear(width, options + 1)
         _quiet_start(self.outputs)
 
@@ -112,5 +112,9 @@ class GaussianHead(nn.Module):
         return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
 
 
-HEADS = {"categorical": CategoricalHead, "gaussian": GaussianHead}
-NETWORKS = {"light": LightMetaNetwork, "paper": PaperMetaNetwork}
+Head = CategoricalHead | GaussianHead
+HEADS: dict[str, Callable[[int], Head]] = {"categorical": CategoricalHead, "gaussian": GaussianHead}
+NETWORKS: dict[str, Callable[[tuple[int, ...], int], nn.Module]] = {
+    "light": LightMetaNetwork,
+    "paper": PaperMetaNetwork,
+}

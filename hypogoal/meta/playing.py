@@ -19,7 +19,7 @@ from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
 
 LOG_INTERVAL = 2_000  # environment steps
-LEARNERS = {"light": LightLearner, "paper": RecurrentLearner}
+LEARNERS: dict[str, type[LightLearner] | type[RecurrentLearner]] = {"light": LightLearner, "paper": RecurrentLearner}
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,10 @@ class PlayConfig(OptionConfig):
     layout_seed: int = setting(100, "the layout the agent lives on", source="Spec E4", low=0)
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", source="B1", low=1)
     termination: str = setting(
-        "learned", "members' verdicts, or the true sub-goals (upper bound)", source="E6", choices=("learned", "oracle")
+        "learned",
+        "members' verdicts, or the true sub-goals (upper bound)",
+        source="E6",
+        choices=("learned", "oracle"),
     )
     random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="F5", low=0)
 
@@ -70,7 +73,13 @@ def play(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress) -> N
             logged = recorder.steps
             success, length = recorder.success(), recorder.length()
             shown = {"success": success, "length": length} if recorder.episodes else {}
-            log.write(step=recorder.steps, episodes=len(recorder.episodes), states=loop.engine.n_states, **shown, **numbers)
+            log.write(
+                step=recorder.steps,
+                episodes=len(recorder.episodes),
+                states=loop.engine.n_states,
+                **shown,
+                **numbers,
+            )
             progress.update(min(recorder.steps - begin, steps), **shown)
 
 

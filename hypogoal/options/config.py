@@ -12,10 +12,16 @@ class OptionConfig:
     """How the intra-option policies are executed and learned."""
 
     network: str = setting(
-        "light", "Q-network: the paper's conv-GRU, or a small one on cells", source="Spec D2", choices=("light", "paper")
+        "light",
+        "Q-network: the paper's conv-GRU, or a small one on cells",
+        source="Spec D2",
+        choices=("light", "paper"),
     )
     experience: str = setting(
-        "shared", "who learns from a step: its own member, or all of them", source="own: paper", choices=("own", "shared")
+        "shared",
+        "who learns from a step: its own member, or all of them",
+        source="own: paper",
+        choices=("own", "shared"),
     )
     option_timeout: int = setting(10, "an option ends after this many steps", unit="steps", source="paper", low=1)
     mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="Spec D6")
@@ -39,4 +45,6 @@ class OptionConfig:
         choices=("start", "first-positive"),
     )
     priority_alpha: float = setting(0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0)
-    priority_beta: float = setting(0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0)
+    priority_beta: float = setting(
+        0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0
+    )

@@ -48,7 +48,12 @@ class Learner(Protocol):
     """Intra-option policies: see :class:`hypogoal.options.light.LightLearner`."""
 
     def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+        self,
+        ids: NDArray[np.int64],
+        options: NDArray[np.int64],
+        age: NDArray[np.int64],
+        *,
+        explore: bool = True,
     ) -> NDArray[np.int64]: ...
 
     def observe(
@@ -185,7 +190,7 @@ class OptionLoop:
             Outcome(
                 environments=done,
                 returns=self.returns[done],
-                discounts=self.gamma ** self.age[done],
+                discounts=np.power(self.gamma, self.age[done], dtype=np.float64),
                 next_ids=next_ids,
                 next_offered=offered_options(self.verdicts.of(next_ids), self.config.mask_reached),
                 terminated=step.terminated[done],

@@ -47,11 +47,18 @@ class LightLearner:
             self.online = LightQNetwork(engine.observation_shape, self.options, engine.n_actions)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
-        fields = {"s": np.int32, "a": np.int8, "next": np.int32, "option": np.int16, "end": np.bool_, "timeout": np.bool_}
-        self.replay = PrioritisedReplay(
-            config.replay, fields, alpha=config.priority_alpha, beta=config.priority_beta
-        )
-        self.positive = {name: np.zeros((self.options, POSITIVES_KEPT), kind) for name, kind in fields.items()}
+        fields = {
+            "s": np.int32,
+            "a": np.int8,
+            "next": np.int32,
+            "option": np.int16,
+            "end": np.bool_,
+            "timeout": np.bool_,
+        }
+        self.replay = PrioritisedReplay(config.replay, fields, alpha=config.priority_alpha, beta=config.priority_beta)
+        self.positive: dict[str, NDArray[Any]] = {
+            name: np.zeros((self.options, POSITIVES_KEPT), kind) for name, kind in fields.items()
+        }
         self.positives = np.zeros(self.options, dtype=np.int64)
         self.option_steps = np.zeros(self.options, dtype=np.int64)
         self.steps_since_positive = np.zeros(self.options, dtype=np.int64)
@@ -65,7 +72,12 @@ class LightLearner:
         return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
 
     def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+        self,
+        ids: NDArray[np.int64],
+        options: NDArray[np.int64],
+        age: NDArray[np.int64],
+        *,
+        explore: bool = True,
     ) -> NDArray[np.int64]:
         """Actions int64 (E,) of the running options (E,) in states (E,)."""
         with torch.no_grad():
@@ -170,7 +182,9 @@ class LightLearner:
 
     def _step(self, loss: Tensor) -> None:
         if not torch.isfinite(loss):
-            raise NumericalError(f"the option loss is {float(loss.detach())} at update {self.updates}; nothing was saved over")
+            raise NumericalError(
+                f"the option loss is {float(loss.detach())} at update {self.updates}; nothing was saved over"
+            )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.online.parameters(), GRADIENT_NORM, foreach=True)

@@ -48,9 +48,7 @@ class LightQNetwork(nn.Module):
         super().__init__()
         self.members, self.actions = members, actions
         self.cells = CellEmbedding(observation_shape)
-        self.trunk = nn.Sequential(
-            nn.Linear(self.cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
-        )
+        self.trunk = nn.Sequential(nn.Linear(self.cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
         self.heads = nn.Linear(width, members * actions)
 
     def forward(self, images: Tensor) -> Tensor:

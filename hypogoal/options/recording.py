@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -108,7 +108,7 @@ class Recorder:
                     file.create_dataset(str(option), data=states, compression="gzip", compression_opts=1)
 
 
-def write_table(path: Path, columns: tuple[str, ...], rows: list[tuple[int | float, ...]]) -> None:
+def write_table(path: Path, columns: tuple[str, ...], rows: Sequence[tuple[int | float, ...]]) -> None:
     """A CSV file with a header."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -71,7 +71,12 @@ class RecurrentLearner:
 
     @torch.no_grad()
     def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+        self,
+        ids: NDArray[np.int64],
+        options: NDArray[np.int64],
+        age: NDArray[np.int64],
+        *,
+        explore: bool = True,
     ) -> NDArray[np.int64]:
         """Actions int64 (E,); moves each environment's hidden state one step on (BatchNorm in eval mode)."""
         actions = np.empty(len(ids), dtype=np.int64)
@@ -152,11 +157,11 @@ class RecurrentLearner:
 
         unique, inverse = np.unique(states, return_inverse=True)
         images = torch.from_numpy(self.engine.images(unique))
-        inverse = torch.from_numpy(inverse.reshape(states.shape))
+        places = torch.from_numpy(inverse.reshape(states.shape))
         member.online.train()
-        values = member.online(member.online.embed(images)[inverse])[0]
+        values = member.online(member.online.embed(images)[places])[0]
         with torch.no_grad():
-            next_target = member.target(member.target.embed(images)[inverse])[0]
+            next_target = member.target(member.target.embed(images)[places])[0]
         here, after = torch.from_numpy(place), torch.from_numpy(place + 1)
         pick = torch.arange(len(indices))
         terminal = data["terminal"][indices]

@@ -61,9 +61,7 @@ class Verdicts:
         if highest > len(self._known):
             size = max(highest, 2 * len(self._known))
             self._known = np.concatenate([self._known, np.zeros(size - len(self._known), dtype=np.bool_)])
-            self._rows = np.concatenate(
-                [self._rows, np.zeros((size - len(self._rows), self.options), dtype=np.bool_)]
-            )
+            self._rows = np.concatenate([self._rows, np.zeros((size - len(self._rows), self.options), dtype=np.bool_)])
         known = self._known[ids]
         if not known.all():
             fresh = np.unique(ids[~known])

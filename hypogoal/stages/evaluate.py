@@ -140,8 +140,15 @@ def evaluate_ensembles(found: Found, arrays: Any, progress: Progress) -> list[di
     metrics = []
     for artefact, name in zip(found.ensembles, names, strict=True):
         dataset = open_dataset(artefact.input("data"))
-        rows = [_evaluate_sub_goal(artefact, goal, dataset, arrays, not metrics) for goal in artefact.config["sub_goals"]]
-        about = {"path": found.name(artefact), "name": name, "seed": artefact.seed, "members": artefact.config["members"]}
+        rows = [
+            _evaluate_sub_goal(artefact, goal, dataset, arrays, not metrics) for goal in artefact.config["sub_goals"]
+        ]
+        about = {
+            "path": found.name(artefact),
+            "name": name,
+            "seed": artefact.seed,
+            "members": artefact.config["members"],
+        }
         metrics.append({**about, "sub_goals": rows})
         progress.advance()
     return metrics
@@ -257,8 +264,8 @@ def layouts_of(runs: Iterable[Run]) -> list[dict[str, Any]]:
 
 def missing(found: Found, names: list[str]) -> list[str]:
     """One line for everything of section F that this run has no artefacts for."""
-    lines = [] if found.ensembles else ["no ensemble: nothing is said of hypotheses"]
-    return [f"{line} in {found.run}" for line in (*lines, *missing_agents(names))]
+    lines = [] if found.ensembles else ["no ensemble"]
+    return [*lines, *missing_agents(names)]
 
 
 def provenance(found: Found, data: list[Path]) -> dict[str, Any]:

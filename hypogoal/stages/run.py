@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST
-from hypogoal.core.config import load_preset, parse_assignments, resolve, setting
+from hypogoal.core.config import parse_assignments, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 
@@ -108,12 +108,20 @@ def plan(experiment: str, out: Path, *, preset: str | None = None, assignments: 
     for stage in by_stage:
         if stage not in stages:
             raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(stages)}.")
-    resolved = {
-        stage: resolve(config_class_of(stage, experiment), stage=stage, preset=preset, assignments=by_stage.get(stage, ()))
+    resolved: dict[str, Any] = {
+        stage: resolve(
+            config_class_of(stage, experiment),
+            stage=stage,
+            preset=preset,
+            assignments=by_stage.get(stage, ()),
+        )
         for stage in stages
     }
     common = {
-        stage: (*(("--preset", preset) if preset else ()), *(x for pair in by_stage.get(stage, ()) for x in ("--set", pair)))
+        stage: (
+            *(("--preset", preset) if preset else ()),
+            *(x for pair in by_stage.get(stage, ()) for x in ("--set", pair)),
+        )
         for stage in stages
     }
     return Plan(_cells(experiment, out, config, resolved, common), config.workers or os.cpu_count() or 1)
@@ -134,7 +142,11 @@ def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]
 
 
 def _cells(
-    experiment: str, out: Path, config: RunConfig, resolved: dict[str, Any], common: dict[str, tuple[str, ...]]
+    experiment: str,
+    out: Path,
+    config: RunConfig,
+    resolved: dict[str, Any],
+    common: dict[str, tuple[str, ...]],
 ) -> list[Cell]:
     single = len(config.layout_seeds) * len(config.seeds) == 1
     data = out / "data.h5"
@@ -143,15 +155,20 @@ def _cells(
     budget = str(spent + resolved["train-meta"].steps)
     agents: list[Path] = []
 
-    def add(name: str, stage: str, arguments: Sequence[str], seed: int, layout: int | None, needs: tuple[Path, ...]) -> Path:
+    def add(
+        name: str,
+        stage: str,
+        arguments: Sequence[str],
+        seed: int,
+        layout: int | None,
+        needs: tuple[Path, ...],
+    ) -> Path:
         place = name if single else f"{name}/seed-{seed}" if layout is None else f"{name}/layout-{layout}-seed-{seed}"
         at = ("--seed", str(seed), *(("--layout-seed", str(layout)) if layout is not None else ()))
         cells.append(_cell(stage, (*arguments, *common[stage], *at), out / place, needs))
         return out / place
 
-    ensembles = {
-        seed: add("ensemble", "train-ensemble", (str(data),), seed, None, (data,)) for seed in config.seeds
-    }
+    ensembles = {seed: add("ensemble", "train-ensemble", (str(data),), seed, None, (data,)) for seed in config.seeds}
     cases = [(layout, seed) for layout in config.layout_seeds for seed in config.seeds]
     for layout, seed in cases:
         source = ensembles[seed]
@@ -169,8 +186,8 @@ def _cells(
     for baseline in config.baselines:
         agent, _, kind = baseline.partition("-")
         for layout, seed in cases:
-            arguments = (experiment, "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
-            agents.append(add(baseline, "train-baseline", arguments, seed, layout, ()))
+            options_of = (experiment, "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
+            agents.append(add(baseline, "train-baseline", options_of, seed, layout, ()))
     evaluation = out / "evaluation"
     everything = (*ensembles.values(), *agents)
     cells.append(Cell("evaluate", ("evaluate", str(out), "--out", str(evaluation)), evaluation, everything))
@@ -232,7 +249,13 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
 
 
 def _start(cell: Cell, logs: Path, force: bool) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "hypogoal", *cell.arguments, *(("--force",) if force and cell.out.exists() else ())]
+    command = [
+        sys.executable,
+        "-m",
+        "hypogoal",
+        *cell.arguments,
+        *(("--force",) if force and cell.out.exists() else ()),
+    ]
     with (logs / f"{cell.name}.log").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
 

@@ -81,7 +81,9 @@ def train_ensemble(
     return summaries
 
 
-def _train_one(data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path) -> dict[str, Any]:
+def _train_one(
+    data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path
+) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
     dataset = open_dataset(data)
@@ -94,7 +96,12 @@ def _train_one(data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int
             log.write(json.dumps({"sub_goal": sub_goal, "step": step, **losses}) + "\n")
 
         ensemble = fit(
-            split.observations, split.labels, dataset.unlabelled(), config, seed_for(seed, "ensemble", sub_goal), on_step
+            split.observations,
+            split.labels,
+            dataset.unlabelled(),
+            config,
+            seed_for(seed, "ensemble", sub_goal),
+            on_step,
         )
     write_ensemble(folder, sub_goal, ensemble)
     return {"sub_goal": sub_goal, **numbers}

@@ -31,9 +31,14 @@ from hypogoal.options.recording import Recorder
 class TrainMetaConfig(PlayConfig, MetaConfig):
     """How options are learned and chosen, and for how long."""
 
-    steps: int = setting(300_000, "environment steps, all environments together", unit="steps", source="E4: 1.5e6", low=1)
+    steps: int = setting(
+        300_000, "environment steps, all environments together", unit="steps", source="E4: 1.5e6", low=1
+    )
     chooser: str = setting(
-        "ppo", "the meta-policy, or uniform choice among those offered", source="E6", choices=("ppo", "random")
+        "ppo",
+        "the meta-policy, or uniform choice among those offered",
+        source="E6",
+        choices=("ppo", "random"),
     )
 
 
@@ -94,20 +99,34 @@ def train_meta(
         save_tensors(folder / "options.safetensors", learner.state())
         if policy:
             save_tensors(folder / "meta.safetensors", policy.state())
-        (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
-    return {"steps": recorder.steps, "episodes": len(recorder.episodes), "success": recorder.success(), "length": recorder.length()}
+        (folder / "layout.json").write_text(
+            json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8"
+        )
+    return {
+        "steps": recorder.steps,
+        "episodes": len(recorder.episodes),
+        "success": recorder.success(),
+        "length": recorder.length(),
+    }
 
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     """The rows of an ``episodes.csv``: step, length, reward, terminated."""
     with path.open(newline="", encoding="utf-8") as file:
-        return [(int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"])) for r in csv.DictReader(file)]
+        return [
+            (int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"]))
+            for r in csv.DictReader(file)
+        ]
 
 
 def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> None:
     made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
     if sha256_of(source.path / "manifest.json") not in made_from:
-        raise UserError("these options were trained with another ensemble", trained.path, f"Train them from {source.path}.")
+        raise UserError(
+            "these options were trained with another ensemble",
+            trained.path,
+            f"Train them from {source.path}.",
+        )
     for key in ("network", "termination", "layout_seed"):
         if trained.config[key] != getattr(config, key):
             raise UserError(

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
@@ -29,12 +30,18 @@ def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
     assert check_files(artefact) == []
 
 
+def break_off(out: Path) -> None:
+    """A stage that fails half-way."""
+    with create_artefact(out, kind="meta", config={}, seed=0, force=True) as folder:
+        (folder / "half").write_text("x")
+        raise RuntimeError("broke")
+
+
 def test_a_failed_stage_leaves_nothing(tmp_path: Path) -> None:
     """Spec G2: no half-written output, and what stood there before stands there still."""
     out = make(tmp_path / "meta")
-    with pytest.raises(RuntimeError, match="broke"), create_artefact(out, kind="meta", config={}, seed=0, force=True) as folder:
-        (folder / "half").write_text("x")
-        raise RuntimeError("broke")
+    with pytest.raises(RuntimeError, match="broke"):
+        break_off(out)
     assert [path.name for path in tmp_path.iterdir()] == ["meta"]
     assert open_artefact(out).config == {"steps": 3}
 
@@ -118,4 +125,6 @@ def test_streams_are_named_and_reproducible() -> None:
     assert seed_for(1, "a", 2) == seed_for(1, "a", 2) != seed_for(1, "a", 3)
     np.testing.assert_array_equal(rng_for(1, "a").random(3), rng_for(1, "a").random(3))
     assert rng_for(1, "a").random() != rng_for(1, "b").random()
-    assert torch.equal(torch.rand(3, generator=torch_generator(1, "a")), torch.rand(3, generator=torch_generator(1, "a")))
+    assert torch.equal(
+        torch.rand(3, generator=torch_generator(1, "a")), torch.rand(3, generator=torch_generator(1, "a"))
+    )

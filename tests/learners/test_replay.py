@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+
 from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay, SumTree
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork
 from hypogoal.meta.ppo import clipped_surrogate
 from hypogoal.meta.smdp import smdp_advantages
@@ -13,7 +14,13 @@ def test_advantages_by_hand() -> None:
     discounts = np.array([0.9**3, 0.9**2])
     returns = np.array([0.0, 0.9])  # reward 1 at the option's second step
     advantages = smdp_advantages(
-        returns, discounts, np.array([0.4, 0.6]), np.array([0.6, 7.0]), np.array([False, True]), np.array([False, True]), 0.5
+        returns,
+        discounts,
+        np.array([0.4, 0.6]),
+        np.array([0.6, 7.0]),
+        np.array([False, True]),
+        np.array([False, True]),
+        0.5,
     )
     last = 0.9 - 0.6
     first = 0.9**3 * 0.6 - 0.4 + 0.9**3 * 0.5 * last

@@ -1,6 +1,7 @@
 """A corridor with the engine's interface: small enough to learn in seconds, with states that look alike."""
 
 import numpy as np
+
 from hypogoal.domains.base import Step
 
 LENGTH = 6

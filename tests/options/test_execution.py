@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
@@ -268,7 +269,9 @@ def test_the_meta_policy_learns_which_option_pays() -> None:
         config = OptionConfig(environments=8)
         verdicts = Verdicts(oracle_terminations(engine), 2)
         learner = Perfect()
-        policy = MetaPolicy(engine, 2, MetaConfig(head=head, decisions=64, meta_batch=32, meta_learning_rate=3e-3), seed=0)
+        policy = MetaPolicy(
+            engine, 2, MetaConfig(head=head, decisions=64, meta_batch=32, meta_learning_rate=3e-3), seed=0
+        )
         loop = OptionLoop(engine, verdicts, learner, policy, Recorder(2), config, gamma=0.9)
         for _ in range(600):
             loop.step()

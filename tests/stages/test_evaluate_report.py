@@ -95,9 +95,9 @@ def test_selection_counts_every_decision(run, metrics):
     assert [member["option"] for member in members] == list(range(10))
     assert sum(member["chosen"] for member in members) == table["chosen"].sum()
     assert sum(member["expected"] for member in members) == pytest.approx(sum(member["chosen"] for member in members))
-    often = [member for member in members if member["expected"] > 100]
+    often = [member for member in members if member["expected"] > 40]
     assert often
-    assert all(0.6 < member["preference"] < 1.5 for member in often)
+    assert all(0.5 < member["preference"] < 1.7 for member in often)
     assert all(0 <= member["match"] <= 1 for member in members)
 
 
@@ -120,10 +120,10 @@ def test_metrics_are_written_as_returned(run, metrics):
 
 def test_what_is_missing_is_named(run, metrics, tmp_path):
     """Spec F: no silent absence, in the metrics, on the page and in an evaluation of a run with a baseline only."""
-    assert metrics["missing"] == [f"no agent '{name}' in {run}" for name in ("PPO paper", "DQN tuned", "DQN paper")]
+    assert metrics["missing"] == [f"no agent '{name}'" for name in ("PPO paper", "DQN tuned", "DQN paper")]
     train_baseline("doorkey", BaselineConfig(steps=640, **SHORT), tmp_path / "only" / "ppo", **QUIET)
     alone = evaluate(tmp_path / "only", tmp_path / "only" / "evaluation", **QUIET)
-    assert alone["missing"][0].startswith("no ensemble")
+    assert alone["missing"][0] == "no ensemble"
     assert alone["ensembles"] == alone["selection"] == []
     text = report(tmp_path / "only").read_text(encoding="utf-8")
     assert "It needs an ensemble artefact" in text

@@ -9,7 +9,18 @@ import numpy as np
 
 from hypogoal.evaluation.agents import LEARNED, ORACLE, ORACLE_RANDOM, PRETRAINING, RANDOM
 from hypogoal.evaluation.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Line, learning_curves
-from hypogoal.evaluation.page.blocks import Block, Material, fixed, figure, interval, listed, row, section, spread, table
+from hypogoal.evaluation.page.blocks import (
+    Block,
+    Material,
+    fixed,
+    figure,
+    interval,
+    listed,
+    row,
+    section,
+    spread,
+    table,
+)
 from hypogoal.evaluation.summary import percent, solved, thousands
 
 COLOURS = {
@@ -160,13 +171,15 @@ def _intervals(agents: Sequence[Mapping[str, Any]]) -> Block:
         )
         for agent in agents
     ]
-    over = sorted({agent["success"]["interval_over"] for agent in agents})
+    over = sorted({agent["success"]["interval_over"] for agent in agents if agent["success"]["n"] > 1})
+    resamples = (
+        f"its 95 % bootstrap interval (2,000 resamples of {listed(over)})" if over else "no interval: one run each"
+    )
     return table(
         ("agent", "success, %", "steps", "discounted return", "runs"),
         rows,
         heading="Interquartile means",
-        caption="Interquartile mean over runs with its 95 % bootstrap interval (2,000 resamples of "
-        f"{listed(over)}), over the last 100 episodes of each run.",
+        caption=f"Interquartile mean over runs with {resamples}; over the last 100 episodes of each run.",
     )
 
 

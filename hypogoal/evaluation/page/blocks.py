@@ -60,8 +60,9 @@ def table(
     caption: str = "",
     heading: str = "",
     folded: str = "",
+    wrap: bool = False,
 ) -> Block:
-    """A table; the first ``texts`` columns are text, the others numbers. Rows are made by :func:`row`."""
+    """A table; the first ``texts`` columns are text, the others numbers; ``wrap`` for long texts. Rows are made by :func:`row`."""
     named = [{"name": name, "number": index >= texts} for index, name in enumerate(columns)]
     return {
         "kind": "table",
@@ -70,6 +71,7 @@ def table(
         "caption": caption,
         "heading": heading,
         "folded": folded,
+        "wrap": wrap,
     }
 
 

@@ -53,8 +53,8 @@ def terminations_section(material: Material) -> Block:
         missing = ["Overlaid termination states: they need a meta artefact with learned terminations: train-meta."]
         return section("terminations", title, [], [], missing)
     text = (
-        "The states in which a member's classifier ended its option, laid over each other (their mean image): what all of "
-        "them share is sharp, what varies fades. For each sub-goal the member that the agent prefers most and the one it "
+        "The states in which a member's classifier ended its option, laid over each other: what all of them share is "
+        "sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one it "
         "prefers least; match is the member's balanced accuracy against the true sub-goal on that layout."
     )
     blocks = []
@@ -115,7 +115,10 @@ def _values(agent: Mapping[str, Any], key: str) -> NDArray[np.float64]:
     """Float (runs, sub-goals, members)."""
     return np.array(
         [
-            [[np.nan if member[key] is None else member[key] for member in goal["members"]] for goal in run["sub_goals"]]
+            [
+                [np.nan if member[key] is None else member[key] for member in goal["members"]]
+                for goal in run["sub_goals"]
+            ]
             for run in agent["runs"]
         ],
         dtype=np.float64,
@@ -130,8 +133,7 @@ def _scatter(material: Material, agent: Mapping[str, Any], control: Mapping[str,
     layouts = sorted({run["layout_seed"] for run in agent["runs"]})
     caption = (
         "Question 5 of the paper: a point per member and run, over all of training; up: chosen more often than by a uniform "
-        f"chooser; right: closer to the true sub-goal on that layout (layout seeds {listed(layouts)}, {len(agent['runs'])} "
-        "runs)."
+        f"chooser; right: closer to the true sub-goal on that layout (layout seed {listed(layouts)}; runs: {len(agent['runs'])})."
     )
     return figure(material, "preference", "Preference against match", drawn, caption)
 

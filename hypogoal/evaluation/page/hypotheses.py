@@ -39,7 +39,9 @@ def hypotheses_section(material: Material) -> Block:
         "accuracy is 0.5 for a member that always says the same."
     )
     if not metrics["ensembles"]:
-        nothing = figure(material, "members", "Members' accuracy", None, missing="It needs an ensemble artefact: train-ensemble.")
+        nothing = figure(
+            material, "members", "Members' accuracy", None, missing="It needs an ensemble artefact: train-ensemble."
+        )
         return section("hypotheses", "Hypotheses", [], [nothing])
     return section("hypotheses", "Hypotheses", [text], [_dots(material), _table(metrics), *_members(metrics)])
 
@@ -151,7 +153,7 @@ def _cards(material: Material, sub_goal: str) -> Block:
             verdict = bool(probability > threshold)
             said = "yes" if verdict else "no"
             mark = "wrong" if verdict != truth else "yes" if verdict else "no"
-            lines.append({"class": mark, "text": f"member {member}: {said} ({probability:.2f})"})
+            lines.append({"class": mark, "text": f"member {member}: {said} {probability:.2f}"})
         seed = int(arrays["layout_seeds"][index])
         place = f", layout {seed}" if seed >= 0 else ""
         cards.append(
@@ -168,5 +170,3 @@ def _cards(material: Material, sub_goal: str) -> Block:
 def _texts(packed: Any) -> Sequence[str]:
     raw = packed.item() if isinstance(packed, np.ndarray) else packed
     return list(json.loads(raw.decode() if isinstance(raw, bytes) else raw))
-
-

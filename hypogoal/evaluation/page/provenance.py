@@ -56,13 +56,15 @@ def _artefacts(about: Mapping[str, Any]) -> Block:
         for artefact in about["artefacts"]
     ]
     columns = ("artefact", "kind", "command", "seed", "inputs (sha256)")
-    return table(columns, rows, texts=5, heading="Artefacts", folded=f"All {len(rows)} artefacts and their commands")
+    return table(columns, rows, texts=5, folded=f"All {len(rows)} artefacts and their commands", wrap=True)
 
 
 def _settings(about: Mapping[str, Any]) -> list[Block]:
     blocks = []
     for data in about["data"]:
-        blocks.append(facts(f"Settings of {data['path']} ({data['domain']})", _lines(data["config"]), heading="Settings"))
+        blocks.append(
+            facts(f"Settings of {data['path']} ({data['domain']})", _lines(data["config"]), heading="Settings")
+        )
     shown: set[str] = set()
     for artefact in about["artefacts"]:
         varying = {key: value for key, value in artefact["config"].items() if key != "layout_seed"}

@@ -74,7 +74,9 @@ class _Watch(BaseCallback):
 
     def _numbers(self) -> dict[str, float]:
         logged = self.model.logger.name_to_value
-        numbers = {key.removeprefix("train/"): float(value) for key, value in logged.items() if key.startswith("train/")}
+        numbers = {
+            key.removeprefix("train/"): float(value) for key, value in logged.items() if key.startswith("train/")
+        }
         if isinstance(self.model, DQN):
             numbers["epsilon"] = float(self.model.exploration_rate)
         return {"episodes": len(self.env.episodes), "success": self.env.success(), **numbers}
