@@ -16,7 +16,7 @@ LATE = 0.25  # the last part of training that is looked at by itself
 
 @dataclass(frozen=True)
 class Choices:
-    """Rows of ``choices.csv``, arrays (n,): one row per option and window of environment steps that ends at ``step``."""
+    """Rows of ``choices.csv``, arrays (n,): one row per option and window of steps that ends at ``step``."""
 
     step: NDArray[np.int64]
     option: NDArray[np.int64]
@@ -33,7 +33,7 @@ class Choices:
 
     def total(self, name: str, options: int) -> NDArray[np.float64]:
         """The sum of column ``name`` over all windows, (O,)."""
-        return np.bincount(self.option, weights=getattr(self, name), minlength=options)
+        return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
 
 
 def selection_of_run(

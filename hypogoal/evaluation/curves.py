@@ -77,7 +77,7 @@ def steps_to_solve(episodes: Episodes, window: int = WINDOW, share: float = SOLV
 
 
 def discounted_return(episodes: Episodes, gamma: float = GAMMA) -> float:
-    """Spec F5: mean of gamma ** (length - 1) * reward, for tasks whose reward comes with the last step; NaN without any.
+    """Spec F5: mean of gamma ** (length - 1) * reward, for tasks whose reward comes last; NaN without episodes.
 
     Unlike success at a cap of 500 steps it tells a short way to the goal from a long one.
     """

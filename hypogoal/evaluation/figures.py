@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +18,16 @@ from numpy.typing import NDArray
 INK, RULE = "#24272b", "#d4d7dc"
 BLUE, VERMILLION, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, ORANGE, SKY, GREY = "#cc79a7", "#e69f00", "#56b4e9", "#808890"
+COLOURS = {
+    INK: "ink", RULE: "rule", BLUE: "blue", VERMILLION: "vermillion", GREEN: "green", PURPLE: "purple",
+    ORANGE: "orange", SKY: "sky", GREY: "soft",
+}  # fmt: skip
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, GREY)
 MARKERS = "osD^vPX"
-WIDTH = 6.2  # inches; readable on a phone where it is scaled to the screen
+WIDTH = 5.6  # inches; readable on a phone where it is scaled to the screen
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
-    "font.size": 10,
+    "font.size": 10.5,
     "axes.edgecolor": INK,
     "axes.labelcolor": INK,
     "axes.titlesize": 10,
@@ -43,6 +48,11 @@ STYLE: dict[str, Any] = {
     "savefig.facecolor": "none",
     "svg.fonttype": "none",
 }
+
+
+def _style(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None]:
+    settings: Any = {**STYLE, **(more or {})}
+    return matplotlib.rc_context(settings)
 
 
 @dataclass(frozen=True)
@@ -71,7 +81,7 @@ def learning_curves(
         references: horizontal lines with their names.
         bounds: of the y axis.
     """
-    with matplotlib.rc_context(STYLE):
+    with _style():
         rows = -(-(len(lines) + len(references)) // 2)
         figure = Figure(figsize=(WIDTH, 3.1 + 0.22 * rows), layout="constrained")
         axes = figure.subplots()
@@ -108,7 +118,7 @@ def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str,
         sub_goals: G names.
         kinds: (name, float (G, 3)) with each sub-goal's best, mean and worst member, mean over seeds.
     """
-    with matplotlib.rc_context(STYLE):
+    with _style():
         step = 0.8 / max(1, len(kinds))
         height = 1.2 + len(sub_goals) * max(0.42, 0.2 * len(kinds)) + 0.25 * -(-len(kinds) // 3)
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
@@ -125,7 +135,7 @@ def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str,
         axes.set_yticks(places, sub_goals)
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        axes.set_xlim(min(0.45, float(np.nanmin([values.min() for _, values in kinds])) - 0.03), 1.02)
+        axes.set_xlim(min(0.45, float(np.nanmin([values for _, values in kinds])) - 0.03), 1.02)
         axes.set_xlabel("balanced accuracy on held-out layouts (0.5: chance)")
         figure.legend(loc="outside lower left", ncols=3)
         return figure
@@ -145,7 +155,7 @@ def preference_against_match(
         preference: float (R, G, K), chosen / expected under uniform choice.
         control: the same two arrays, flat, of the random chooser.
     """
-    with matplotlib.rc_context(STYLE):
+    with _style():
         figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
         axes = figure.subplots()
         if control is not None:
@@ -176,7 +186,7 @@ def to_svg(figure: Figure, name: str) -> str:
         name: makes the ids inside unique among several on one page.
     """
     buffer = io.StringIO()
-    with matplotlib.rc_context({**STYLE, "svg.hashsalt": name}):
+    with _style({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
@@ -188,7 +198,7 @@ def to_svg(figure: Figure, name: str) -> str:
 def to_png(figure: Figure) -> bytes:
     """The figure as a PNG on white, for READMEs and slides."""
     buffer = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
+    with _style():
         figure.savefig(buffer, format="png", dpi=160, facecolor="white", metadata={"Software": None})
     return buffer.getvalue()
 

@@ -36,4 +36,6 @@ def _flat(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _text(value: Any) -> str:
+    if value is None:
+        return "unset"
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

@@ -43,7 +43,7 @@ QUANTITIES: dict[str, dict[str, str]] = {
     "share": {"unit": "fraction", "meaning": "chosen / all decisions; confounded by how often an option is offered"},
     "rank_correlation": {
         "unit": "Spearman's rho, -1..1",
-        "meaning": "with the members' match; 'all': over all options, 'within': mean over sub-goals of that among members",
+        "meaning": "with the match; 'all': over all options, 'within': mean over sub-goals of that among members",
     },
     "mean": {"unit": "as said beside it", "meaning": "over runs"},
     "standard_error": {"unit": "as said beside it", "meaning": "of the mean over runs"},

@@ -33,7 +33,8 @@ def read_choices(path: Path) -> Choices:
     """``choices.csv``: one row per option and window."""
     names = tuple(Choices.__dataclass_fields__)
     table = _read_table(path, names)
-    return Choices(*(table[name].astype(CHOICE_KINDS.get(name, np.int64)) for name in names))
+    columns: dict[str, Any] = {name: table[name].astype(CHOICE_KINDS.get(name, np.int64)) for name in names}
+    return Choices(**columns)
 
 
 def read_layout(path: Path) -> dict[str, Any]:

@@ -1,20 +1,22 @@
-"""Which members the meta-policy came to prefer, and whether they are the good ones (Spec F6, the paper's question 5)."""
+"""Which members the meta-policy prefers, and whether they are the good ones (Spec F6, the paper's question 5)."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 
-def preference(chosen: NDArray[np.int64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[np.float64]:
     """Spec F6: chosen / expected under uniform choice among the options offered.
 
     A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered
     always. This ratio is 1 for a chooser that does not care, whatever is offered how often.
 
     Args:
-        chosen: int (..., O), decisions that chose each option.
+        chosen: (..., O), decisions that chose each option.
         expected: float (..., O), the sum of 1 / (options offered) over the decisions that offered it.
 
     Returns:
@@ -24,7 +26,7 @@ def preference(chosen: NDArray[np.int64], expected: NDArray[np.float64]) -> NDAr
     return np.where(expected > 0, chosen / safe, np.nan)
 
 
-def shares(chosen: NDArray[np.int64]) -> NDArray[np.float64]:
+def shares(chosen: NDArray[Any]) -> NDArray[np.float64]:
     """Spec F6: the share of all decisions that chose each option, (O,); NaN without decisions."""
     total = chosen.sum()
     return chosen / total if total > 0 else np.full(chosen.shape, np.nan)

@@ -11,34 +11,26 @@ from hypogoal.core.config import setting
 class EnsembleConfig:
     """Spec C6: DoorKey's values (Table 3) are the defaults; Montezuma's are those of Table 1."""
 
-    members: int = setting(
-        3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64
-    )
+    members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting("dbat", "diversity objective, by name: dbat, divdis, none", source="Eq. (1)")
-    diversity_weight: float = setting(
-        1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0
-    )
+    diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     schedule: str = setting(
         "simultaneous",
         "members at once (the double sum of Eq. (1)), or one after the other against those before it",
         source="Eq. (1); sequential: D-BAT (arXiv:2202.04414)",
         choices=("simultaneous", "sequential"),
     )
-    network: str = setting(
-        "doorkey", "member network, by name: doorkey, montezuma", source="the paper's appendix"
-    )
+    network: str = setting("doorkey", "member network, by name: doorkey, montezuma", source="the paper's appendix")
     steps: int = setting(
-        300,
+        150,
         "gradient steps (of each member, where sequential)",
         unit="batches",
-        source="the paper says none",
+        source="own choice, the paper says none: docs/results/ensembles-doorkey.md",
         low=1,
         high=10_000_000,
     )
     learning_rate: float = setting(2e-4, "Adam's learning rate", source="Table 3", low=0.0, high=1.0)
-    l2_weight: float = setting(
-        1e-4, "L2 regularisation, Adam's weight decay", source="Table 3", low=0.0, high=1.0
-    )
+    l2_weight: float = setting(1e-4, "L2 regularisation, Adam's weight decay", source="Table 3", low=0.0, high=1.0)
     batch_size: int = setting(
         64,
         "labelled states in a batch, and as many unlabelled ones",
@@ -47,12 +39,8 @@ class EnsembleConfig:
         low=2,
         high=65536,
     )
-    class_weight_negative: float = setting(
-        0.5, "cross entropy's weight of negatives", source="Table 3", low=1e-6
-    )
-    class_weight_positive: float = setting(
-        0.5, "cross entropy's weight of positives", source="Table 3", low=1e-6
-    )
+    class_weight_negative: float = setting(0.5, "cross entropy's weight of negatives", source="Table 3", low=1e-6)
+    class_weight_positive: float = setting(0.5, "cross entropy's weight of positives", source="Table 3", low=1e-6)
     class_balance: str = setting(
         "batch",
         "batch: half of each labelled batch is positive, so that the class weights hold of what a member "
@@ -62,6 +50,6 @@ class EnsembleConfig:
     )
     unlabelled_bn: bool = setting(
         True,
-        "unlabelled batches count in BatchNorm's running statistics too",
+        "unlabelled batches count in BatchNorm's running statistics too, so that these are of more than one layout",
         source="the authors' code",
     )

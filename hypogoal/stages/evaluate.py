@@ -137,7 +137,7 @@ def _has_input(artefact: Artefact, kind: str) -> bool:
 def evaluate_ensembles(found: Found, arrays: Any, progress: Progress) -> list[dict[str, Any]]:
     """Spec F1, F2: every ensemble of the run on its data's held-out and unlabelled states."""
     names = ensemble_names([artefact.config for artefact in found.ensembles])
-    metrics = []
+    metrics: list[dict[str, Any]] = []
     for artefact, name in zip(found.ensembles, names, strict=True):
         dataset = open_dataset(artefact.input("data"))
         rows = [

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hypogoal.domains.base import Step
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, hyperparameters
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings, PPOSettings, hyperparameters
 from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
 
 EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 6_000, ("dqn", "tuned"): 12_000}
@@ -23,7 +24,8 @@ EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned")
 class Corridor:
     """Five cells in a row: action 2 steps right, action 0 left, the others do nothing; the goal is the last cell."""
 
-    n_actions, observation_shape, max_steps, n_states = 7, (64, 64, 3), 20, 5
+    n_actions, n_states = 7, 5
+    observation_shape: tuple[int, ...] = (64, 64, 3)
 
     def __init__(self, count: int, max_steps: int = 20):
         self.count, self.max_steps = count, max_steps
@@ -70,7 +72,7 @@ def test_solves_an_easy_task(agent, setting):
     trained = train(env, chosen, steps=EASY_STEPS[agent, setting], seed=1)
     assert np.mean([terminated for *_, terminated in env.episodes[:20]]) < 0.8
     trial = EngineEnv(Corridor(1))
-    observation = trial.reset()
+    observation: Any = trial.reset()
     while not trial.episodes:
         observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
     assert trial.episodes == [(4, 4, 1.0, 1)]  # the shortest way, by the greedy policy
@@ -78,15 +80,16 @@ def test_solves_an_easy_task(agent, setting):
 
 def test_a_time_limit_is_not_a_terminal_state():
     """Spec E7, D2: an episode that is cut is told to the agent as truncated, with the state it was cut in."""
-    env = EngineEnv(Corridor(2, max_steps=3))
+    corridor = Corridor(2, max_steps=3)
+    env = EngineEnv(corridor)
     env.reset()
     for _ in range(2):
         assert not env.step(np.array([1, 2]))[2].any()
-    observations, rewards, done, infos = env.step(np.array([1, 2]))
+    observations, _, done, infos = env.step(np.array([1, 2]))
     assert done.tolist() == [True, True]
     assert [info["TimeLimit.truncated"] for info in infos] == [True, True]
-    assert infos[1]["terminal_observation"].tolist() == env.engine.codes(np.array([3]))[0].tolist()
-    assert observations.tolist() == env.engine.codes(np.array([0, 0])).tolist()  # the next episode's start
+    assert infos[1]["terminal_observation"].tolist() == corridor.codes(np.array([3]))[0].tolist()
+    assert np.array_equal(np.asarray(observations), corridor.codes(np.array([0, 0])))  # the next episode's start
     assert env.episodes == [(6, 3, 0.0, 0), (6, 3, 0.0, 0)]
 
 
@@ -121,6 +124,8 @@ def test_tile_codes_say_what_the_image_says(network):
 def test_epsilon_waits_for_the_first_goal():
     """Spec E7, Table 4: 1 -> 0.01 over 8,000 steps from the start; the tuned one falls from its first goal on."""
     paper, tuned = hyperparameters("dqn", "paper"), hyperparameters("dqn", "tuned")
+    assert isinstance(paper, DQNSettings)
+    assert isinstance(tuned, DQNSettings)
     assert [round(epsilon(paper, step, None), 3) for step in (0, 4_000, 8_000, 9_000)] == [1.0, 0.505, 0.01, 0.01]
     assert epsilon(tuned, 200_000, None) == 1.0
     assert epsilon(tuned, 24_000, first_goal=20_000) == pytest.approx(0.525)
@@ -129,6 +134,8 @@ def test_epsilon_waits_for_the_first_goal():
 def test_the_paper_setting_is_the_papers():
     """Spec E3, D3, E7: the numbers of Tables 4 and 5."""
     ppo, dqn = hyperparameters("ppo", "paper"), hyperparameters("dqn", "paper")
+    assert isinstance(ppo, PPOSettings)
+    assert isinstance(dqn, DQNSettings)
     assert (ppo.rollout, ppo.entropy, ppo.gae_lambda, ppo.batch, ppo.epochs) == (100, 0.01, 0.97, 64, 10)
     assert (dqn.replay, dqn.target_interval, dqn.epsilon_steps, dqn.epsilon_final) == (100_000, 10, 8_000, 0.01)
     assert (dqn.learning_rate, dqn.batch, dqn.environments) == (2.5e-4, 32, 4)

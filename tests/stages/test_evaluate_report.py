@@ -153,7 +153,7 @@ def test_tables_fit_a_terminal(metrics):
 class Structure(HTMLParser):
     """Open tags that are never closed, ids, and whatever would be fetched."""
 
-    VOID = {"meta", "img", "link", "br", "input", "hr"}
+    VOID = frozenset({"meta", "img", "link", "br", "input", "hr"})
 
     def __init__(self, text):
         super().__init__()

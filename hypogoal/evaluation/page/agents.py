@@ -12,8 +12,8 @@ from hypogoal.evaluation.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, 
 from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
-    fixed,
     figure,
+    fixed,
     interval,
     listed,
     row,
@@ -41,31 +41,30 @@ def summary_section(material: Material) -> Block:
     """What was asked, what came out."""
     metrics = material.metrics
     asked = (
-        "Each sub-goal is known from one layout only. An ensemble of classifiers holds several hypotheses about what the "
-        "sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by the task "
-        "alone. Does that agent solve layouts that no data came from, and does it come to prefer the hypotheses that "
-        "are true there?"
+        "Each sub-goal is known from one layout only. An ensemble of classifiers holds several hypotheses about what "
+        "the sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by "
+        "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
+        "hypotheses that are true there?"
     )
     return section("summary", "Summary", [asked, _answer(material)], [_headline(material)], metrics["missing"])
 
 
 def _answer(material: Material) -> str:
     named = {agent["name"]: agent for agent in material.agents()}
-    agent = named.get(LEARNED)
+    agent, control = named.get(LEARNED), named.get(RANDOM)
     if agent is None:
         return ""
+    ratio = fixed(agent["length_over_shortest"]["mean"], 1)
     text = (
         f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last 100 training episodes, "
-        f"taking {fixed(agent['length']['mean'], 0)} steps, {fixed(agent['length_over_shortest']['mean'], 1)} times the "
-        f"shortest path ({_runs(agent)})."
+        f"which took {fixed(agent['length']['mean'], 0)} steps, {ratio} times the shortest path ({_runs(agent)})."
     )
-    control = named.get(RANDOM)
-    if control is not None:
-        text += (
-            f" Uniformly random choice among the same options succeeded in {percent(control['success']['mean'])}, "
-            f"in {fixed(control['length']['mean'], 0)} steps: where success ties, length tells the two apart."
-        )
-    return text
+    if control is None:
+        return text
+    return (
+        f"{text} Uniformly random choice among the same options: {percent(control['success']['mean'])}, "
+        f"{fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
+    )
 
 
 def _runs(agent: Mapping[str, Any]) -> str:
@@ -97,10 +96,10 @@ def _headline(material: Material) -> Block:
     return table(
         ("agent", "runs", "success, %", "steps", "× shortest", "discounted return", "95 % at"),
         rows,
-        caption="Over the last 100 training episodes of each run: mean over runs ± standard error. Steps: length of an "
-        "episode, failures counted at the cap; × shortest: against the layout's shortest path. Discounted return: 0.99 per "
-        "step. 95 % at: median number of environment steps, in thousands, at which 95 of the last 100 episodes succeeded, "
-        "or how many runs got there; steps of train-options count.",
+        caption="Over the last 100 training episodes of each run: mean over runs ± standard error. Steps: length of "
+        "an episode, failures counted at the cap; × shortest: against the layout's shortest path. Discounted return: "
+        "0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of the last 100 "
+        "episodes succeeded, or how many runs got there; steps of train-options count.",
     )
 
 
@@ -108,9 +107,9 @@ def curves_section(material: Material) -> Block:
     """Figure 6 with controls and baselines, and every run's numbers."""
     agents = material.agents()
     text = (
-        "Success at a cap of 500 steps cannot show by itself that choices are learned, so episode length stands beside it. "
-        "Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive actions on the same "
-        "observations and budget."
+        "Success at a cap of 500 steps cannot show by itself that choices are learned, so episode length stands "
+        "beside it. Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive "
+        "actions on the same observations and budget."
     )
     if not agents:
         nothing = "It needs options, meta or baseline artefacts: train-meta, train-baseline."
@@ -128,6 +127,7 @@ def _curve(material: Material, quantity: str) -> Block:
         colour, dashed = COLOURS.get(agent["name"]) or next(others)
         lines.append(Line(agent["name"], material.arrays[f"curves/{index}/{quantity}"], colour, dashed))
     layouts = metrics["layouts"]
+    bounds: tuple[float, float | None]
     if quantity == "reward":
         random = [layout["random_success"] for layout in layouts if layout["random_success"] is not None]
         references = [("random play", float(np.mean(random)))] if random else []
@@ -157,7 +157,7 @@ def _others(agents: Sequence[Mapping[str, Any]]) -> str:
         == {(run["layout_seed"], run["seed"]) for run in agents[0]["runs"]}
         for agent in agents[1:]
     )
-    return "the same layouts and seeds" if same else f"{listed(counts)} runs each, see the table of runs"
+    return "the same layouts and seeds" if same else f"runs each: {listed(counts)}, see the table of runs"
 
 
 def _intervals(agents: Sequence[Mapping[str, Any]]) -> Block:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.figures import INK, RULE, image_png, to_svg
+from hypogoal.evaluation.figures import COLOURS, image_png, to_svg
 
 Block = dict[str, Any]
 
@@ -62,7 +62,7 @@ def table(
     folded: str = "",
     wrap: bool = False,
 ) -> Block:
-    """A table; the first ``texts`` columns are text, the others numbers; ``wrap`` for long texts. Rows are made by :func:`row`."""
+    """A table; the first ``texts`` columns are text, the others numbers; ``wrap`` breaks long texts."""
     named = [{"name": name, "number": index >= texts} for index, name in enumerate(columns)]
     return {
         "kind": "table",
@@ -101,7 +101,9 @@ def figure(
     svg = ""
     if drawn is not None:
         material.figures[name] = drawn
-        svg = to_svg(drawn, name).replace(INK, "var(--ink)").replace(RULE, "var(--rule)")
+        svg = to_svg(drawn, name)
+        for colour, variable in COLOURS.items():
+            svg = svg.replace(colour, f"var(--{variable})")
     return {
         "kind": "figure",
         "id": f"figure-{name}",

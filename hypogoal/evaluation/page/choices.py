@@ -54,8 +54,8 @@ def terminations_section(material: Material) -> Block:
         return section("terminations", title, [], [], missing)
     text = (
         "The states in which a member's classifier ended its option, laid over each other: what all of them share is "
-        "sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one it "
-        "prefers least; match is the member's balanced accuracy against the true sub-goal on that layout."
+        "sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
+        "it prefers least; match is the member's balanced accuracy against the true sub-goal on that layout."
     )
     blocks = []
     for index, run in enumerate(agent["runs"]):
@@ -66,8 +66,8 @@ def terminations_section(material: Material) -> Block:
                 "heading": name if index == 0 else "",
                 "folded": "" if index == 0 else name[0].upper() + name[1:],
                 "pairs": [_pair(material, run, goal) for goal in run["sub_goals"]],
-                "caption": f"Figures 7 and 8 of the paper, for all sub-goals: {run['path']}, {name}. The last states, 128 at "
-                "most, in which the option's own classifier said yes.",
+                "caption": f"Figures 7 and 8 of the paper, for all sub-goals: {run['path']}, {name}. The last "
+                "states, 128 at most, in which the option's own classifier said yes.",
             }
         )
     return section("terminations", title, [text], blocks)
@@ -100,9 +100,10 @@ def choices_section(material: Material) -> Block:
         needed = "It needs a meta artefact with learned terminations: train-meta."
         return section("choices", title, [], [figure(material, "preference", title, None, missing=needed)])
     text = (
-        "Preference is how often an option was chosen over how often a uniform choice among the options offered would have "
-        "chosen it. Raw shares are confounded by availability: a member that fires everywhere is masked nearly always, one "
-        "that never fires is always offered. The random chooser's numbers show what no preference looks like."
+        "Preference is how often an option was chosen over how often a uniform choice among the options offered "
+        "would have chosen it. Raw shares are confounded by availability: a member that fires everywhere is masked "
+        "nearly always, one that never fires is always offered. The random chooser's numbers show what no preference "
+        "looks like."
     )
     blocks = [_scatter(material, agent, control), _correlations(material)]
     for index, run in enumerate(agent["runs"]):
@@ -132,8 +133,9 @@ def _scatter(material: Material, agent: Mapping[str, Any], control: Mapping[str,
     drawn = preference_against_match(names, match, preference, uncaring)
     layouts = sorted({run["layout_seed"] for run in agent["runs"]})
     caption = (
-        "Question 5 of the paper: a point per member and run, over all of training; up: chosen more often than by a uniform "
-        f"chooser; right: closer to the true sub-goal on that layout (layout seed {listed(layouts)}; runs: {len(agent['runs'])})."
+        "Question 5 of the paper: a point per member and run, over all of training; up: chosen more often than by a "
+        f"uniform chooser; right: closer to the true sub-goal on that layout (layout seed {listed(layouts)}; runs: "
+        f"{len(agent['runs'])})."
     )
     return figure(material, "preference", "Preference against match", drawn, caption)
 
@@ -158,9 +160,10 @@ def _correlations(material: Material) -> Block:
         rows,
         texts=2,
         heading="Rank correlation with the match",
-        caption="Spearman's rank correlation between how a member is ranked and its match with the true sub-goal on the run's "
-        "layout; interquartile mean over runs, 95 % bootstrap interval. Within: mean over sub-goals of the correlation "
-        "among a sub-goal's members. 1 would mean that reward picks out the hypotheses that transfer, 0 that it does not.",
+        caption="Spearman's rank correlation between how a member is ranked and its match with the true sub-goal on "
+        "the run's layout; interquartile mean over runs, 95 % bootstrap interval. Within: mean over sub-goals of the "
+        "correlation among a sub-goal's members. 1 would mean that reward picks out the hypotheses that transfer, 0 "
+        "that it does not.",
     )
 
 
@@ -191,6 +194,7 @@ def _members(run: Mapping[str, Any], *, folded: bool) -> Block:
         texts=2,
         heading="" if folded else f"Every member: {name}",
         folded=f"Every member: {name}" if folded else "",
-        caption="Decisions at which the option was offered and chosen; expected under uniform choice; preference over all and "
-        "over the last quarter of training; raw share of decisions; mean steps of an execution; match on this layout.",
+        caption="Decisions at which the option was offered and chosen; expected under uniform choice; preference "
+        "over all and over the last quarter of training; raw share of decisions; mean steps of an execution; match "
+        "on this layout.",
     )

@@ -34,9 +34,9 @@ def hypotheses_section(material: Material) -> Block:
     """Figure 3's question on held-out layouts: best, mean and worst member, and how much members disagree."""
     metrics = material.metrics
     text = (
-        "Members are judged on layouts whose states were in no training set. The best member shows whether a hypothesis "
-        "that transfers is in the ensemble at all; mean and worst show what the agent has to choose among. Balanced "
-        "accuracy is 0.5 for a member that always says the same."
+        "Members are judged on layouts whose states were in no training set. The best member shows whether a "
+        "hypothesis that transfers is in the ensemble at all; mean and worst show what the agent has to choose "
+        "among. Balanced accuracy is 0.5 for a member that always says the same."
     )
     if not metrics["ensembles"]:
         nothing = figure(
@@ -60,9 +60,9 @@ def _dots(material: Material) -> Block:
     drawn = best_mean_worst_members(sub_goals, kinds) if np.isfinite([values for _, values in kinds]).any() else None
     seeds = sorted({ensemble["seed"] for ensemble in material.metrics["ensembles"]})
     caption = (
-        "The quantity of the paper's Figure 3, for one labelled layout: balanced accuracy on held-out layouts, pooled over "
-        "them. Filled: best member; bar: mean of members; hollow: worst member; each a mean over ensemble seeds "
-        f"({listed(seeds)}). Dotted: always the same answer."
+        "The quantity of the paper's Figure 3, for one labelled layout: balanced accuracy on held-out layouts, "
+        "pooled over them. Filled: best member; bar: mean of members; hollow: worst member; each a mean over "
+        f"ensemble seeds ({listed(seeds)}). Dotted: always the same answer."
     )
     missing = "No held-out states have both classes."
     return figure(material, "members", "Members' balanced accuracy on held-out layouts", drawn, caption, missing)
@@ -88,8 +88,8 @@ def _table(metrics: Mapping[str, Any]) -> Block:
         ("ensemble", "sub-goal", "best", "mean", "worst", "disagree, unlabelled", "disagree, held-out", "seeds"),
         rows,
         texts=2,
-        caption="Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of states on which "
-        "two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
+        caption="Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of states "
+        "on which two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
     )
 
 
@@ -115,8 +115,8 @@ def _members(metrics: Mapping[str, Any]) -> list[Block]:
                 rows,
                 texts=2,
                 folded=f"Every member of {ensemble['path']} ({ensemble['name']}, seed {ensemble['seed']})",
-                caption=f"Pooled over {goal['states']} held-out states of {len(goal['by_layout'])} layouts; the last column "
-                "is the share of unlabelled states that the member calls positive.",
+                caption=f"Pooled over {goal['states']} held-out states of {len(goal['by_layout'])} layouts; the last "
+                "column is the share of unlabelled states that the member calls positive.",
             )
         )
     return blocks
@@ -130,9 +130,9 @@ def examples_section(material: Material) -> Block:
         return section("examples", "Example states", [], [], missing)
     source = material.metrics["ensembles"][0]
     text = (
-        f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its probability that "
-        "the sub-goal is reached. Coloured: verdicts that differ from the truth. Chosen to show each kind, so their "
-        "frequency here says nothing."
+        f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
+        "probability that the sub-goal is reached. Coloured: verdicts that differ from the truth. Chosen to show "
+        "each kind, so their frequency here says nothing."
     )
     order = [goal["sub_goal"] for goal in source["sub_goals"]]
     names.sort(key=lambda name: order.index(name.split("/")[1]))

@@ -14,8 +14,8 @@ def provenance_section(material: Material) -> Block:
     """Data, artefacts, settings, versions and the meaning of every number."""
     about = material.metrics["provenance"]
     text = (
-        "Every number above is in metrics.json of the evaluation. Each artefact's manifest holds its settings, the sha256 of "
-        "its files and of its inputs' manifests."
+        "Every number above is in metrics.json of the evaluation. Each artefact's manifest holds its settings, the "
+        "sha256 of its files and of its inputs' manifests."
     )
     blocks = [_data(about), _artefacts(about), *_settings(about), _versions(about), _glossary(material)]
     return section("provenance", "Data, settings, provenance", [text], [block for block in blocks if block])

@@ -59,7 +59,7 @@ class CellNetwork(BaseFeaturesExtractor):
         """The first convolution: (N, channels, rows, columns)."""
         if self.tiles is None:
             return self.first(observations)
-        table = torch.addmm(self.first.bias, self.tiles, self.first.weight.flatten(start_dim=1).T)
+        table = nn.functional.linear(self.tiles, self.first.weight.flatten(start_dim=1), self.first.bias)
         seen = table.index_select(0, observations.flatten().long())
         return seen.view(len(observations), self.rows, -1, table.shape[1]).permute(0, 3, 1, 2)
 

@@ -1,0 +1,76 @@
+"""Spec F: figures say what they show, whatever is not a number in them, and come out the same each time."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.figures import (
+    BLUE,
+    VERMILLION,
+    Line,
+    best_mean_worst_members,
+    image_png,
+    learning_curves,
+    preference_against_match,
+    to_png,
+    to_svg,
+)
+
+GRID = np.arange(0, 1_001, 100)
+
+
+def curves():
+    several = np.linspace(0, 1, 11) * np.array([[1.0], [0.8], [0.6]])
+    several[1, 7:] = np.nan
+    several[:, 0] = np.nan
+    lines = [Line("options", several, BLUE), Line("PPO", several[:1], VERMILLION, dashed=True)]
+    return learning_curves(GRID, lines, "reward per episode", [("random play", 0.1)], (0, 1))
+
+
+def members():
+    values = np.array([[0.9, 0.8, 0.7], [1.0, np.nan, 0.5]])
+    return best_mean_worst_members(["red", "blue"], [("dbat, K=3", values), ("single CNN", values - 0.1)])
+
+
+def preferences():
+    match = np.array([[[0.5, 1.0], [0.7, np.nan]]])
+    return preference_against_match(["red", "blue"], match, 4 * match, (match.ravel(), match.ravel()))
+
+
+@pytest.mark.parametrize(
+    ("draw", "texts"),
+    [
+        (curves, ["options", "PPO", "random play", "reward per episode", "environment steps, in thousands"]),
+        (members, ["red", "blue", "dbat, K=3", "single CNN", "balanced accuracy on held-out layouts"]),
+        (preferences, ["red", "blue", "random choice", "preference: chosen / expected", "match: balanced accuracy"]),
+    ],
+)
+def test_figures_say_what_they_show(draw, texts):
+    """Spec F: axes, units and legends are text in the SVG, which is the same bytes each time."""
+    svg = to_svg(draw(), "name")
+    for text in texts:
+        assert text in svg
+    assert svg == to_svg(draw(), "name")
+    assert "NaN" not in svg
+    assert 'id="name-' in svg
+    assert 'id="figure_1"' not in svg
+    assert to_png(draw()).startswith(b"\x89PNG")
+
+
+def test_the_curve_is_the_mean_of_runs_that_have_a_value():
+    """Figure 6: where one of three runs has ended the mean is of the other two."""
+    line = curves().axes[0].get_lines()[0]
+    assert line.get_label() == "options"
+    np.testing.assert_allclose(line.get_ydata()[1:7], np.linspace(0, 1, 11)[1:7] * 0.8)
+    np.testing.assert_allclose(line.get_ydata()[7:], np.linspace(0, 1, 11)[7:] * 0.8)
+    assert np.isnan(line.get_ydata()[0])
+
+
+def test_an_observation_as_png_is_the_same_pixels():
+    """Spec F7: the picture in the page is the state itself."""
+    import io
+
+    from matplotlib.image import imread
+
+    image = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    read = imread(io.BytesIO(image_png(image)))
+    np.testing.assert_array_equal((read[..., :3] * 255).round().astype(np.uint8), image)

@@ -1,0 +1,114 @@
+"""Spec E6, E7, F5: runs that were not made alike are not averaged; what is missing is said."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.agents import (
+    LEARNED,
+    ORACLE,
+    RANDOM,
+    Run,
+    agent_curves,
+    agent_metrics,
+    base_name,
+    common_grid,
+    group_runs,
+    missing_agents,
+)
+from hypogoal.evaluation.choices import Choices, selection_of_run
+from hypogoal.evaluation.curves import Episodes
+from hypogoal.evaluation.ensembles import ensemble_names
+
+META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_steps": 200, "option_gamma": 0.95}
+
+
+def made(layout_seed=100, seed=0, kind="meta", episodes=120, success=1, shortest=10, **config):
+    length = np.full(episodes, 20)
+    done = np.full(episodes, bool(success))
+    run = Episodes(np.arange(1, episodes + 1) * 10, length, done.astype(float), done)
+    layout = {"layout_seed": layout_seed, "shortest_path": shortest, "random_success": 0.1, "random_episodes": 10}
+    about = {**(META if kind == "meta" else {"steps": 1_000}), "layout_seed": layout_seed, **config}
+    return Run(kind, f"{kind}/{layout_seed}-{seed}", seed, about, run, layout)
+
+
+def test_agents_are_named_after_how_they_choose():
+    """Spec E6, E7: the agent, its two controls and the baselines, in the report's order, layouts together."""
+    runs = [
+        made(kind="baseline", agent="dqn", setting="paper"),
+        made(termination="oracle"),
+        made(chooser="random"),
+        made(),
+        made(layout_seed=101, seed=1),
+        made(kind="baseline", agent="ppo", setting="tuned"),
+    ]
+    groups = group_runs(runs)
+    assert list(groups) == [LEARNED, RANDOM, ORACLE, "PPO tuned", "DQN paper"]
+    assert len(groups[LEARNED]) == 2
+    assert base_name("options", {}) == "random choice while options learn"
+    assert missing_agents(list(groups)) == ["no agent 'PPO paper'", "no agent 'DQN tuned'"]
+
+
+def test_a_setting_that_differs_splits_an_agent():
+    """Spec F5: half the runs with another discount are another agent, and neither counts as missing."""
+    groups = group_runs([made(), made(seed=1, option_gamma=0.9), made(seed=2, domain_config={"door_label": "open"})])
+    assert sorted(groups) == [
+        f"{LEARNED}, door_label=open, option_gamma=0.95",
+        f"{LEARNED}, door_label=unset, option_gamma=0.9",
+        f"{LEARNED}, door_label=unset, option_gamma=0.95",
+    ]
+    assert "no agent 'options (learned members)'" not in missing_agents(list(groups))
+
+
+def test_numbers_over_runs():
+    """Spec F5: mean over runs, how many got to 95 %, and the median that counts those that did not."""
+    runs = [made(), made(seed=1), made(layout_seed=101, success=0, shortest=20)]
+    metrics = agent_metrics("agent", runs)
+    assert metrics["success"]["mean"] == pytest.approx(2 / 3)
+    assert metrics["length_over_shortest"]["mean"] == pytest.approx((2 + 2 + 1) / 3)
+    assert metrics["steps_to_95"] == {"reached": 2, "median": 1_000.0, "n": 3, "unit": "environment steps"}
+    assert metrics["runs"][0]["steps"] == 1_200
+    never = agent_metrics("agent", runs[2:])["steps_to_95"]
+    assert (never["reached"], never["median"]) == (0, None)
+
+
+def test_curves_end_with_the_budget():
+    """Figure 6: beyond its budget a run has no curve, and the grid reaches the largest one."""
+    runs = [made(), made(seed=1, steps=300)]
+    grid = common_grid(runs, points=13)
+    assert grid.tolist() == list(range(0, 1_201, 100))
+    reward = agent_curves(runs, grid)["reward"]
+    assert np.isnan(reward[1, 6:]).all()
+    assert reward[1, 5] == reward[0, 12] == 1
+
+
+def test_ensembles_are_named_after_their_objective():
+    """Spec C1, F1: settings without effect do not split, those with effect do."""
+    base = {"members": 3, "diversity": "dbat", "diversity_weight": 1e-4, "steps": 300}
+    single = {**base, "members": 1}
+    assert ensemble_names([base, {**base, "diversity": "none"}, single, {**single, "diversity": "none"}]) == [
+        "dbat, K=3", "no diversity, K=3", "single CNN", "single CNN",
+    ]  # fmt: skip
+    assert ensemble_names([base, {**base, "steps": 600}]) == ["dbat, K=3, steps=300", "dbat, K=3, steps=600"]
+
+
+def test_selection_of_a_run_by_hand():
+    """Spec F6: two sub-goals of two members, two windows; the second member of each is the better one."""
+    rows = [
+        # step, option, offered, chosen, expected, reached, duration
+        (100, 0, 40, 10, 20.0, 5, 50), (100, 1, 40, 20, 10.0, 20, 40), (100, 2, 0, 0, 0.0, 0, 0),
+        (100, 3, 10, 0, 5.0, 0, 0),
+        (200, 0, 40, 0, 10.0, 0, 0), (200, 1, 40, 30, 10.0, 30, 60), (200, 2, 0, 0, 0.0, 0, 0),
+        (200, 3, 10, 10, 5.0, 9, 20),
+    ]  # fmt: skip
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    found = selection_of_run(Choices(*columns), np.array([0.6, 0.9, 0.5, 1.0]), ("a", "b"), 2)
+    first, second = found["sub_goals"]
+    assert [member["preference"] for member in first["members"]] == pytest.approx([10 / 30, 50 / 20])
+    assert [member["late_preference"] for member in first["members"]] == pytest.approx([0, 3])
+    assert first["members"][1]["share"] == pytest.approx(50 / 70)
+    assert first["members"][1]["duration"] == 2
+    assert (first["most"], first["least"]) == (1, 0)
+    assert np.isnan(second["members"][0]["preference"])
+    assert (second["most"], second["least"]) == (1, 1)
+    assert found["rank_correlation"]["preference"]["within"] == pytest.approx(1)
+    assert found["rank_correlation"]["preference"]["all"] == pytest.approx(0.5)  # of match 0.6, 0.9, 1.0
