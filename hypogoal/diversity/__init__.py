@@ -47,12 +47,8 @@ def load_objective(name: str) -> PairLoss:
     try:
         found = entries[name].load()
     except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"the diversity objective cannot be loaded ({error})", name, "Check its package."
-        ) from None
+        raise UserError(f"the diversity objective cannot be loaded ({error})", name, "Check its package.") from None
     found = getattr(found, "pair_loss", found)
     if not callable(found):
-        raise UserError(
-            "the entry point is no diversity objective", name, "Give a pair_loss(logits_a, logits_b)."
-        )
+        raise UserError("the entry point is no diversity objective", name, "Give a pair_loss(logits_a, logits_b).")
     return found

@@ -172,8 +172,8 @@ def preference_against_match(
         axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
         axes.set_ylim(-0.04, ticks[-1] * 1.1)
-        axes.set_xlabel("match: balanced accuracy against the true sub-goal on the run's layout")
-        axes.set_ylabel("preference: chosen / expected (1: indifferent)")
+        axes.set_xlabel("match: balanced accuracy on the run's layout")
+        axes.set_ylabel("preference: chosen / expected")
         figure.legend(loc="outside lower left", ncols=3, handletextpad=0.3)
         return figure
 

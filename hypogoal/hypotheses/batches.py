@@ -41,9 +41,7 @@ class TrainingStates:
         device: torch.device,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
-            shapes = (
-                f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
-            )
+            shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
             raise UserError("the states do not fit together", shapes, "Collect them again.")
         if not labels.any() or labels.all():
             counts = f"{int(labels.sum())} positives of {len(labels)}"
@@ -51,9 +49,7 @@ class TrainingStates:
         self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
         self.device = device
         images = np.concatenate([observations, unlabelled])
-        self._tables = (
-            patches.make_tables(images, patches.windows_of(network)) if device.type == "cpu" else None
-        )
+        self._tables = patches.make_tables(images, patches.windows_of(network)) if device.type == "cpu" else None
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
 
@@ -79,9 +75,7 @@ class TrainingStates:
             chunks = [self.forward(networks, every[at : at + CHUNK]) for at in range(0, len(every), CHUNK)]
         return [torch.cat(logits) for logits in zip(*chunks, strict=True)]
 
-    def batches(
-        self, config: EnsembleConfig, seed: int
-    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """``config.steps`` times: labelled states (B,), half of them positive if asked, and unlabelled (B,).
 
         Every state of a pool is drawn once before any is drawn again. Without unlabelled states theirs are

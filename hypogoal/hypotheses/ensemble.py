@@ -35,17 +35,11 @@ class Ensemble(nn.Module):
         UserError: unknown network, or images too small for it.
     """
 
-    def __init__(
-        self, network: str, observation_shape: tuple[int, ...], members: int, generator: torch.Generator
-    ):
+    def __init__(self, network: str, observation_shape: tuple[int, ...], members: int, generator: torch.Generator):
         super().__init__()
         self.network, self.observation_shape = network, tuple(int(size) for size in observation_shape)
-        self.members = nn.ModuleList(
-            build_network(network, self.observation_shape, generator) for _ in range(members)
-        )
-        self._networks = tuple(
-            reordered(member) for member in self.members if isinstance(member, nn.Sequential)
-        )
+        self.members = nn.ModuleList(build_network(network, self.observation_shape, generator) for _ in range(members))
+        self._networks = tuple(reordered(member) for member in self.members if isinstance(member, nn.Sequential))
 
     def __len__(self) -> int:
         """K, the number of members."""
@@ -76,9 +70,7 @@ class Ensemble(nn.Module):
         with torch.inference_mode():
             for start in range(0, len(observations), chunk):
                 some = observations[start : start + chunk]
-                probabilities[start : start + chunk] = (
-                    self._logits(some).softmax(dim=-1)[..., 1].T.cpu().numpy()
-                )
+                probabilities[start : start + chunk] = self._logits(some).softmax(dim=-1)[..., 1].T.cpu().numpy()
         if was_training:
             self.train()
         return probabilities
@@ -101,9 +93,7 @@ class Ensemble(nn.Module):
 
     def state(self) -> dict[str, Tensor]:
         """Weights and BatchNorm statistics by name: contiguous CPU tensors, ready for safetensors."""
-        return {
-            name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.state_dict().items()
-        }
+        return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.state_dict().items()}
 
     @classmethod
     def from_state(

@@ -12,7 +12,9 @@ public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdi
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import metadata
 from itertools import pairwise
+from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +22,7 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 
 CLASSES = 2
+ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
 
 
 def doorkey(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
@@ -59,18 +62,34 @@ def montezuma(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
     return convolutions, (512,)
 
 
-NETWORKS: dict[str, Callable[[int], tuple[list[nn.Module], tuple[int, ...]]]] = {
-    "doorkey": doorkey,
-    "montezuma": montezuma,
-}
+Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]
+NETWORKS: dict[str, Callable[[int], Parts]] = {"doorkey": doorkey, "montezuma": montezuma}
 """By name: number of channels -> convolutional part, and the widths of the hidden dense layers behind it."""
+
+
+def load_network(name: str) -> Callable[[int], Parts]:
+    """The function that makes network ``name``: one of :data:`NETWORKS` or an installed entry point.
+
+    Raises:
+        UserError: no such network, or the entry point cannot be loaded.
+    """
+    if name in NETWORKS:
+        return NETWORKS[name]
+    entries = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
+    if name not in entries:
+        raise UserError("unknown network", name, f"Choose one of {', '.join(sorted({*NETWORKS, *entries}))}.")
+    try:
+        found: Callable[[int], Parts] = entries[name].load()
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"the network cannot be loaded ({error})", name, "Check its package.") from None
+    return found
 
 
 def build_network(name: str, observation_shape: tuple[int, ...], generator: torch.Generator) -> nn.Sequential:
     """A member network with fresh weights.
 
     Args:
-        name: one of :data:`NETWORKS`.
+        name: see :func:`load_network`.
         observation_shape: (H, W, C).
         generator: draws the initial weights (PyTorch's default distributions).
 
@@ -80,8 +99,7 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
     Raises:
         UserError: unknown network, or observations that are no images or too small for it.
     """
-    if name not in NETWORKS:
-        raise UserError("unknown network", name, f"Choose one of {', '.join(sorted(NETWORKS))}.")
+    parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
     if len(observation_shape) != 3 or min(observation_shape) < 1:
         raise UserError("member networks need images (H, W, C)", where, "Collect image observations.")
@@ -89,14 +107,12 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
     seed = int(torch.randint(2**62, (), generator=generator))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
         torch.manual_seed(seed)
-        layers, hidden = NETWORKS[name](channels)
+        layers, hidden = parts_of(channels)
         try:
             with torch.no_grad():
                 features = nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
         except RuntimeError:
-            raise UserError(
-                f"images too small for the network {name!r}", where, "Give larger ones."
-            ) from None
+            raise UserError(f"images too small for the network {name!r}", where, "Give larger ones.") from None
         layers.append(nn.Flatten())
         for inputs, outputs in pairwise((features.numel(), *hidden)):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]

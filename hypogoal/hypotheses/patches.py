@@ -109,9 +109,7 @@ def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]])
     return Tables(torch.from_numpy(colours.astype(np.float32)).div_(255.0), tuple(levels))
 
 
-def _level(
-    rows: NDArray[np.int64], lines: NDArray[np.int64], distinct: int, kernel: int, stride: int
-) -> Level:
+def _level(rows: NDArray[np.int64], lines: NDArray[np.int64], distinct: int, kernel: int, stride: int) -> Level:
     """Distinct kernel x kernel windows: first bands of ``kernel`` rows, then windows in distinct bands."""
     lines, bands = _join(_strided(lines, kernel, stride), np.arange(len(rows))[:, None])
     high = rows[bands]  # (R, kernel, W)

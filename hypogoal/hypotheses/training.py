@@ -59,23 +59,15 @@ def fit(
         UserError: labels of one class only, or no unlabelled states though members are to differ.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
-    ensemble = Ensemble(
-        config.network, observations.shape[1:], config.members, torch_generator(seed, "weights")
-    )
+    ensemble = Ensemble(config.network, observations.shape[1:], config.members, torch_generator(seed, "weights"))
     ensemble.to(device)
     networks = ensemble.networks()
     states = TrainingStates(observations, labels, unlabelled, networks[0], torch.device(device))
     if _diverse(config) and len(unlabelled) == 0:
         raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
-    rounds = (
-        [[m] for m in range(config.members)]
-        if config.schedule == "sequential"
-        else [[*range(config.members)]]
-    )
+    rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
     for done, members in enumerate(rounds):
-        _fit_members(
-            networks, members, states, config, seed_for(seed, "batches", done), done * config.steps, on_step
-        )
+        _fit_members(networks, members, states, config, seed_for(seed, "batches", done), done * config.steps, on_step)
     return ensemble.eval()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -33,8 +35,12 @@ def double_q_targets(
 @torch.no_grad()
 def follow(target: nn.Module, online: nn.Module, tau: float) -> None:
     """Move every parameter and buffer of ``target`` towards ``online`` by ``tau``; 1 copies the whole network."""
-    theirs = [tensor.detach() for tensor in online.state_dict().values()]
-    ours = list(target.state_dict().values())
+    follow_tensors(list(target.state_dict().values()), list(online.state_dict().values()), tau)
+
+
+@torch.no_grad()
+def follow_tensors(ours: Sequence[Tensor], theirs: Sequence[Tensor], tau: float) -> None:
+    """As :func:`follow`, for the networks' tensors in the same order, where gathering them each time is too dear."""
     moving = [(a, b) for a, b in zip(ours, theirs, strict=True) if a.is_floating_point() and tau < 1]
     if moving:
         torch._foreach_lerp_([a for a, _ in moving], [b for _, b in moving], tau)

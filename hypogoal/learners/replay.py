@@ -31,9 +31,7 @@ class SumTree:
         places = indices + self.leaves
         nodes[places] = priorities
         while places[0] > 1:
-            places = places >> 1
-            if len(places) > 8:
-                places = np.unique(places)
+            places = places >> 1  # repeated parents get the same sum twice, which is cheaper than finding them
             nodes[places] = nodes[2 * places] + nodes[2 * places + 1]
 
     def find(self, sums: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.options.networks import CellEmbedding
@@ -24,7 +26,7 @@ class LightMetaNetwork(nn.Module):
         """uint8 (N, H, W, C) -> float32 (N, O + 1): a score per option, then the value."""
         return self.outputs(self.trunk(self.cells(images)))
 
-    def from_codes(self, codes: Tensor, tiles: Tensor) -> Tensor:
+    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
         """The same from tile codes; see :class:`hypogoal.options.networks.CellEmbedding`."""
         return self.outputs(self.trunk(self.cells.from_codes(codes, tiles)))
 

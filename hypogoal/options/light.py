@@ -18,7 +18,7 @@ from torch import Tensor
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
+from hypogoal.learners.double_dqn import double_q_targets, follow_tensors, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import LightQNetwork, apply_to_states
@@ -46,6 +46,7 @@ class LightLearner:
             torch.manual_seed(seed_for(seed, "option-weights"))
             self.online = LightQNetwork(engine.observation_shape, self.options, engine.n_actions)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
+        self._copied = list(self.target.state_dict().values()), list(self.online.state_dict().values())
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         fields = {
             "s": np.int32,
@@ -191,7 +192,7 @@ class LightLearner:
         self.optimiser.step()
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
-            follow(self.target, self.online, self.config.target_tau)
+            follow_tensors(*self._copied, self.config.target_tau)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""

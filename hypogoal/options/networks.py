@@ -28,16 +28,20 @@ class CellEmbedding(nn.Module):
         height, width, depth = observation_shape
         self.conv = nn.Conv2d(depth, channels, CELL, stride=CELL)
         self.features = channels * (height // CELL) * (width // CELL)
+        self._tiles: NDArray[np.uint8] | None = None
+        self._pixels = torch.empty(0)
 
     def forward(self, images: Tensor) -> Tensor:
         """uint8 (N, H, W, C) -> float32 (N, features), cells row by row."""
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
         return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 
-    def from_codes(self, codes: Tensor, tiles: Tensor) -> Tensor:
+    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
         """The same from tile codes uint8 (N, cells) and the tiles uint8 (T, 8, 8, C) that they stand for."""
-        pixels = tiles.permute(0, 3, 1, 2).float() / 255.0
-        table = torch.relu(self.conv(pixels)).flatten(1)
+        if self._tiles is not tiles:
+            self._tiles = tiles
+            self._pixels = torch.from_numpy(tiles.copy()).permute(0, 3, 1, 2).flatten(1).float() / 255.0
+        table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
         return nn.functional.embedding(codes.long(), table).flatten(1)
 
 
@@ -55,7 +59,7 @@ class LightQNetwork(nn.Module):
         """uint8 (N, H, W, C) -> float32 (N, members, actions)."""
         return self._values(self.cells(images))
 
-    def from_codes(self, codes: Tensor, tiles: Tensor) -> Tensor:
+    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
         """The same from tile codes; see :meth:`CellEmbedding.from_codes`."""
         return self._values(self.cells.from_codes(codes, tiles))
 
@@ -110,5 +114,5 @@ def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) 
     tiles = getattr(engine, "tiles", None)
     if tiles is not None:
         codes = torch.from_numpy(engine.codes(ids))  # type: ignore[attr-defined]
-        return network.from_codes(codes, torch.from_numpy(tiles.copy()))  # type: ignore[operator]
+        return network.from_codes(codes, tiles)  # type: ignore[operator]
     return network(torch.from_numpy(engine.images(ids)))

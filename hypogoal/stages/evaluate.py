@@ -17,7 +17,7 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Dataset, open_dataset
+from hypogoal.dataset import Split, open_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.evaluation.agents import (
@@ -91,12 +91,12 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             Progress("evaluate", total=len(inputs), quiet=quiet) as progress,
         ):
             runs = [read_run(found, artefact) for artefact in found.agents]
-            ensembles = evaluate_ensembles(found, arrays, progress)
             groups = group_runs(runs)
             agents = [agent_metrics(name, same) for name, same in groups.items()]
             if runs:
                 write_curves(arrays, groups)
             selection = evaluate_selection(found, groups, arrays, progress)
+            ensembles = evaluate_ensembles(found, arrays, progress)
         metrics = {
             "run": found.run.resolve().name,
             "settings": SETTINGS,
@@ -122,7 +122,12 @@ def find(run: Path) -> Found:
         UserError: there is none, or one is damaged.
     """
     metas = find_artefacts(run, "meta")
-    continued = {artefact.input("options") for artefact in metas if _has_input(artefact, "options")}
+    continued = {
+        (artefact.path / entry["relative"]).resolve()
+        for artefact in metas
+        for entry in artefact.manifest["inputs"]
+        if entry["kind"] == "options"
+    }
     options = [artefact for artefact in find_artefacts(run, "options") if artefact.path.resolve() not in continued]
     found = Found(run, find_artefacts(run, "ensemble"), [*metas, *options, *find_artefacts(run, "baseline")])
     if not found.ensembles and not found.agents:
@@ -130,48 +135,44 @@ def find(run: Path) -> Found:
     return found
 
 
-def _has_input(artefact: Artefact, kind: str) -> bool:
-    return any(entry["kind"] == kind for entry in artefact.manifest["inputs"])
-
-
 def evaluate_ensembles(found: Found, arrays: Any, progress: Progress) -> list[dict[str, Any]]:
     """Spec F1, F2: every ensemble of the run on its data's held-out and unlabelled states."""
     names = ensemble_names([artefact.config for artefact in found.ensembles])
-    metrics: list[dict[str, Any]] = []
-    for artefact, name in zip(found.ensembles, names, strict=True):
-        dataset = open_dataset(artefact.input("data"))
-        rows = [
-            _evaluate_sub_goal(artefact, goal, dataset, arrays, not metrics) for goal in artefact.config["sub_goals"]
-        ]
-        about = {
-            "path": found.name(artefact),
-            "name": name,
-            "seed": artefact.seed,
-            "members": artefact.config["members"],
-        }
-        metrics.append({**about, "sub_goals": rows})
-        progress.advance()
-    return metrics
+    metrics = [
+        {"path": found.name(artefact), "name": name, "seed": artefact.seed, "members": artefact.config["members"]}
+        for artefact, name in zip(found.ensembles, names, strict=True)
+    ]
+    rows: list[list[dict[str, Any]]] = [[] for _ in metrics]
+    sources = [artefact.input("data") for artefact in found.ensembles]
+    for path in sorted(set(sources)):
+        dataset = open_dataset(path)
+        unlabelled = dataset.unlabelled()
+        for sub_goal in dataset.sub_goals:
+            split = dataset.heldout(sub_goal)  # read once for all ensembles: it is the largest thing here
+            for index, artefact in enumerate(found.ensembles):
+                if sources[index] == path and sub_goal in artefact.config["sub_goals"]:
+                    examples = arrays.create_group(f"examples/{sub_goal}") if index == 0 else None
+                    rows[index].append(_evaluate_sub_goal(artefact, sub_goal, split, unlabelled, examples))
+    progress.advance(len(metrics))
+    return [{**about, "sub_goals": own} for about, own in zip(metrics, rows, strict=True)]
 
 
 def _evaluate_sub_goal(
-    artefact: Artefact, sub_goal: str, dataset: Dataset, arrays: Any, with_examples: bool
+    artefact: Artefact, sub_goal: str, split: Split, unlabelled: NDArray[np.uint8], examples: Any
 ) -> dict[str, Any]:
     ensemble = read_ensemble(artefact.path, artefact.config, sub_goal)
-    split = dataset.heldout(sub_goal)
     probabilities = ensemble.predict(split.observations)
-    unlabelled = ensemble.predict(dataset.unlabelled()) > THRESHOLD
     seeds = split.origins.get("layout_seed")
-    if with_examples:
+    if examples is not None:
         picked = pick_examples(probabilities, split.labels, threshold=THRESHOLD)
         index = np.array([index for index, _ in picked], dtype=np.int64)
-        group = arrays.create_group(f"examples/{sub_goal}")
-        group["observations"] = split.observations[index]
-        group["probabilities"] = probabilities[index]
-        group["labels"] = split.labels[index]
-        group["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
-        group["kinds"] = json.dumps([kind for _, kind in picked])
-    return sub_goal_metrics(sub_goal, probabilities > THRESHOLD, split.labels, seeds, unlabelled)
+        examples["observations"] = split.observations[index]
+        examples["probabilities"] = probabilities[index]
+        examples["labels"] = split.labels[index]
+        examples["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
+        examples["kinds"] = json.dumps([kind for _, kind in picked])
+    verdicts = ensemble.predict(unlabelled) > THRESHOLD
+    return sub_goal_metrics(sub_goal, probabilities > THRESHOLD, split.labels, seeds, verdicts)
 
 
 def read_run(found: Found, artefact: Artefact) -> Run:

@@ -175,9 +175,7 @@ def test_none_is_zero_and_can_be_differentiated() -> None:
 
 def test_an_unknown_objective_is_one_clear_line() -> None:
     """Spec G2."""
-    with pytest.raises(
-        UserError, match=r"unknown diversity objective: dbta\. Choose one of dbat, divdis, none"
-    ):
+    with pytest.raises(UserError, match=r"unknown diversity objective: dbta\. Choose one of dbat, divdis, none"):
         load_objective("dbta")
 
 

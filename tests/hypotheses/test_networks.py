@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network, reordered
+from hypogoal.hypotheses.networks import ENTRY_POINTS, NETWORKS, as_input, build_network, reordered
 
 SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4)}
 
@@ -59,9 +61,7 @@ def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     """Spec C5, G2: dense layers take what the convolutions leave; too small an image is one clear line."""
     shape = (smallest, smallest + 9, 1)
     assert network_of(name, shape).eval()(torch.zeros(1, 1, smallest, smallest + 9)).shape == (1, 2)
-    with pytest.raises(
-        UserError, match=rf"too small for the network '{name}': observation shape \({smallest - 1},"
-    ):
+    with pytest.raises(UserError, match=rf"too small for the network '{name}': observation shape \({smallest - 1},"):
         network_of(name, (smallest - 1, smallest, 1))
 
 
@@ -71,6 +71,21 @@ def test_wrong_names_and_shapes_are_one_clear_line() -> None:
         network_of("resnet", (64, 64, 3))
     with pytest.raises(UserError, match=r"need images \(H, W, C\): observation shape \(8,\)"):
         network_of("doorkey", (8,))
+
+
+def test_another_package_adds_its_own_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Spec C5: an installed distribution with an entry point is found by name."""
+    folder = tmp_path / "own-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\ntiny = own_network:tiny\nbad = own_network:nothing\n")
+    code = "from torch import nn\ndef tiny(channels):\n    return [nn.Conv2d(channels, 2, 3)], (5,)\n"
+    (tmp_path / "own_network.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    layers = list(network_of("tiny", (8, 8, 1)))
+    assert [layer.in_features for layer in layers if isinstance(layer, nn.Linear)] == [2 * 6 * 6, 5]
+    with pytest.raises(UserError, match="cannot be loaded"):
+        network_of("bad", (8, 8, 1))
 
 
 def test_weights_come_from_the_generator_alone() -> None:
@@ -117,9 +132,7 @@ def test_deeplift_is_complete(name: str) -> None:
     captum = pytest.importorskip("captum.attr")
     network = network_of(name).eval()
     height, width, channels = SHAPES[name]
-    image = torch.rand(
-        1, channels, height, width, generator=torch.Generator().manual_seed(2)
-    ).requires_grad_()
+    image = torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(2)).requires_grad_()
     baseline = torch.full_like(image, 0.5)
     attributions = captum.DeepLift(network).attribute(image, baseline, target=1)
     difference = (network(image) - network(baseline))[0, 1]

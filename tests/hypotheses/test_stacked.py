@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
 

@@ -52,9 +52,7 @@ def test_diversity_finds_the_feature_that_is_hidden(schedule: str) -> None:
     alike = fit(observations, labels, unlabelled, dataclasses.replace(config, diversity="none"), seed=1)
     diverse = fit(observations, labels, unlabelled, config, seed=1)
     for ensemble in (alike, diverse):
-        assert ((ensemble.predict(observations) > 0.5) == labels[:, None]).mean() > 0.95, (
-            "all explain the labels"
-        )
+        assert ((ensemble.predict(observations) > 0.5) == labels[:, None]).mean() > 0.95, "all explain the labels"
     assert (follows(alike)[0] > 0.9).all()
     easy, hard = follows(diverse)
     assert easy.max() > 0.9
@@ -66,9 +64,7 @@ def test_a_single_member_is_the_plain_cnn() -> None:
     observations, labels, unlabelled = toy()
     config = dataclasses.replace(TOY, members=1)
     reports: list[dict[str, float]] = []
-    ensemble = fit(
-        observations, labels, unlabelled[:0], config, 0, lambda _, numbers: reports.append(numbers)
-    )
+    ensemble = fit(observations, labels, unlabelled[:0], config, 0, lambda _, numbers: reports.append(numbers))
     assert ensemble.predict(observations).shape == (64, 1)
     assert ((ensemble.predict(observations)[:, 0] > 0.5) == labels).all()
     assert {numbers["diversity"] for numbers in reports} == {0.0}
@@ -121,9 +117,7 @@ def test_reports_are_the_losses_of_equation_1(diversity: str) -> None:
     fit(observations, labels, unlabelled, config, 0, lambda *report: reports.append(report))
     assert [step for step, _ in reports] == [10, 12]
     for _, numbers in reports:
-        assert numbers["loss"] == pytest.approx(
-            3 * numbers["labelled"] + 0.5 * numbers["diversity"], rel=1e-5
-        )
+        assert numbers["loss"] == pytest.approx(3 * numbers["labelled"] + 0.5 * numbers["diversity"], rel=1e-5)
         assert (numbers["diversity"] > 0) == (diversity != "none")
 
 
@@ -175,11 +169,7 @@ def test_batches_are_balanced_where_asked(balance: str) -> None:
     labelled, unlabelled = (np.stack(drawn) for drawn in zip(*states.batches(config, 0), strict=True))
     assert labelled.shape == unlabelled.shape == (41, 40)
     positives = labels[labelled].sum(axis=1)
-    assert (
-        (positives == 20).all()
-        if balance == "batch"
-        else positives.mean() == pytest.approx(40 * 3 / 164, abs=0.01)
-    )
+    assert (positives == 20).all() if balance == "batch" else positives.mean() == pytest.approx(40 * 3 / 164, abs=0.01)
     assert unlabelled.min() == 164
     np.testing.assert_array_equal(np.unique(unlabelled.ravel()[:100]), np.arange(164, 264))
     counts = np.bincount(labelled.ravel(), minlength=164)
@@ -195,9 +185,7 @@ def test_class_weights_weigh_the_classes() -> None:
     config = dataclasses.replace(TOY, members=1, steps=30)
     says = []
     for negative in (0.95, 0.05):
-        weighted = dataclasses.replace(
-            config, class_weight_negative=negative, class_weight_positive=1 - negative
-        )
+        weighted = dataclasses.replace(config, class_weight_negative=negative, class_weight_positive=1 - negative)
         says.append(fit(observations, labels, unlabelled, weighted, seed=0).predict(unlabelled).mean())
     assert says[0] < 0.4 < 0.6 < says[1]
 
@@ -209,9 +197,7 @@ def test_nan_stops_the_run_and_names_the_member() -> None:
     with pytest.raises(NumericalError, match=r"^the labelled loss of member 0 is (nan|inf) at step [23]$"):
         fit(observations, labels, unlabelled, config, seed=0)
     with pytest.raises(NumericalError, match=r"of member [01] is NaN or Inf after step 1$"):
-        fit(
-            observations, labels, unlabelled, dataclasses.replace(config, learning_rate=1e39, steps=1), seed=0
-        )
+        fit(observations, labels, unlabelled, dataclasses.replace(config, learning_rate=1e39, steps=1), seed=0)
 
 
 def test_an_objective_that_gives_nan_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Step
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.networks import NETWORKS
+from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings, PPOSettings, hyperparameters
 from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
 
@@ -119,6 +119,20 @@ def test_tile_codes_say_what_the_image_says(network):
     by_image = NETWORKS[network](spaces.Box(0, 255, (3, 64, 64), np.uint8))
     by_image.load_state_dict(by_code.state_dict())
     assert torch.allclose(by_code(codes), by_image(images), atol=1e-5)
+
+
+def test_block_convolution_is_a_convolution():
+    """Spec E2, E7: the paper's convolutions, written as matrix products, are convolutions: values and gradients."""
+    block, plain = BlockConvolution(3, 5, 2), torch.nn.Conv2d(3, 5, 2, stride=2)
+    kernel = block.linear.weight.detach().view(5, 2, 2, 3).permute(0, 3, 1, 2)
+    plain.load_state_dict({"weight": kernel, "bias": block.linear.bias.detach()})
+    inputs = torch.rand(4, 3, 6, 8, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    expected = plain(inputs)
+    found = block(inputs.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    assert torch.allclose(found, expected, atol=1e-6)
+    (wanted,) = torch.autograd.grad(expected.square().sum(), inputs, retain_graph=True)
+    (had,) = torch.autograd.grad(found.square().sum(), inputs)
+    assert torch.allclose(had, wanted, atol=1e-5)
 
 
 def test_epsilon_waits_for_the_first_goal():

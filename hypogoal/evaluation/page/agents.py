@@ -131,7 +131,7 @@ def _curve(material: Material, quantity: str) -> Block:
     if quantity == "reward":
         random = [layout["random_success"] for layout in layouts if layout["random_success"] is not None]
         references = [("random play", float(np.mean(random)))] if random else []
-        label, axis, bounds = "Undiscounted reward per episode", "reward per episode (1: goal reached)", (-0.02, 1.04)
+        label, axis, bounds = "Undiscounted reward per episode", "reward per episode", (-0.02, 1.04)
     else:
         shortest = [layout["shortest_path"] for layout in layouts if layout["shortest_path"]]
         references = [("shortest path", float(np.mean(shortest)))] if shortest else []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -13,8 +15,31 @@ FEATURES = 128
 CELL = 8  # pixels; the first convolution's kernel and stride
 
 
+class BlockConvolution(nn.Module):
+    """A convolution whose stride is its kernel size, as one matrix product: ``nn.Conv2d(c, out, size, stride=size)``.
+
+    On images as small as these that takes half the time of a convolution routine (a CPU thread).
+
+    Args:
+        channels: of the input (N, H, W, channels).
+        out: of the output (N, H / size, W / size, out).
+        size: kernel and stride; divides H and W.
+    """
+
+    def __init__(self, channels: int, out: int, size: int):
+        super().__init__()
+        self.size = size
+        self.linear = nn.Linear(size * size * channels, out)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        count, height, width, channels = inputs.shape
+        rows, columns = height // self.size, width // self.size
+        blocks = inputs.reshape(count, rows, self.size, columns, self.size, channels).transpose(2, 3)
+        return self.linear(blocks.reshape(count, rows, columns, -1))
+
+
 class CellNetwork(BaseFeaturesExtractor):
-    """A convolution that sees one 8 x 8 cell at a time, further layers, then dense layers.
+    """Convolutions that each see a block at a time, the first one an 8 x 8 cell, then dense layers.
 
     Where the engine's images are made of tiles, observations are the cells' tile codes (N, cells) and the first
     convolution is computed once per tile and looked up: the same function of the image, up to rounding, several times
@@ -22,8 +47,7 @@ class CellNetwork(BaseFeaturesExtractor):
 
     Args:
         space: the observation space.
-        channels: of the first convolution.
-        further: layers from (N, channels, rows, columns) to (N, width).
+        channels: of the convolutions; those after the first have kernel 2.
         dense: how many dense layers follow.
         tiles: uint8 (codes, 8, 8, C), what each code looks like; None where observations are images.
         rows: of cells in an image, where ``tiles`` is given.
@@ -34,57 +58,54 @@ class CellNetwork(BaseFeaturesExtractor):
     def __init__(
         self,
         space: spaces.Box,
-        channels: int,
-        further: nn.Sequential,
+        channels: Sequence[int],
         dense: int,
         tiles: NDArray[np.uint8] | None = None,
         rows: int = 0,
     ):
         super().__init__(space, FEATURES)
         self.rows = rows
-        self.first = nn.Conv2d(space.shape[0] if tiles is None else tiles.shape[3], channels, CELL, stride=CELL)
-        self.further = further
-        flat = None
-        if tiles is not None:
-            flat = torch.from_numpy(tiles.astype(np.float32) / 255.0).permute(0, 3, 1, 2).flatten(start_dim=1)
-        self.register_buffer("tiles", flat, persistent=False)
+        self.first = BlockConvolution(space.shape[0] if tiles is None else tiles.shape[3], channels[0], CELL)
+        pixels = None if tiles is None else torch.from_numpy(tiles.astype(np.float32) / 255.0)
+        self.register_buffer("tiles", pixels, persistent=False)
+        further: list[nn.Module] = []
+        for before, after in zip(channels[:-1], channels[1:], strict=True):
+            further += [BlockConvolution(before, after, 2), nn.ReLU()]
+        self.further = nn.Sequential(*further, nn.Flatten())
         with torch.no_grad():
-            width = self.further(torch.relu(self._cells(torch.zeros(1, *space.shape)))).shape[1]
+            width = self.further(self._cells(torch.zeros(1, *space.shape))).shape[1]
         layers: list[nn.Module] = [nn.Linear(width, FEATURES), nn.ReLU()]
         for _ in range(dense - 1):
             layers += [nn.Linear(FEATURES, FEATURES), nn.ReLU()]
         self.dense = nn.Sequential(*layers)
 
     def _cells(self, observations: Tensor) -> Tensor:
-        """The first convolution: (N, channels, rows, columns)."""
+        """The first convolution and ReLU: (N, rows, columns, channels)."""
         if self.tiles is None:
-            return self.first(observations)
-        table = nn.functional.linear(self.tiles, self.first.weight.flatten(start_dim=1), self.first.bias)
+            return torch.relu(self.first(observations.permute(0, 2, 3, 1)))
+        table = torch.relu(self.first(self.tiles)).flatten(start_dim=1)
         seen = table.index_select(0, observations.flatten().long())
-        return seen.view(len(observations), self.rows, -1, table.shape[1]).permute(0, 3, 1, 2)
+        return seen.view(len(observations), self.rows, -1, table.shape[1])
 
     def forward(self, observations: Tensor) -> Tensor:
-        return self.dense(self.further(torch.relu(self._cells(observations))))
+        return self.dense(self.further(self._cells(observations)))
 
 
-class ThreeConv(CellNetwork):
+class ThreeConvolutions(CellNetwork):
     """The paper's network: three convolutions with ReLU between, and a dense layer shared by actor and critic.
 
     The paper gives no sizes; these are small.
     """
 
     def __init__(self, space: spaces.Box, tiles: NDArray[np.uint8] | None = None, rows: int = 0):
-        further = nn.Sequential(
-            nn.Conv2d(16, 32, 2, stride=2), nn.ReLU(), nn.Conv2d(32, 32, 2), nn.ReLU(), nn.Flatten()
-        )
-        super().__init__(space, 16, further, 1, tiles, rows)
+        super().__init__(space, (16, 32, 64), 1, tiles, rows)
 
 
 class Cells(CellNetwork):
     """The tuned network: one convolution over cells, two dense layers."""
 
     def __init__(self, space: spaces.Box, tiles: NDArray[np.uint8] | None = None, rows: int = 0):
-        super().__init__(space, 8, nn.Sequential(nn.Flatten()), 2, tiles, rows)
+        super().__init__(space, (8,), 2, tiles, rows)
 
 
-NETWORKS: dict[str, type[ThreeConv] | type[Cells]] = {"three-conv": ThreeConv, "cells": Cells}
+NETWORKS: dict[str, type[ThreeConvolutions] | type[Cells]] = {"three-conv": ThreeConvolutions, "cells": Cells}
