@@ -13,6 +13,7 @@ from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
     figure,
+    first_named,
     fixed,
     interval,
     listed,
@@ -50,8 +51,7 @@ def summary_section(material: Material) -> Block:
 
 
 def _answer(material: Material) -> str:
-    named = {agent["name"]: agent for agent in material.agents()}
-    agent, control = named.get(LEARNED), named.get(RANDOM)
+    agent, control = first_named(material.agents(), LEARNED), first_named(material.agents(), RANDOM)
     if agent is None:
         return ""
     ratio = fixed(agent["length_over_shortest"]["mean"], 1)

@@ -14,6 +14,7 @@ from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
     figure,
+    first_named,
     fixed,
     interval,
     listed,
@@ -30,24 +31,9 @@ QUANTITIES = {
 }
 
 
-def _learned(material: Material) -> Mapping[str, Any] | None:
-    """The agent with learned members; where its settings differ between runs, the first such."""
-    for agent in material.metrics["selection"]:
-        if agent["name"] == LEARNED or agent["name"].startswith(f"{LEARNED}, "):
-            return agent
-    return None
-
-
-def _control(material: Material) -> Mapping[str, Any] | None:
-    for agent in material.metrics["selection"]:
-        if agent["name"] == RANDOM or agent["name"].startswith(f"{RANDOM}, "):
-            return agent
-    return None
-
-
 def terminations_section(material: Material) -> Block:
     """Figures 7 and 8: where the most and the least preferred member's options stopped."""
-    agent = _learned(material)
+    agent = first_named(material.metrics["selection"], LEARNED)
     title = "Where options stop"
     if agent is None:
         missing = ["Overlaid termination states: they need a meta artefact with learned terminations: train-meta."]
@@ -94,7 +80,8 @@ def _pair(material: Material, run: Mapping[str, Any], goal: Mapping[str, Any]) -
 
 def choices_section(material: Material) -> Block:
     """Question 5: does reward lead to the hypotheses that transfer?"""
-    agent, control = _learned(material), _control(material)
+    selection = material.metrics["selection"]
+    agent, control = first_named(selection, LEARNED), first_named(selection, RANDOM)
     title = "Which hypotheses are chosen"
     if agent is None:
         needed = "It needs a meta artefact with learned terminations: train-meta."

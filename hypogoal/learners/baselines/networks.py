@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -69,7 +70,7 @@ class CellNetwork(BaseFeaturesExtractor):
         pixels = None if tiles is None else torch.from_numpy(tiles.astype(np.float32) / 255.0)
         self.register_buffer("tiles", pixels, persistent=False)
         further: list[nn.Module] = []
-        for before, after in zip(channels[:-1], channels[1:], strict=True):
+        for before, after in itertools.pairwise(channels):
             further += [BlockConvolution(before, after, 2), nn.ReLU()]
         self.further = nn.Sequential(*further, nn.Flatten())
         with torch.no_grad():
