@@ -72,6 +72,7 @@ def write_dataset(
     import h5py
 
     claim(path, force=force)
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
         with h5py.File(partial, "w") as file:

@@ -88,7 +88,7 @@ def versions() -> dict[str, str]:
 
 
 def claim(out: Path, *, force: bool = False) -> Path:
-    """Check that ``out`` may be written before any work is done.
+    """Check, before any work is done, that ``out`` may be written; nothing is made yet.
 
     Raises:
         UserError: it exists and ``force`` is false, or it exists and is not ours to replace.
@@ -99,13 +99,9 @@ def claim(out: Path, *, force: bool = False) -> Path:
             raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
         if not ours and out.is_dir():
             raise UserError("--force replaces only artefacts, and this folder has no manifest", out, "Move it away.")
-    parent = out.absolute().parent
-    try:
-        parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"the output's folder cannot be made ({error.strerror})", parent, "Choose another --out."
-        ) from None
+    parent = next(folder for folder in out.absolute().parents if folder.exists())
+    if not parent.is_dir():
+        raise UserError("the output's folder cannot be made, a file is in the way", parent, "Choose another --out.")
     if not os.access(parent, os.W_OK):
         raise UserError("no permission to write", parent, "Choose another --out.")
     return out

@@ -128,3 +128,12 @@ def test_streams_are_named_and_reproducible() -> None:
     assert torch.equal(
         torch.rand(3, generator=torch_generator(1, "a")), torch.rand(3, generator=torch_generator(1, "a"))
     )
+
+
+def test_claim_makes_nothing_and_finds_a_file_in_the_way(tmp_path: Path) -> None:
+    """Spec G2."""
+    assert claim(tmp_path / "a" / "b" / "c") == tmp_path / "a" / "b" / "c"
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UserError, match="in the way"):
+        claim(tmp_path / "file" / "out")
