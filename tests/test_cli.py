@@ -12,6 +12,7 @@ import pytest
 
 import hypogoal
 from hypogoal.cli import main
+from hypogoal.dataset import open_dataset
 
 SMALL = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1"]
 QUICK = [
@@ -84,6 +85,16 @@ def test_steps_of_both_stages_count(made: Path) -> None:
     assert {entry["kind"] for entry in manifest["inputs"]} == {"ensemble", "options"}
     layout = json.loads((made / "meta" / "layout.json").read_text())
     assert layout["layout_seed"] == 100 and layout["shortest_path"] >= 9
+
+
+def test_collected_states_and_members_are_files(made: Path) -> None:
+    """Spec A1, A2, B3: labelled, unlabelled and held-out states under one file; an ensemble per sub-goal under another."""
+    dataset = open_dataset(made / "data.h5")
+    counts = dataset.counts()
+    assert counts["labelled"]["go-to-goal"] == {"states": 1640, "positives": 8}
+    assert len(dataset.unlabelled()) == counts["unlabelled"] > 500
+    assert set(dataset.heldout("go-to-goal").origins["layout_seed"]).isdisjoint({0, 1, 2})
+    assert {path.stem for path in (made / "ensemble").glob("*.safetensors")} == set(dataset.sub_goals)
 
 
 def test_show_and_verify(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,11 +234,13 @@ def test_config_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_dry_run_lists_commands_and_runs_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec A6: a run is ordinary commands."""
+    """Spec A6: a run is ordinary commands. Spec D5, E4: in the paper's, policies start fresh, a layout per agent."""
     out = tmp_path / "run"
     assert main(["run", "doorkey", "--preset", "paper", "--out", str(out), "--dry-run"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert sum("train-meta" in line and "chooser" not in line and "termination" not in line for line in lines) == 10
+    assert len({line.split("--layout-seed ")[1].split()[0] for line in lines if "--layout-seed" in line}) == 10
+    assert not any("train-options" in line for line in lines)
     assert not out.exists()
 
 

@@ -87,9 +87,10 @@ def layout_facts(engine: Any, config: PlayConfig, seed: int) -> dict[str, Any]:
     """Spec F5: how hard the layout is: its shortest path and how often random play reaches the goal."""
     rng = rng_for(seed, "random-play")
     episodes = config.random_episodes
+    playable = episodes and hasattr(engine, "random_success")
     return {
         "layout_seed": config.layout_seed,
-        "shortest_path": engine.shortest_path(),
-        "random_success": engine.random_success(episodes, rng) if episodes else None,
+        "shortest_path": engine.shortest_path() if hasattr(engine, "shortest_path") else None,
+        "random_success": engine.random_success(episodes, rng) if playable else None,
         "random_episodes": episodes,
     }

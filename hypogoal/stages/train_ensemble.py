@@ -17,6 +17,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import open_dataset
+from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.storage import write_ensemble
 from hypogoal.hypotheses.training import EnsembleConfig, fit
 
@@ -49,6 +50,7 @@ def train_ensemble(
         NumericalError: a loss became NaN or Inf.
     """
     prepare(device)
+    load_objective(config.diversity)
     dataset = open_dataset(data)
     sub_goals = config.sub_goals or dataset.sub_goals
     for sub_goal in sub_goals:
@@ -74,7 +76,8 @@ def train_ensemble(
                 spawn = multiprocessing.get_context("spawn")
                 with ProcessPoolExecutor(workers, mp_context=spawn) as pool:
                     futures = [pool.submit(_train_one, *job) for job in jobs]
-                    for _ in as_completed(futures):
+                    for future in as_completed(futures):
+                        future.result()  # a failure is told at once
                         progress.advance(1)
                     summaries = [future.result() for future in futures]
         _join_metrics(folder, sub_goals)

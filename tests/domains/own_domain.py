@@ -1,0 +1,44 @@
+"""A domain that is not hypogoal's, as a user would bring it (Spec B6): one file behind the small interface."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from corridor import LENGTH, Corridor
+from hypogoal.core.config import setting
+from hypogoal.dataset import Collected, States
+
+
+class TallCorridor(Corridor):
+    """The corridor in images that the member network takes."""
+
+    observation_shape = (64, 64, 3)
+
+
+@dataclass(frozen=True)
+class CorridorConfig:
+    """What ``collect`` can be told."""
+
+    copies: int = setting(8, "copies of each cell", low=1)
+
+
+class CorridorDomain:
+    """The corridor with its two ends as sub-goals."""
+
+    name = "own_domain:DOMAIN"
+    sub_goals = Corridor.sub_goals
+    observation_shape = TallCorridor.observation_shape
+    config_class = CorridorConfig
+    env_id = ""
+
+    def collect(self, config: CorridorConfig, seed: int, progress: Any) -> Collected:
+        engine = TallCorridor(1)
+        ids = np.tile(np.arange(LENGTH), config.copies)
+        states = States(engine.images(ids), engine.labels(ids), {"cell": ids})
+        return Collected(self.observation_shape, self.sub_goals, states, states, states)
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> TallCorridor:
+        return TallCorridor(count, max_steps)
+
+
+DOMAIN = CorridorDomain()

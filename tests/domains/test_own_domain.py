@@ -1,0 +1,40 @@
+"""A user's own domain goes through the stages without a change to hypogoal (Spec B6)."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypogoal.cli import main
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.base import load_domain
+
+TESTS = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TESTS))
+    monkeypatch.syspath_prepend(str(TESTS / "domains"))
+
+
+def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
+    """Spec B6: ``module:object`` is collected, its hypotheses, options and meta-policy are trained, all is evaluated."""
+    data, run = tmp_path / "data.h5", tmp_path / "run"
+    assert main(["collect", "own_domain:DOMAIN", "--out", str(data), "--set", "copies=9", "-q"]) == 0
+    assert open_dataset(data).counts()["labelled"]["left-end"] == {"states": 54, "positives": 9}
+    train = ["train-ensemble", str(data), "--out", str(run / "ensemble"), "--set", "steps=30", "--set", "workers=1", "-q"]
+    assert main(train) == 0
+    few = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
+    assert main(["train-options", str(run / "ensemble"), "--out", str(run / "options"), *few]) == 0
+    assert main(["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), *few]) == 0
+    assert json.loads((run / "meta" / "layout.json").read_text())["shortest_path"] is None
+    assert (run / "meta" / "episodes.csv").read_text().count("\n") > 10
+
+
+def test_what_is_no_domain_is_refused() -> None:
+    """Spec B6, G2: one line that says what a domain needs."""
+    with pytest.raises(UserError, match="not a domain"):
+        load_domain("own_domain:CorridorConfig")
+    with pytest.raises(UserError, match="cannot be loaded"):
+        load_domain("own_domain:NOTHING")
