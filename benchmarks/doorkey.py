@@ -116,11 +116,7 @@ def machine() -> dict[str, str]:
     model = platform.processor() or "unknown"
     info = Path("/proc/cpuinfo")
     if info.exists():
-        names = [
-            line.split(":")[1].strip()
-            for line in info.read_text().splitlines()
-            if line.startswith("model name")
-        ]
+        names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
         model = f"{names[0]}, {len(names)} cores" if names else model
     packages = {name: metadata.version(name) for name in ("minigrid", "gymnasium", "numpy")}
     return {"processor": model, "python": platform.python_version(), **packages}
@@ -138,9 +134,7 @@ def main() -> None:
     results = [summary(name, repeated, yardstick) for name, repeated in timings.items()]
     about = machine()
     print(", ".join(f"{name} {value}" for name, value in about.items()))
-    print(
-        f"image uint8 (64, 64, 3) at each of {minigrid_steps:,} MiniGrid and {engine_steps:,} engine steps,"
-    )
+    print(f"image uint8 (64, 64, 3) at each of {minigrid_steps:,} MiniGrid and {engine_steps:,} engine steps,")
     print(f"CPU time of one thread, {repeats} repeats (layout seeds 0-{repeats - 1}), engines from cold")
     print(f"{'':34}{'steps/s (median)':>18}{'lowest':>12}{'highest':>12}{'ratio':>9}{'hits':>8}")
     for row in results:

@@ -58,9 +58,7 @@ def test_version_is_said_once() -> None:
     version = PROJECT["version"]
     assert hypogoal.__version__ == version
     assert metadata.version("hypogoal") == version, "run `make setup` again"
-    assert re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M) == [
-        version
-    ]
+    assert re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M) == [version]
     headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
     assert headings[0] == version
 
@@ -124,17 +122,13 @@ def test_every_data_file_of_the_package_is_installed() -> None:
     data = [path for path in files if path.suffix != ".py" and "__pycache__" not in path.parts]
     assert any(path.suffix == ".toml" for path in data), "the presets are gone"
     for path in data:
-        assert any(fnmatch.fnmatch(path.as_posix(), pattern) for pattern in patterns), (
-            f"{path} is not packaged"
-        )
+        assert any(fnmatch.fnmatch(path.as_posix(), pattern) for pattern in patterns), f"{path} is not packaged"
 
 
 def loaded_by(code: str) -> set[str]:
     """Top-level modules that a fresh interpreter has loaded after running ``code``."""
     script = f"import sys\n{code}\nprint(*sorted(name for name in sys.modules if '.' not in name))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
-    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     return set(done.stdout.split())
 
 
@@ -169,16 +163,11 @@ def unsafe(source: str) -> Iterator[str]:
             yield str(node.module)
         elif isinstance(node, ast.ImportFrom) and node.module == "torch":
             yield from (f"torch.{alias.name}" for alias in node.names if alias.name in ("load", "save"))
-        elif (
-            isinstance(node, ast.Attribute)
-            and node.attr in ("load", "save")
-            and isinstance(node.value, ast.Name)
-        ):
+        elif isinstance(node, ast.Attribute) and node.attr in ("load", "save") and isinstance(node.value, ast.Name):
             if node.value.id in ("torch", "PPO", "DQN"):
                 yield f"{node.value.id}.{node.attr}"
         elif isinstance(node, ast.keyword) and node.arg == "allow_pickle":
-            if not (isinstance(node.value, ast.Constant) and node.value.value is False):
-                yield "allow_pickle"
+            yield from () if isinstance(node.value, ast.Constant) and node.value.value is False else ("allow_pickle",)
 
 
 @pytest.mark.parametrize(
@@ -273,9 +262,7 @@ def test_results_are_not_committed_by_mistake(tmp_path: Path) -> None:
     wanted = {"data/README.md", "runs/README.md", "hypogoal/dataset.py", "hypogoal/core/artefacts.py"}
     unwanted = {"data/doorkey.h5", "runs/demo/manifest.json", ".venv/bin/python", "tests/__pycache__/a.pyc"}
     paths = "\n".join(wanted | unwanted)
-    done = subprocess.run(
-        ["git", "check-ignore", "--stdin"], cwd=tmp_path, input=paths, capture_output=True, text=True
-    )
+    done = subprocess.run(["git", "check-ignore", "--stdin"], cwd=tmp_path, input=paths, capture_output=True, text=True)
     assert set(done.stdout.split()) == unwanted
     for name in ("data", "runs"):
         assert (ROOT / name / "README.md").is_file()

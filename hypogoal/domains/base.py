@@ -91,11 +91,7 @@ def load_domain(name: str) -> Domain:
     try:
         domain = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"the domain cannot be loaded ({error})", name, "Check the module and the object."
-        ) from None
+        raise UserError(f"the domain cannot be loaded ({error})", name, "Check the module and the object.") from None
     if not isinstance(domain, Domain):
-        raise UserError(
-            "the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs."
-        )
+        raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
     return domain

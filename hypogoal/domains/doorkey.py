@@ -59,9 +59,7 @@ class DoorKeyConfig:
         choices=("fixed", "shuffled"),
     )
     draws: int = setting(20, "key placements of the regime 'shuffled'", source="own choice", low=1, high=1000)
-    labelled_seed: int = setting(
-        0, "layout seed of the labelled states", source="paper, MiniGrid experiment", low=0
-    )
+    labelled_seed: int = setting(0, "layout seed of the labelled states", source="paper, MiniGrid experiment", low=0)
     unlabelled_seeds: tuple[int, ...] = setting(
         (1, 2), "layout seeds of the unlabelled states", source="paper, MiniGrid experiment", low=0
     )
@@ -115,9 +113,7 @@ def collect(config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
     training = [(layout_seed, 0, layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]
     heldout = _heldout_layouts(config, avoid=[layout for _, _, layout in [*sources, *training]])
     progress.expect(len(sources) + len(training) + len(heldout))
-    swept = [
-        [_sweep(config, *source, progress) for source in group] for group in (sources, training, heldout)
-    ]
+    swept = [[_sweep(config, *source, progress) for source in group] for group in (sources, training, heldout)]
     keep = None
     if config.regime == "shuffled":
         amount = len(DoorKeyStates(layout_of(config.labelled_seed), config.keyring).reachable())
@@ -202,9 +198,7 @@ class DoorKeyDomain:
         """See ``collect``."""
         return collect(config, seed, progress)
 
-    def make_engine(
-        self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, **arguments: Any
-    ) -> DoorKeyEngine:
+    def make_engine(self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, **arguments: Any) -> DoorKeyEngine:
         """An engine of ``count`` environments of one layout; ``arguments``: ``keyring``, ``door_label``."""
         return DoorKeyEngine(layout_seed, count, max_steps=max_steps, **arguments)
 

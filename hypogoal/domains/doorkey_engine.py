@@ -37,9 +37,7 @@ _ROW_OF_TILE = np.dtype(f"V{TILE * 3}")  # a tile's pixel row moved as one item:
 def _cells_of(images: NDArray[np.uint8]) -> NDArray[Any]:
     """A view of images (n, 64, 64, 3) as (n, cell row, pixel row, cell column): items are rows of a tile."""
     if images.dtype != np.uint8 or images.shape[1:] != OBSERVATION_SHAPE or not images.flags.c_contiguous:
-        raise ValueError(
-            f"images must be contiguous uint8 (n, {OBSERVATION_SHAPE}), not {images.dtype} {images.shape}"
-        )
+        raise ValueError(f"images must be contiguous uint8 (n, {OBSERVATION_SHAPE}), not {images.dtype} {images.shape}")
     rows = images.reshape(len(images), SIZE, TILE, SIZE * TILE * 3)
     return rows.view(_ROW_OF_TILE)
 
@@ -207,9 +205,7 @@ class SingleDoorKey:
     Args: as ``DoorKeyEngine``, without ``count``. After an episode's end call ``reset``.
     """
 
-    def __init__(
-        self, layout_seed: int, *, keyring: bool = True, max_steps: int = MAX_STEPS, door_label: str = "open"
-    ):
+    def __init__(self, layout_seed: int, *, keyring: bool = True, max_steps: int = MAX_STEPS, door_label: str = "open"):
         self.states = DoorKeyStates(layout_of(layout_seed), keyring, door_label)
         self.max_steps = max_steps
         layout = self.states.layout

@@ -156,9 +156,7 @@ class DoorKeyGrid(MiniGridEnv):
         self.mission = MISSION
         self._np_random = episode_rng
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """A new episode; ``info["labels"]`` has the true sub-goal predicates."""
         observation, info = super().reset(seed=seed, options=options)
         return observation, info | {"labels": self._named_labels()}

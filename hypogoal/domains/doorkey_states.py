@@ -62,10 +62,7 @@ Configuration = tuple[int, int, int, int]  # the door; the places of the blue, t
 def tiles() -> NDArray[np.uint8]:
     """MiniGrid's drawing of each cell code, uint8 (N_CODES, 8, 8, 3)."""
     things: list[Any] = [None, Wall(), Goal(), *(Key(colour) for colour in KEY_COLOURS)]
-    things += [
-        Door(DOOR_COLOUR, is_open=state == OPEN, is_locked=state == LOCKED)
-        for state in (OPEN, CLOSED, LOCKED)
-    ]
+    things += [Door(DOOR_COLOUR, is_open=state == OPEN, is_locked=state == LOCKED) for state in (OPEN, CLOSED, LOCKED)]
     drawn = [Grid.render_tile(thing, tile_size=TILE) for thing in things]
     for under in (None, things[DOOR + OPEN], things[GOAL]):
         drawn += [Grid.render_tile(under, agent_dir=direction, tile_size=TILE) for direction in range(4)]
@@ -130,9 +127,7 @@ class DoorKeyStates:
         key = (configuration * CELLS + front) * N_ACTIONS + action
         known = self._changes.get(key)
         if known is None:
-            known = self._changes[key] = self._index_of(
-                self._after(self._configurations[configuration], front, action)
-            )
+            known = self._changes[key] = self._index_of(self._after(self._configurations[configuration], front, action))
         return known
 
     def _after(self, configuration: Configuration, front: int, action: int) -> Configuration:

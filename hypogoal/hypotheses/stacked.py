@@ -48,9 +48,7 @@ class StackedMembers:
         for layer, weights in self._steps:
             if isinstance(layer, nn.Conv2d):
                 bias = weights[1] if len(weights) > 1 else None
-                x = functional.conv2d(
-                    x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups
-                )
+                x = functional.conv2d(x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups)
                 groups = self.count
             elif isinstance(layer, nn.BatchNorm2d):
                 mean, variance, scale, shift = weights

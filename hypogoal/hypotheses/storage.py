@@ -31,8 +31,6 @@ def read_ensemble(folder: Path, config: dict[str, Any], sub_goal: str) -> Ensemb
     path = folder / f"{sub_goal}.safetensors"
     state = load_tensors(path)
     try:
-        return Ensemble.from_state(
-            config["network"], tuple(config["observation_shape"]), config["members"], state
-        )
+        return Ensemble.from_state(config["network"], tuple(config["observation_shape"]), config["members"], state)
     except (RuntimeError, KeyError):
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None

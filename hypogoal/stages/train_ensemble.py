@@ -84,9 +84,7 @@ def train_ensemble(
     return summaries
 
 
-def _train_one(
-    data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path
-) -> dict[str, Any]:
+def _train_one(data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
     dataset = open_dataset(data)

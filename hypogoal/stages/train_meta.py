@@ -99,9 +99,7 @@ def train_meta(
         save_tensors(folder / "options.safetensors", learner.state())
         if policy:
             save_tensors(folder / "meta.safetensors", policy.state())
-        (folder / "layout.json").write_text(
-            json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8"
-        )
+        (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
     return {
         "steps": recorder.steps,
         "episodes": len(recorder.episodes),
@@ -114,8 +112,7 @@ def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     """The rows of an ``episodes.csv``: step, length, reward, terminated."""
     with path.open(newline="", encoding="utf-8") as file:
         return [
-            (int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"]))
-            for r in csv.DictReader(file)
+            (int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"])) for r in csv.DictReader(file)
         ]
 
 

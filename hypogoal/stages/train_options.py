@@ -55,9 +55,7 @@ def train_options(
         "chooser": "random",
         "setting": config.network,
     }
-    with create_artefact(
-        out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force
-    ) as folder:
+    with create_artefact(out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force) as folder:
         recorder = Recorder(verdicts.options)
         chooser = RandomChooser(rng_for(seed, "random-choice"))
         loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0)
@@ -67,9 +65,7 @@ def train_options(
         log.close()
         recorder.write(folder, engine.images)
         save_tensors(folder / "options.safetensors", learner.state())
-        (folder / "layout.json").write_text(
-            json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8"
-        )
+        (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
     return {
         "steps": recorder.steps,
         "episodes": len(recorder.episodes),

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from corridor import LENGTH, Corridor
+
 from hypogoal.core.config import setting
 from hypogoal.dataset import Collected, States
 

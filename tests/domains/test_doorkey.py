@@ -195,11 +195,7 @@ def test_fixed_collection() -> None:
     """Spec B3, regime A: each image of seed 0 once, unlabelled of seeds 1 and 2, 20 held-out layouts."""
     data = collected()
     assert data.sub_goals == SUB_GOALS
-    assert (
-        len(data.labelled.observations)
-        == len({image.tobytes() for image in data.labelled.observations})
-        == 1640
-    )
+    assert len(data.labelled.observations) == len({image.tobytes() for image in data.labelled.observations}) == 1640
     assert set(data.unlabelled.origins["layout_seed"]) == {1, 2}
     assert len(set(data.heldout.origins["layout_seed"])) == 20
     for states in (data.labelled, data.unlabelled, data.heldout):
@@ -232,9 +228,7 @@ def test_origins_say_where_the_agent_is() -> None:
 
 def test_shuffled_collection() -> None:
     """Spec B3, regime B: keys lie elsewhere within seed 0's walls, as many states; seeds repeat."""
-    first, again, other = (
-        collected(seed, regime="shuffled", draws=6, heldout_layouts=1) for seed in (1, 1, 2)
-    )
+    first, again, other = (collected(seed, regime="shuffled", draws=6, heldout_layouts=1) for seed in (1, 1, 2))
     assert first.labelled.observations.shape == (1640, 64, 64, 3)
     assert np.array_equal(first.labelled.observations, again.labelled.observations)
     assert not np.array_equal(first.labelled.observations, other.labelled.observations)

@@ -204,9 +204,7 @@ def test_reachable_states_of_seed_0() -> None:
 def corridor() -> Layout:
     """Agent, red key, door, goal in a row (cells 9 to 12), the other keys walled in."""
     open_cells = {9, 10, 11, 12, 50, 52}
-    return Layout(
-        frozenset(range(64)) - open_cells, door=11, goal=12, start=9, direction=0, keys=(50, 52, 10)
-    )
+    return Layout(frozenset(range(64)) - open_cells, door=11, goal=12, start=9, direction=0, keys=(50, 52, 10))
 
 
 def test_a_corridor_counted_by_hand() -> None:
@@ -235,12 +233,7 @@ def test_all_layouts_are_solvable_with_the_ring() -> None:
 def test_random_success() -> None:
     """Spec F5: none below the shortest path; else the share that single episodes have; seeds repeat."""
     engine = DoorKeyEngine(9, 1, max_steps=500)
-    assert (
-        DoorKeyEngine(9, 1, max_steps=engine.shortest_path() - 1).random_success(
-            200, np.random.default_rng(0)
-        )
-        == 0
-    )
+    assert DoorKeyEngine(9, 1, max_steps=engine.shortest_path() - 1).random_success(200, np.random.default_rng(0)) == 0
     share = engine.random_success(600, np.random.default_rng(0))
     assert share == engine.random_success(600, np.random.default_rng(0))
     rng, single, wins = np.random.default_rng(1), SingleDoorKey(9), 0

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
@@ -19,11 +20,21 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
-    """Spec B6: ``module:object`` is collected, its hypotheses, options and meta-policy are trained, all is evaluated."""
+    """Spec B6: ``module:object`` is collected; its hypotheses, options and meta-policy are trained."""
     data, run = tmp_path / "data.h5", tmp_path / "run"
     assert main(["collect", "own_domain:DOMAIN", "--out", str(data), "--set", "copies=9", "-q"]) == 0
     assert open_dataset(data).counts()["labelled"]["left-end"] == {"states": 54, "positives": 9}
-    train = ["train-ensemble", str(data), "--out", str(run / "ensemble"), "--set", "steps=30", "--set", "workers=1", "-q"]
+    train = [
+        "train-ensemble",
+        str(data),
+        "--out",
+        str(run / "ensemble"),
+        "--set",
+        "steps=30",
+        "--set",
+        "workers=1",
+        "-q",
+    ]
     assert main(train) == 0
     few = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
     assert main(["train-options", str(run / "ensemble"), "--out", str(run / "options"), *few]) == 0
