@@ -6,6 +6,7 @@ command line's ``--help`` stay fast.
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -30,7 +31,14 @@ def __getattr__(name: str) -> Any:
 
 
 def register() -> None:
-    """Register hypogoal's environments; Gymnasium's plug-in entry point calls it on ``import gymnasium``."""
+    """Register hypogoal's environments with Gymnasium; calling it again does nothing.
+
+    Done by ``import hypogoal`` where Gymnasium is imported already, else by the first use of hypogoal's interface.
+    """
     from hypogoal.domains.doorkey_registration import register as register_doorkey
 
     register_doorkey()
+
+
+if "gymnasium" in sys.modules:
+    register()

@@ -128,20 +128,22 @@ class Dataset:
         self.path = path
         with _open(path) as file:
             self.attributes = {key: _plain(value) for key, value in file.attrs.items()}
-        if int(self.attributes.get("format", -1)) > FORMAT_VERSION:
+        foreign = UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
+        if not isinstance(self.attributes.get("format"), int):
+            raise foreign
+        if self.attributes["format"] > FORMAT_VERSION:
             raise UserError(
-                f"format {self.attributes['format']} is newer than this hypogoal reads",
-                path,
-                "Upgrade hypogoal.",
+                f"format {self.attributes['format']} is newer than this hypogoal reads", path, "Upgrade hypogoal."
             )
-        if "format" not in self.attributes or "sub_goals" not in self.attributes:
-            raise UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
         if not self.attributes.get("complete", False):
             raise UserError("the data file is not complete", path, "Collect it again.")
-        self.sub_goals: tuple[str, ...] = tuple(json.loads(self.attributes["sub_goals"]))
-        self.observation_shape: tuple[int, ...] = tuple(json.loads(self.attributes["observation_shape"]))
-        self.domain: str = self.attributes["domain"]
-        self.config: dict[str, Any] = json.loads(self.attributes["config"])
+        try:
+            self.sub_goals: tuple[str, ...] = tuple(map(str, json.loads(self.attributes["sub_goals"])))
+            self.observation_shape: tuple[int, ...] = tuple(map(int, json.loads(self.attributes["observation_shape"])))
+            self.domain = str(self.attributes["domain"])
+            self.config: dict[str, Any] = dict(json.loads(self.attributes["config"]))
+        except (KeyError, TypeError, ValueError):
+            raise foreign from None
 
     def labelled(self, sub_goal: str) -> Split:
         """The labelled states of one sub-goal."""

@@ -1,0 +1,84 @@
+"""The data file: whole or refused in one line (Spec A1, A8, G2)."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import Collected, States, open_dataset, write_dataset
+
+
+def write(path: Path) -> Path:
+    rng = np.random.default_rng(0)
+
+    def states(count: int) -> States:
+        images = rng.integers(0, 256, size=(count, 4, 5, 3), dtype=np.uint8)
+        return States(images, rng.random((count, 2)) < 0.5, {"layout_seed": np.arange(count)})
+
+    collected = Collected((4, 5, 3), ("one", "two"), states(7), states(5), states(6))
+    write_dataset(path, collected, domain="toy", config={"a": 1}, seed=3)
+    return path
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    """Spec A1: three sets, a label column per sub-goal, origins; unlabelled states without labels."""
+    path = write(tmp_path / "data.h5")
+    dataset = open_dataset(path)
+    assert dataset.sub_goals == ("one", "two") and dataset.domain == "toy" and dataset.config == {"a": 1}
+    assert dataset.labelled("one").observations.shape == (7, 4, 5, 3)
+    np.testing.assert_array_equal(dataset.labelled("one").observations, dataset.labelled("two").observations)
+    assert (dataset.labelled("one").labels != dataset.labelled("two").labels).any()
+    np.testing.assert_array_equal(dataset.heldout("two").origins["layout_seed"], np.arange(6))
+    with h5py.File(path) as file:
+        assert set(file["unlabelled"]) == {"observations", "origin"}
+    with pytest.raises(UserError, match="unknown sub-goal"):
+        dataset.labelled("three")
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "words"),
+    [
+        ("format", 99, "newer"),
+        ("format", "x", "not a hypogoal data file"),
+        ("complete", False, "not complete"),
+        ("domain", None, "not a hypogoal data file"),
+        ("sub_goals", "{", "not a hypogoal data file"),
+        ("observation_shape", '"x"', "not a hypogoal data file"),
+        ("config", None, "not a hypogoal data file"),
+    ],
+)
+def test_foreign_and_damaged_attributes(tmp_path: Path, attribute: str, value: Any, words: str) -> None:
+    """Spec G2: one clear line."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path, "a") as file:
+        del file.attrs[attribute]
+        if value is not None:
+            file.attrs[attribute] = value
+    with pytest.raises(UserError, match=words) as caught:
+        open_dataset(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_parts_and_other_files(tmp_path: Path) -> None:
+    """Spec G2: a file that lost a dataset, an empty file, a text."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path, "a") as file:
+        del file["heldout/two/labels"]
+    with pytest.raises(UserError, match="no readable 'heldout/two/labels'"):
+        open_dataset(path).heldout("two")
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(UserError, match="truncated or not HDF5"):
+        open_dataset(tmp_path / "text.h5")
+
+
+@pytest.mark.parametrize("first", ["import gymnasium, hypogoal", "import hypogoal, gymnasium; hypogoal.OptionEnv"])
+def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> None:
+    """Spec B1: the README's example works where nothing else was imported."""
+    code = f"{first}; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "(64, 64, 3)", done.stderr
