@@ -1,7 +1,8 @@
 """Settings: one home for each default, with unit, meaning and source; presets and ``--set`` resolve here.
 
 A stage's configuration is a frozen dataclass whose every field is a :func:`setting`. ``hypogoal config STAGE``
-and the manifests are made from the same fields. Precedence: ``--set`` > option > preset > default.
+and the manifests are made from the same fields. Precedence: ``--set`` > option > preset > the domain's
+default > default.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any, TypeVar
 from hypogoal.core.errors import UserError
 
 T = TypeVar("T")
+DOMAIN = "doorkey"  # whose presets and defaults hold where no domain is said
 
 
 def setting(
@@ -43,19 +45,21 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def load_preset(name: str | None, stage: str) -> dict[str, Any]:
+def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]:
     """The differences from the defaults that preset ``name`` asks for in ``stage``.
 
     Args:
         name: a preset shipped with the package (``demo``, ``paper``), the path of an own TOML file, or None.
         stage: the command's name; the TOML table read is ``[stage]``.
+        domain: whose presets are meant; those of a domain that has none are DoorKey's.
 
     Raises:
         UserError: unknown preset, unreadable file or not TOML.
     """
     if name is None:
         return {}
-    folder = resources.files("hypogoal") / "presets"
+    every = resources.files("hypogoal") / "presets"
+    folder = every / domain if domain.isidentifier() and (every / domain).is_dir() else every / DOMAIN
     known = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
     if name.endswith(".toml"):
         path = Path(name)
@@ -94,6 +98,8 @@ def resolve(
     preset: str | None = None,
     options: Mapping[str, Any] | None = None,
     assignments: Iterable[str] = (),
+    domain: str = DOMAIN,
+    defaults: Mapping[str, Any] | None = None,
 ) -> T:
     """The configuration of a stage from its preset, its options and its ``--set`` pairs.
 
@@ -103,11 +109,13 @@ def resolve(
         preset: see :func:`load_preset`.
         options: command-line options; those that are None were not given.
         assignments: ``key=value`` texts.
+        domain: whose presets are meant.
+        defaults: the domain's own, before which the class's stand back.
 
     Raises:
         UserError: unknown key, wrong type, or a value out of range.
     """
-    values: dict[str, Any] = dict(load_preset(preset, stage))
+    values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})
     values.update(parse_assignments(assignments))
     return from_values(config_class, values, stage)
@@ -135,13 +143,14 @@ def as_dict(config: Any) -> dict[str, Any]:
     }
 
 
-def describe(config_class: type) -> list[dict[str, Any]]:
-    """Every setting with default, type, unit, meaning, source and allowed values."""
+def describe(config_class: type, defaults: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+    """Every setting with default (a domain's own where given), type, unit, meaning, source and allowed values."""
     kinds = typing.get_type_hints(config_class)
     rows = []
     for field in dataclasses.fields(config_class):
         kind = kinds[field.name]
-        row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": field.default}
+        default = (defaults or {}).get(field.name, field.default)
+        row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
         rows.append(row | {key: field.metadata.get(key) for key in ("unit", "meaning", "source")})
         rows[-1]["allowed"] = _allowed(field.metadata)
     return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from importlib import metadata
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -95,3 +96,16 @@ def load_domain(name: str) -> Domain:
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
     return domain
+
+
+def defaults_of(domain: str, stage: str) -> Mapping[str, Any]:
+    """The settings of a stage that this domain has by default, in place of the general ones; empty where none are.
+
+    A domain that cannot be loaded has none: own data may name a domain that is not installed here.
+    """
+    try:
+        found = load_domain(domain)
+    except UserError:
+        return {}
+    defaults: Mapping[str, Mapping[str, Any]] = getattr(found, "defaults", {})
+    return defaults.get(stage, {})

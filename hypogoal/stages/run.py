@@ -5,93 +5,48 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import MANIFEST
-from hypogoal.core.config import parse_assignments, resolve, setting
+from hypogoal.core.config import parse_assignments, resolve
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import defaults_of, load_domain
+from hypogoal.experiments import doorkey, montezuma_ladders
+from hypogoal.experiments.cells import Cell, Plan
 
-EXPERIMENTS = ("doorkey",)
+EXPERIMENTS: Mapping[str, Any] = {"doorkey": doorkey, "montezuma-ladders": montezuma_ladders}
 CONFIGS = {
     "train-ensemble": "hypogoal.stages.train_ensemble:TrainEnsembleConfig",
     "train-options": "hypogoal.stages.train_options:TrainOptionsConfig",
     "train-meta": "hypogoal.stages.train_meta:TrainMetaConfig",
     "train-baseline": "hypogoal.stages.train_baseline:BaselineConfig",
-    "run": "hypogoal.stages.run:RunConfig",
 }
+STAGES = ("collect", *CONFIGS, "run")
 POLL_SECONDS = 0.2
 REPORT_SECONDS = 15.0
 
 
-@dataclass(frozen=True)
-class RunConfig:
-    """Which cells an experiment has."""
-
-    layout_seeds: tuple[int, ...] = setting((100,), "layouts, each with an agent of its own", source="Spec E4", low=0)
-    seeds: tuple[int, ...] = setting((0,), "run seeds, each with an ensemble of its own", low=0)
-    pretrain: bool = setting(True, "train-options before train-meta; false is the paper's D5")
-    controls: tuple[str, ...] = setting(
-        ("random", "oracle"), "controls beside the agent", source="Spec E6", choices=("random", "oracle")
-    )
-    baselines: tuple[str, ...] = setting(
-        ("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
-        "agents on the primitive actions",
-        source="Spec E7",
-        choices=("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
-    )
-    workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One command of an experiment.
-
-    Attributes:
-        name: for messages and its log.
-        arguments: of ``hypogoal``, without ``--force``.
-        out: what it writes.
-        needs: outputs of other cells that must be complete first.
-    """
-
-    name: str
-    arguments: tuple[str, ...]
-    out: Path
-    needs: tuple[Path, ...]
-
-    @property
-    def text(self) -> str:
-        """The command as one would type it."""
-        return shlex.join(("hypogoal", *self.arguments))
-
-    def complete(self) -> bool:
-        """Whether its output is there; what has a manifest, and a data file under its name, is whole."""
-        return (self.out / MANIFEST).is_file() if self.out.suffix != ".h5" else self.out.is_file()
-
-
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
-    """The settings of a stage, by its command's name."""
+    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment.
+
+    Raises:
+        UserError: no such stage or domain, or no experiment is on that domain.
+    """
     if stage == "collect":
         return load_domain(domain).config_class
+    if stage == "run":
+        for experiment in EXPERIMENTS.values():
+            if domain == experiment.DOMAIN:
+                return experiment.RunConfig
+        raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
     if stage not in CONFIGS:
-        raise UserError("no such stage", stage, f"Choose one of collect, {', '.join(CONFIGS)}.")
+        raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}.")
     module, _, name = CONFIGS[stage].partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """An experiment's cells, in an order in which they can run, and how many run at once."""
-
-    cells: list[Cell]
-    workers: int
 
 
 def plan(experiment: str, out: Path, *, preset: str | None = None, assignments: Iterable[str] = ()) -> Plan:
@@ -102,29 +57,31 @@ def plan(experiment: str, out: Path, *, preset: str | None = None, assignments: 
     """
     if experiment not in EXPERIMENTS:
         raise UserError("unknown experiment", experiment, f"Choose one of {', '.join(EXPERIMENTS)}.")
+    found = EXPERIMENTS[experiment]
     own, by_stage = _split(assignments)
-    config: RunConfig = resolve(RunConfig, stage="run", preset=preset, assignments=own)
-    stages = ("collect", *(stage for stage in CONFIGS if stage != "run"))
+    config = resolve(found.RunConfig, stage="run", preset=preset, assignments=own, domain=found.DOMAIN)
     for stage in by_stage:
-        if stage not in stages:
-            raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(stages)}.")
+        if stage not in found.STAGES:
+            raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(found.STAGES)}.")
     resolved: dict[str, Any] = {
         stage: resolve(
-            config_class_of(stage, experiment),
+            config_class_of(stage, found.DOMAIN),
             stage=stage,
             preset=preset,
             assignments=by_stage.get(stage, ()),
+            domain=found.DOMAIN,
+            defaults=defaults_of(found.DOMAIN, stage),
         )
-        for stage in stages
+        for stage in found.STAGES
     }
     common = {
         stage: (
             *(("--preset", preset) if preset else ()),
             *(x for pair in by_stage.get(stage, ()) for x in ("--set", pair)),
         )
-        for stage in stages
+        for stage in found.STAGES
     }
-    return Plan(_cells(experiment, out, config, resolved, common), config.workers or os.cpu_count() or 1)
+    return Plan(found.cells(out, config, resolved, common), config.workers or os.cpu_count() or 1)
 
 
 def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:
@@ -139,65 +96,6 @@ def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]
         else:
             own.append(assignment)
     return own, by_stage
-
-
-def _cells(
-    experiment: str,
-    out: Path,
-    config: RunConfig,
-    resolved: dict[str, Any],
-    common: dict[str, tuple[str, ...]],
-) -> list[Cell]:
-    single = len(config.layout_seeds) * len(config.seeds) == 1
-    data = out / "data.h5"
-    cells = [_cell("collect", (experiment, *common["collect"]), data)]
-    spent = resolved["train-options"].steps if config.pretrain else 0
-    budget = str(spent + resolved["train-meta"].steps)
-    agents: list[Path] = []
-
-    def add(
-        name: str,
-        stage: str,
-        arguments: Sequence[str],
-        seed: int,
-        layout: int | None,
-        needs: tuple[Path, ...],
-    ) -> Path:
-        place = name if single else f"{name}/seed-{seed}" if layout is None else f"{name}/layout-{layout}-seed-{seed}"
-        at = ("--seed", str(seed), *(("--layout-seed", str(layout)) if layout is not None else ()))
-        cells.append(_cell(stage, (*arguments, *common[stage], *at), out / place, needs))
-        return out / place
-
-    ensembles = {seed: add("ensemble", "train-ensemble", (str(data),), seed, None, (data,)) for seed in config.seeds}
-    cases = [(layout, seed) for layout in config.layout_seeds for seed in config.seeds]
-    for layout, seed in cases:
-        source = ensembles[seed]
-        extra: tuple[str, ...] = ()
-        needs: tuple[Path, ...] = (source,)
-        if config.pretrain:
-            options = add("options", "train-options", (str(source),), seed, layout, (source,))
-            extra, needs = ("--options", str(options)), (source, options)
-        agents.append(add("meta", "train-meta", (str(source), *extra), seed, layout, needs))
-    for control in config.controls:
-        change = "chooser=random" if control == "random" else "termination=oracle"
-        for layout, seed in cases:
-            arguments = (str(ensembles[seed]), "--set", change, "--set", f"steps={budget}")
-            agents.append(add(f"meta-{control}", "train-meta", arguments, seed, layout, (ensembles[seed],)))
-    for baseline in config.baselines:
-        agent, _, kind = baseline.partition("-")
-        for layout, seed in cases:
-            options_of = (experiment, "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
-            agents.append(add(baseline, "train-baseline", options_of, seed, layout, ()))
-    evaluation = out / "evaluation"
-    everything = (*ensembles.values(), *agents)
-    cells.append(Cell("evaluate", ("evaluate", str(out), "--out", str(evaluation)), evaluation, everything))
-    cells.append(Cell("report", ("report", str(out)), out / "report", (evaluation,)))
-    return cells
-
-
-def _cell(stage: str, arguments: Sequence[str], out: Path, needs: tuple[Path, ...] = ()) -> Cell:
-    name = stage if stage == "collect" else f"{out.parent.name}-{out.name}" if "seed-" in out.name else out.name
-    return Cell(name, (stage, *arguments, "--out", str(out)), out, needs)
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:

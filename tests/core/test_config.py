@@ -1,5 +1,6 @@
 """Settings, presets and their errors (the command line's contract in the house rules)."""
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,9 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import hypogoal
 from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
 from hypogoal.core.errors import UserError
-from hypogoal.stages.run import CONFIGS, config_class_of
+from hypogoal.domains.base import defaults_of
+from hypogoal.stages.run import STAGES, config_class_of
+
+PRESETS = Path(hypogoal.__file__).parent / "presets"
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,17 @@ def test_precedence_is_set_over_option_over_preset_over_default(tmp_path: Path) 
         assignments=["steps=40"],
     )
     assert config == Example(steps=40, rate=2.0, kind="b", on=True, seeds=(1, 2))
+
+
+def test_a_domains_defaults_stand_between_the_presets_and_the_general_ones(tmp_path: Path) -> None:
+    """Preset > the domain's default > default; an unknown key of a domain is told like any other."""
+    preset = tmp_path / "own.toml"
+    preset.write_text("[example]\nsteps = 20\n")
+    config = resolve(Example, stage="example", preset=str(preset), defaults={"steps": 5, "rate": 3.0})
+    assert (config.steps, config.rate, config.kind) == (20, 3.0, "a")
+    with pytest.raises(UserError, match="no setting: rates"):
+        resolve(Example, stage="example", defaults={"rates": 3.0})
+    assert {row["name"]: row["default"] for row in describe(Example, {"steps": 5})}["steps"] == 5
 
 
 def test_texts_become_values() -> None:
@@ -77,12 +93,17 @@ def test_unknown_and_broken_presets(tmp_path: Path) -> None:
             resolve(Example, stage="example", preset=preset)
 
 
-@pytest.mark.parametrize("preset", ["demo", "paper"])
-@pytest.mark.parametrize("stage", ["collect", *CONFIGS])
-def test_the_presets_resolve_for_every_stage(stage: str, preset: str) -> None:
-    """Every key of a preset is a setting, with a value in range."""
-    config = resolve(config_class_of(stage), stage=stage, preset=preset)
-    assert from_values(type(config), as_dict(config), stage) == config
+@pytest.mark.parametrize(
+    ("experiment", "preset"), [(path.parent.name, path.stem) for path in sorted(PRESETS.glob("*/*.toml"))]
+)
+def test_the_presets_resolve_for_every_stage(experiment: str, preset: str) -> None:
+    """Every table of a preset is a stage, every key a setting, with a value in range."""
+    tables = tomllib.loads((PRESETS / experiment / f"{preset}.toml").read_text())
+    assert set(tables) <= set(STAGES)
+    for stage in STAGES:
+        config_class, defaults = config_class_of(stage, experiment), defaults_of(experiment, stage)
+        config = resolve(config_class, stage=stage, preset=preset, domain=experiment, defaults=defaults)
+        assert from_values(type(config), as_dict(config), stage) == config
 
 
 def test_the_paper_preset_has_the_papers_tables() -> None:
@@ -115,7 +136,7 @@ def test_the_paper_preset_has_the_papers_tables() -> None:
     assert collect.door_label == "in-front" and collect.regime == "fixed"
 
 
-@pytest.mark.parametrize("stage", ["collect", *CONFIGS])
+@pytest.mark.parametrize("stage", STAGES)
 def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> None:
     """'hypogoal config' says something of each setting."""
     config_class = config_class_of(stage)

@@ -1,0 +1,79 @@
+"""The command line: each command parses, calls one stage and prints the artefact's path as its last line.
+
+Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`` is quick.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Annotated
+
+import typer
+
+from hypogoal.cli import making, showing
+from hypogoal.cli.common import app
+from hypogoal.core.errors import NumericalError, UserError
+
+__all__ = ["app", "main", "making", "showing"]
+
+
+def _version(value: bool) -> None:
+    if value:
+        from hypogoal import __version__
+
+        typer.echo(f"hypogoal {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Stages: collect, train-ensemble, train-options, train-meta, evaluate, report; 'run' chains them."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
+    if arguments is None:
+        signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
+    given = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
+    try:
+        code = app(args=given, standalone_mode=False, prog_name="hypogoal")
+        return code if isinstance(code, int) else 0
+    except UserError as error:
+        if debug:
+            raise
+        return _fail(str(error), 2)
+    except NumericalError as error:
+        if debug:
+            raise
+        return _fail(f"training stopped: {error}", 1)
+    except KeyboardInterrupt:
+        return _fail("stopped; nothing was half-written", 130)
+    except Exception as error:
+        code = getattr(error, "exit_code", None)
+        if code is not None:
+            message = getattr(error, "format_message", lambda: "")()
+            return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(code)
+        if debug:
+            raise
+        return _fail(f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1)
+
+
+def _stop(signum: int, _frame: object) -> None:
+    raise KeyboardInterrupt(signum)
+
+
+def _fail(message: str, code: int) -> int:
+    typer.echo(f"hypogoal: {message}", err=True)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""What all commands share: the application, its options, and how outcomes are printed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import typer
+
+T = TypeVar("T")
+
+app = typer.Typer(
+    help="Transferable sub-goals by hypothesising which features generalise.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Out = Annotated[Path, typer.Option("--out", help="What to write; it must not exist yet.")]
+Preset = Annotated[str | None, typer.Option("--preset", help="demo, paper, or an own .toml file.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; see 'hypogoal config'."),
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything that is random.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace what stands at --out.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep a complete --out as it is; otherwise make it.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
+
+
+def resolve_for(
+    domain: str,
+    config_class: type[T],
+    stage: str,
+    preset: str | None,
+    assignments: Iterable[str] | None,
+    options: Mapping[str, Any] | None = None,
+) -> T:
+    """A stage's configuration with the presets and defaults of the domain it works on."""
+    from hypogoal.core.config import resolve
+    from hypogoal.domains.base import defaults_of
+
+    return resolve(
+        config_class,
+        stage=stage,
+        preset=preset,
+        options=options,
+        assignments=assignments or (),
+        domain=domain,
+        defaults=defaults_of(domain, stage),
+    )
+
+
+def domain_of(artefact: Path, kind: str) -> str:
+    """The domain of a data file (kind ``data``) or of an artefact."""
+    if kind == "data":
+        from hypogoal.dataset import open_dataset
+
+        return open_dataset(artefact).domain
+    from hypogoal.core.artefacts import open_artefact
+
+    return str(open_artefact(artefact, kind).config["domain"])
+
+
+def is_complete(out: Path, resume: bool) -> bool:
+    """Whether ``--resume`` was given and ``out`` is complete; then the stage has nothing to do."""
+    if not resume or not out.exists():
+        return False
+    if out.is_dir():
+        from hypogoal.core.artefacts import open_artefact
+
+        open_artefact(out)
+    else:
+        from hypogoal.dataset import open_dataset
+
+        open_dataset(out)
+    typer.echo(f"{out} is complete already", err=True)
+    typer.echo(out)
+    return True
+
+
+def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
+    if not quiet:
+        text = ", ".join(
+            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in numbers.items()
+        )
+        typer.echo(text)
+
+
+def print_table(table: Any) -> None:
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=100)
+    console.print(table)
+
+
+def echo(value: Any, as_json: bool, text: list[str]) -> None:
+    import json
+
+    if as_json:
+        typer.echo(json.dumps(value, indent=1))
+    else:
+        for line in text:
+            typer.echo(line)

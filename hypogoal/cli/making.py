@@ -1,0 +1,220 @@
+"""The commands that make something: one stage each, and ``run``, which chains them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hypogoal.cli.common import (
+    Device,
+    Force,
+    Out,
+    Preset,
+    Quiet,
+    Resume,
+    Seed,
+    Set,
+    app,
+    domain_of,
+    is_complete,
+    print_outcome,
+    print_table,
+    resolve_for,
+)
+
+
+@app.command()
+def collect(
+    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
+    out: Out,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Collect labelled, unlabelled and held-out states into an HDF5 file."""
+    from hypogoal.domains.base import load_domain
+    from hypogoal.stages.collect import collect as stage
+
+    if is_complete(out, resume):
+        return
+    found = load_domain(domain)
+    config: Any = resolve_for(domain, found.config_class, "collect", preset, set_)
+    counts = stage(found, config, out, seed=seed, force=force, quiet=quiet)
+    if not quiet:
+        for split in ("labelled", "heldout"):
+            for sub_goal, row in counts[split].items():
+                typer.echo(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
+        typer.echo(f"unlabelled                     {counts['unlabelled']:7d} states")
+    typer.echo(out)
+
+
+@app.command("train-ensemble")
+def train_ensemble(
+    data: Annotated[Path, typer.Argument(help="The HDF5 file that 'collect' wrote.")],
+    out: Out,
+    diversity: Annotated[str | None, typer.Option(help="dbat, divdis, none, or an own one.")] = None,
+    members: Annotated[int | None, typer.Option(help="Hypotheses per sub-goal (K).")] = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train an ensemble of diverse classifiers for each sub-goal."""
+    from hypogoal.stages.train_ensemble import TrainEnsembleConfig
+    from hypogoal.stages.train_ensemble import train_ensemble as stage
+
+    if is_complete(out, resume):
+        return
+    given = {"diversity": diversity, "members": members}
+    config = resolve_for(domain_of(data, "data"), TrainEnsembleConfig, "train-ensemble", preset, set_, given)
+    stage(data, config, out, seed=seed, force=force, quiet=quiet, device=device)
+    typer.echo(out)
+
+
+@app.command("train-options")
+def train_options(
+    ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
+    out: Out,
+    layout_seed: Annotated[int | None, typer.Option(min=0, help="The layout to learn on.")] = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Learn an option policy for every member, options chosen at random."""
+    from hypogoal.stages.train_options import TrainOptionsConfig
+    from hypogoal.stages.train_options import train_options as stage
+
+    if is_complete(out, resume):
+        return
+    given = {"layout_seed": layout_seed}
+    config = resolve_for(domain_of(ensemble, "ensemble"), TrainOptionsConfig, "train-options", preset, set_, given)
+    print_outcome(stage(ensemble, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    typer.echo(out)
+
+
+@app.command("train-meta")
+def train_meta(
+    ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
+    out: Out,
+    options: Annotated[Path | None, typer.Option(help="Continue the options of 'train-options'.")] = None,
+    layout_seed: Annotated[int | None, typer.Option(min=0, help="The layout to learn on.")] = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Learn which options to choose, by the environment's reward."""
+    from hypogoal.stages.train_meta import TrainMetaConfig
+    from hypogoal.stages.train_meta import train_meta as stage
+
+    if is_complete(out, resume):
+        return
+    given = {"layout_seed": layout_seed}
+    config = resolve_for(domain_of(ensemble, "ensemble"), TrainMetaConfig, "train-meta", preset, set_, given)
+    print_outcome(
+        stage(ensemble, config, out, options=options, seed=seed, force=force, quiet=quiet, device=device),
+        quiet,
+    )
+    typer.echo(out)
+
+
+@app.command("train-baseline")
+def train_baseline(
+    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
+    out: Out,
+    agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
+    layout_seed: Annotated[int | None, typer.Option(min=0, help="The layout to learn on.")] = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train PPO or DQN on the primitive actions, for comparison."""
+    from hypogoal.stages.train_baseline import BaselineConfig
+    from hypogoal.stages.train_baseline import train_baseline as stage
+
+    if is_complete(out, resume):
+        return
+    given = {"agent": agent, "layout_seed": layout_seed}
+    config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given)
+    print_outcome(stage(domain, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    typer.echo(out)
+
+
+@app.command()
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="A run: a folder with artefacts in it.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Default: RUN/evaluation.")] = None,
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compute every number of the report: accuracy, curves, controls, selection."""
+    from hypogoal.stages.evaluate import evaluate as stage
+    from hypogoal.stages.evaluate import summary_table
+
+    out = out or run / "evaluation"
+    if is_complete(out, resume):
+        return
+    metrics = stage(run, out, force=force, quiet=quiet)
+    if not quiet:
+        print_table(summary_table(metrics))
+    typer.echo(out)
+
+
+@app.command()
+def report(
+    run: Annotated[Path, typer.Argument(help="A run that was evaluated.")],
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Draw RUN/report/index.html: one file, readable offline."""
+    from hypogoal.stages.report import report as stage
+
+    typer.echo(stage(run, force=force))
+
+
+@app.command()
+def run(
+    experiment: Annotated[str, typer.Argument(help="doorkey or montezuma-ladders.")],
+    out: Out,
+    preset: Preset = None,
+    set_: Set = None,
+    force: Force = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, make the rest.")] = False,
+    quiet: Quiet = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the commands, run none.")] = False,
+) -> None:
+    """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
+    import json
+
+    from hypogoal.stages.evaluate import summary_table
+    from hypogoal.stages.run import plan
+    from hypogoal.stages.run import run as stage
+
+    planned = plan(experiment, out, preset=preset, assignments=set_ or ())
+    if dry_run:
+        for cell in planned.cells:
+            typer.echo(cell.text)
+        return
+    stage(planned, out, force=force, resume=resume, quiet=quiet)
+    print_table(summary_table(json.loads((out / "evaluation" / "metrics.json").read_text(encoding="utf-8"))))
+    typer.echo(out / "report" / "index.html")

@@ -1,0 +1,56 @@
+"""The commands that only look: ``show``, ``verify``, ``config``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hypogoal.cli.common import AsJson, app, echo
+
+
+@app.command()
+def show(
+    path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")], as_json: AsJson = False
+) -> None:
+    """What is this: kind, configuration, inputs, numbers."""
+    from hypogoal.inspection import describe_path, lines
+
+    about = describe_path(path)
+    echo(about, as_json, lines(about))
+
+
+@app.command()
+def verify(
+    path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")], as_json: AsJson = False
+) -> None:
+    """Check schema, hashes and readability; exit code 2 when something is wrong."""
+    from hypogoal.inspection import faults_of
+
+    faults = faults_of(path)
+    echo({"path": str(path), "faults": faults}, as_json, faults or [f"{path}: whole"])
+    if faults:
+        raise typer.Exit(2)
+
+
+@app.command()
+def config(
+    stage: Annotated[str, typer.Argument(help="For example train-meta.")],
+    domain: Annotated[str, typer.Option(help="Whose settings: doorkey, montezuma, or module:object.")] = "doorkey",
+    as_json: AsJson = False,
+) -> None:
+    """Every setting of a stage: default, unit, meaning, source."""
+    from hypogoal.core.config import describe
+    from hypogoal.domains.base import defaults_of
+    from hypogoal.stages.run import config_class_of
+
+    rows = describe(config_class_of(stage, domain), defaults_of(domain, stage))
+    if as_json:
+        echo(rows, True, [])
+        return
+    for row in rows:
+        default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple) else row["default"]
+        unit = f" {row['unit']}" if row["unit"] else ""
+        typer.echo(f"{row['name']} = {default}{unit}" + (f"   ({row['allowed']})" if row["allowed"] else ""))
+        typer.echo(f"    {row['meaning']}" + (f" [{row['source']}]" if row["source"] else ""))

@@ -1,0 +1,236 @@
+"""Montezuma's Revenge on the Arcade Learning Environment: RAM, pictures, and an agent put anywhere (Spec B4, B5).
+
+The raw emulator rather than Gymnasium's wrappers: states have to be saved, restored and written to, which the
+wrappers do not offer, and frames that nobody looks at need not be drawn. What is seen is theirs, pixel for pixel (a
+test compares them with ``AtariPreprocessing`` and ``FrameStackObservation``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+
+GAME = "montezuma_revenge"
+FRAME_SKIP = 4  # frames per agent step; what is seen is the brighter of the last two, pixel by pixel
+SIDE = 84
+STACK = 4  # agent steps in an observation
+OBSERVATION_SHAPE = (SIDE, SIDE, STACK)  # the oldest frame first
+SCREEN = (210, 160)
+N_ACTIONS = 18
+ROOMS = 24
+
+NOOP, FIRE, UP, RIGHT, LEFT, DOWN = range(6)
+
+# RAM, index = the console's address - 0x80. Found by watching the emulator while playing (tests do it again); room, x,
+# y and the inventory are also in the table of Anand et al. 2019, Unsupervised State Representation Learning in Atari.
+RAM = {
+    "room": 0x03,
+    "x": 0x2A,
+    "y": 0x2B,  # grows upwards, modulo 256
+    "pose": 0x35,  # 8 idle or falling, 18 walking, 10 on a ladder, 6 jumping, 22 dying
+    "dying": 0x37,  # counts down after a death; 0 alive
+    "lives": 0x3A,  # spare ones
+    "inventory": 0x41,  # bits: 01 hammer, 02-10 keys, 20 and 40 swords, 80 torch
+    "row": 0x50,  # of the pyramid, from the top
+    "jump": 0x56,  # 255 on the ground, 19..0 in a jump
+    "fall": 0x58,  # frames of free fall
+}
+TORCH = 0x80
+ON_LADDER = 10  # a pose
+FIRST_ROOM_OF_ROW = (0, 3, 8, 15)
+DARK_FROM = 15  # rooms from here on are dark without the torch
+RIGHT_EDGE, LEFT_EDGE, EDGE_Y = 146, 5, 235
+CROSSING_FRAMES = 40
+
+
+class Position(NamedTuple):
+    """Where the agent is, in the RAM's units."""
+
+    room: int
+    x: int
+    y: int
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A state of the emulator and the frames seen before it, which are no part of the emulator's own state."""
+
+    state: Any
+    stack: NDArray[np.uint8]
+
+
+def row_of(room: int) -> int:
+    """The pyramid's row (0 the top one) of a room 0..23."""
+    return max(row for row, first in enumerate(FIRST_ROOM_OF_ROW) if room >= first)
+
+
+def load_ale(seed: int) -> Any:
+    """A raw emulator with the game's ROM in it, deterministic, one frame per act.
+
+    Raises:
+        UserError: ale-py or OpenCV is not installed or broken, or it has no such ROM.
+    """
+    try:
+        import cv2  # noqa: F401
+        from ale_py import ALEInterface, LoggerMode
+        from ale_py.roms import get_rom_path
+    except ImportError as error:
+        raise UserError(
+            f"Montezuma's Revenge cannot be played ({error})", GAME, "pip install ale-py opencv-python-headless."
+        ) from None
+    rom = get_rom_path(GAME)
+    if rom is None or not rom.is_file():
+        raise UserError("the emulator has no ROM of the game", GAME, "Install ale-py 0.11 or newer: its wheel has it.")
+    ALEInterface.setLoggerMode(LoggerMode.Error)
+    ale = ALEInterface()
+    ale.setInt("random_seed", seed % 2**31)
+    ale.setFloat("repeat_action_probability", 0.0)
+    ale.setInt("frame_skip", 1)
+    ale.loadROM(rom)
+    return ale
+
+
+class Emulator:
+    """One game: agent steps of four frames, stacks of four steps, RAM, and the agent put anywhere.
+
+    Args:
+        seed: of the emulator; without sticky actions nothing depends on it.
+
+    Attributes:
+        stack: uint8 (84, 84, 4), the frames seen at the last four agent steps, the oldest first. Never written to
+            again: each step makes a new one.
+        screens: False, nothing is drawn and ``stack`` stays as it is: half the time, where only RAM is looked at.
+    """
+
+    def __init__(self, seed: int = 0):
+        import cv2
+
+        self.ale = load_ale(seed)
+        self.actions = list(self.ale.getLegalActionSet())
+        self.screens = True
+        self._resize, self._area = cv2.resize, cv2.INTER_AREA
+        self._last, self._before = np.zeros(SCREEN, np.uint8), np.zeros(SCREEN, np.uint8)
+        self._ram = np.zeros(128, np.uint8)
+        self.reset()
+        self._first_room = self._idle_first_room()
+        self._entered: dict[int, Any] = {}
+        self.reset()
+
+    def reset(self) -> NDArray[np.uint8]:
+        """A new game; the stack is four times its first frame."""
+        self.ale.reset_game()
+        self.ale.getScreenGrayscale(self._last)
+        self.stack = np.repeat(self._shrink(self._last)[:, :, None], STACK, axis=2)
+        return self.stack
+
+    def step(self, action: int) -> float:
+        """Spec B4: four frames of ``action`` (0..17), fewer where the game ends; the sum of their rewards."""
+        reward, act = 0.0, self.actions[action]
+        for frame in range(FRAME_SKIP):
+            reward += self.ale.act(act)
+            if self.screens and frame >= FRAME_SKIP - 2:
+                self.ale.getScreenGrayscale(self._before if frame == FRAME_SKIP - 2 else self._last)
+            if self.ale.game_over():
+                break
+        if self.screens:
+            seen = self._shrink(np.maximum(self._before, self._last))
+            self.stack = np.concatenate([self.stack[:, :, 1:], seen[:, :, None]], axis=2)
+        return reward
+
+    def _shrink(self, screen: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return self._resize(screen, (SIDE, SIDE), interpolation=self._area)
+
+    def frames(self, action: int, count: int) -> None:
+        """``count`` single frames of ``action``, undrawn: no agent step, the stack stays as it is."""
+        act = self.actions[action]
+        for _ in range(count):
+            self.ale.act(act)
+
+    def ram(self) -> NDArray[np.uint8]:
+        """The console's memory, uint8 (128,); overwritten by the next call."""
+        self.ale.getRAM(self._ram)
+        return self._ram
+
+    def read(self, name: str) -> int:
+        """One byte of ``RAM`` by name."""
+        return int(self.ram()[RAM[name]])
+
+    def write(self, name: str, value: int) -> None:
+        """Write one byte of ``RAM`` by name; the screen shows it from the next frame on."""
+        self.ale.setRAM(RAM[name], value)
+
+    def position(self) -> Position:
+        """Where the agent is."""
+        ram = self.ram()
+        return Position(int(ram[RAM["room"]]), int(ram[RAM["x"]]), int(ram[RAM["y"]]))
+
+    def alive(self) -> bool:
+        """Whether the agent is not dying."""
+        return self.read("dying") == 0 and not self.ale.game_over()
+
+    def screen_rgb(self) -> NDArray[np.uint8]:
+        """The console's picture, uint8 (210, 160, 3)."""
+        return self.ale.getScreenRGB()
+
+    def save(self) -> Snapshot:
+        """The state, to be restored exactly."""
+        return Snapshot(self.ale.cloneState(), self.stack)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Back to a state saved by this emulator or another."""
+        self.ale.restoreState(snapshot.state)
+        self.stack = snapshot.stack
+
+    def _idle_first_room(self) -> Any:
+        self.frames(NOOP, 60)
+        return self.ale.cloneState()
+
+    def place(self, room: int, x: int, y: int, *, phase: int = 2, settle: int = 4) -> Snapshot | None:
+        """Spec B5: the agent at (x, y) of a room, with the torch, its enemies ``phase`` frames old.
+
+        The room is entered through its side, as if the agent came from the neighbour: writing the room's number alone
+        draws half a room. Of places in the air the agent falls.
+
+        Args:
+            room, x, y: where, in the RAM's units.
+            phase: frames to wait before the agent is put at its place.
+            settle: agent steps to wait afterwards; four or more fill the stack with what the place looks like.
+
+        Returns:
+            The state; None where the agent did not live to see it, or left the room.
+        """
+        if room not in self._entered:
+            self._entered[room] = self._enter(room)
+        self.ale.restoreState(self._entered[room])
+        self.frames(NOOP, phase)
+        self.write("x", x)
+        self.write("y", y)
+        for _ in range(settle):
+            self.step(NOOP)
+        if not self.alive() or self.position().room != room:
+            return None
+        return self.save()
+
+    def _enter(self, room: int) -> Any:
+        if not 0 <= room < ROOMS:
+            raise UserError("no such room", room, f"Rooms are 0 to {ROOMS - 1}.")
+        for neighbour, x, action in ((room - 1, RIGHT_EDGE, RIGHT), (room + 1, LEFT_EDGE, LEFT)):
+            if not 0 <= neighbour < ROOMS:
+                continue
+            self.ale.restoreState(self._first_room)
+            self.write("row", row_of(room))
+            self.write("inventory", self.read("inventory") | TORCH)
+            self.write("room", neighbour)
+            self.write("x", x)
+            self.write("y", EDGE_Y)
+            for _ in range(CROSSING_FRAMES):
+                self.frames(action, 1)
+                if self.read("room") == room:
+                    self.frames(NOOP, 2 * FRAME_SKIP)  # the old room's picture, then a black one
+                    return self.ale.cloneState()
+        raise RuntimeError(f"room {room} could not be entered: has the ROM changed?")

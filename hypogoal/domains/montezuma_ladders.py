@@ -1,0 +1,151 @@
+"""The twelve ladders of Montezuma's Revenge: where they are, when one is climbed down, and how far it is (Spec B4, B5, F3).
+
+Positions are the RAM's (see ``montezuma_emulator``). They were read off the emulator while the agent climbed down; a
+test marked ``atari`` plays every descent again.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.domains.montezuma_emulator import FIRST_ROOM_OF_ROW, ROOMS, Position, row_of
+
+SUB_GOAL = "climb-down-ladder"
+REACH = 2  # at a base: this far from it at most, in x and in y
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """A ladder, from where the agent mounts it to where it gets off.
+
+    Attributes:
+        name: its rooms, or its place in room 1 (left, middle, right).
+        top, base: the positions.
+        steps_down: agent steps of DOWN from the top to the base.
+        runs_on: the base is the top of the next ladder; by Spec B5 such states get no label.
+    """
+
+    name: str
+    top: Position
+    base: Position
+    steps_down: int
+    runs_on: bool = False
+
+
+LADDERS = (
+    Ladder("1L", Position(1, 21, 192), Position(1, 21, 148), 9),
+    Ladder("1M", Position(1, 77, 235), Position(1, 76, 192), 8),
+    Ladder("1R", Position(1, 133, 192), Position(1, 133, 148), 9),
+    Ladder("0-4", Position(0, 77, 235), Position(4, 77, 235), 28, runs_on=True),
+    Ladder("2-6", Position(2, 77, 235), Position(6, 77, 235), 28),
+    Ladder("3-9", Position(3, 77, 235), Position(9, 77, 235), 28),
+    Ladder("4-10", Position(4, 77, 235), Position(10, 77, 235), 28),
+    Ladder("5-11", Position(5, 77, 157), Position(11, 77, 235), 9, runs_on=True),
+    Ladder("7-13", Position(7, 77, 235), Position(13, 77, 235), 28, runs_on=True),
+    Ladder("11-19", Position(11, 77, 235), Position(19, 77, 235), 28),
+    Ladder("13-21", Position(13, 77, 235), Position(21, 77, 235), 28),
+    Ladder("14-22", Position(14, 77, 160), Position(22, 77, 235), 10),
+)
+BY_NAME = {ladder.name: ladder for ladder in LADDERS}
+GROUPS: tuple[tuple[int, ...], ...] = ((1,), (2, 6), (0, 4, 10), (3, 9), (7, 13, 21), (5, 11, 19), (14, 22))
+LADDER_ROOMS = frozenset(room for group in GROUPS for room in group)
+
+# The rooms side by side and row upon row, in one plane. Each row begins half a step of the pyramid further left: the
+# room below room c of a row is c + 1 of the next.
+ROOM_WIDTH, ROOM_HEIGHT = 150, 122
+SHAFT_EXIT, SHAFT_ENTRY = 134, 255  # y where one leaves a room through its floor, and where one then is
+# Neighbours with a wall between them, tried at y 235. Doors that take a key count as open.
+WALLS = frozenset({(9, 10), (20, 21)})
+
+
+def ladder_named(name: str) -> Ladder:
+    """A ladder by its name.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    if name not in BY_NAME:
+        raise UserError("unknown ladder", name, f"Choose one of {', '.join(BY_NAME)}.")
+    return BY_NAME[name]
+
+
+def at_base(positions: NDArray[np.int64], *, runs_on: bool | None = None) -> NDArray[np.bool_]:
+    """Spec B4: whether positions (n, 3) of room, x, y are at the base of a ladder; whether alive is not looked at.
+
+    Args:
+        positions: int (n, 3).
+        runs_on: only ladders that do or do not run on through the floor; None for all twelve.
+    """
+    found = np.zeros(len(positions), dtype=np.bool_)
+    for ladder in LADDERS:
+        if runs_on is None or ladder.runs_on == runs_on:
+            away = np.abs(positions - np.array(ladder.base))
+            found |= (away[:, 0] == 0) & (away[:, 1:] <= REACH).all(1)
+    return found
+
+
+def plane(positions: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Positions (n, 3) as coordinates (n, 2) in one plane, x to the right, y upwards."""
+    row = np.searchsorted(FIRST_ROOM_OF_ROW, positions[:, 0], side="right") - 1
+    column = positions[:, 0] - np.array(FIRST_ROOM_OF_ROW)[row] - row
+    return np.stack([positions[:, 1] + ROOM_WIDTH * column, positions[:, 2] - ROOM_HEIGHT * row], axis=1)
+
+
+@cache
+def _regions() -> NDArray[np.int64]:
+    """Per room the number of its region: rooms that one walks between, side by side."""
+    region = [0]
+    for room in range(1, ROOMS):
+        together = row_of(room) == row_of(room - 1) and (room - 1, room) not in WALLS
+        region.append(region[-1] + (not together))
+    return np.array(region)
+
+
+@cache
+def _landmarks() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """All bases and both ends of each shaft between rooms: regions (m,), plane (m, 2), distance to a base (m,)."""
+    places = [ladder.base for ladder in LADDERS]
+    joined: dict[int, int] = {}
+    for ladder in LADDERS:
+        if ladder.top.room != ladder.base.room:
+            joined[len(places)] = len(places) + 1
+            joined[len(places) + 1] = len(places)
+            places.append(Position(ladder.top.room, ladder.top.x, SHAFT_EXIT))
+            places.append(Position(ladder.base.room, ladder.base.x, SHAFT_ENTRY))
+    positions = np.array(places)
+    region, at = _regions()[positions[:, 0]], plane(positions)
+    away = np.where(region[:, None] == region, np.abs(at[:, None] - at).sum(2), np.iinfo(np.int64).max)
+    distance = np.full(len(places), np.iinfo(np.int64).max)
+    distance[: len(LADDERS)] = 0
+    queue = [(0, place) for place in range(len(LADDERS))]
+    while queue:
+        so_far, place = heapq.heappop(queue)
+        if so_far > distance[place]:
+            continue
+        steps = [(int(away[place, other]), other) for other in np.flatnonzero(region == region[place])]
+        if place in joined:
+            steps.append((int(np.abs(at[place] - at[joined[place]]).sum()), joined[place]))
+        for step, other in steps:
+            if so_far + step < distance[other]:
+                distance[other] = so_far + step
+                heapq.heappush(queue, (so_far + step, int(other)))
+    return region, at, distance
+
+
+def distance_to_base(positions: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Spec F3: Manhattan distance from positions (n, 3) to the nearest base, on a way through the rooms; int (n,).
+
+    Within a row of the pyramid one goes sideways from room to room, except where ``WALLS`` stand, and up and down
+    freely; from row to row only through the nine ladders that join rooms. Platforms and walls inside a room are not
+    looked at, so that this is the least it can be. 0 at a base's own position.
+    """
+    region, at, onwards = _landmarks()
+    away = np.abs(plane(positions)[:, None] - at).sum(2) + onwards
+    same = _regions()[positions[:, 0]][:, None] == region
+    return np.where(same, away, np.iinfo(np.int64).max).min(1)

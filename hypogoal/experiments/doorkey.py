@@ -1,0 +1,81 @@
+"""Figure 6: agents on layouts of three-key DoorKey, with their controls and baselines (Spec E4, E6, E7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.config import setting
+from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
+
+DOMAIN = "doorkey"
+STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Which cells the experiment has."""
+
+    layout_seeds: tuple[int, ...] = setting((100,), "layouts, each with an agent of its own", source="Spec E4", low=0)
+    seeds: tuple[int, ...] = setting((0,), "run seeds, each with an ensemble of its own", low=0)
+    pretrain: bool = setting(True, "train-options before train-meta; false is the paper's D5")
+    controls: tuple[str, ...] = setting(
+        ("random", "oracle"), "controls beside the agent", source="Spec E6", choices=("random", "oracle")
+    )
+    baselines: tuple[str, ...] = setting(
+        ("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
+        "agents on the primitive actions",
+        source="Spec E7",
+        choices=("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
+    )
+    workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
+
+
+def cells(
+    out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
+) -> list[Cell]:
+    """The cells of a run.
+
+    Args:
+        out: the run's folder.
+        config: which cells.
+        resolved: by stage, its configuration.
+        common: by stage, the arguments that brought that configuration about.
+    """
+    single = len(config.layout_seeds) * len(config.seeds) == 1
+    data = out / "data.h5"
+    planned = [stage_cell(data, out, ("collect", DOMAIN, *common["collect"]))]
+    spent = resolved["train-options"].steps if config.pretrain else 0
+    budget = str(spent + resolved["train-meta"].steps)
+    agents: list[Path] = []
+
+    def add(name: str, arguments: Sequence[str], seed: int, layout: int | None, needs: tuple[Path, ...]) -> Path:
+        place = name if single else f"{name}/seed-{seed}" if layout is None else f"{name}/layout-{layout}-seed-{seed}"
+        at = ("--seed", str(seed), *(("--layout-seed", str(layout)) if layout is not None else ()))
+        stage = arguments[0]
+        planned.append(stage_cell(out / place, out, (*arguments, *common[stage], *at), needs))
+        return out / place
+
+    ensembles = {seed: add("ensemble", ("train-ensemble", str(data)), seed, None, (data,)) for seed in config.seeds}
+    cases = [(layout, seed) for layout in config.layout_seeds for seed in config.seeds]
+    for layout, seed in cases:
+        source = ensembles[seed]
+        extra: tuple[str, ...] = ()
+        needs: tuple[Path, ...] = (source,)
+        if config.pretrain:
+            options = add("options", ("train-options", str(source)), seed, layout, (source,))
+            extra, needs = ("--options", str(options)), (source, options)
+        agents.append(add("meta", ("train-meta", str(source), *extra), seed, layout, needs))
+    for control in config.controls:
+        change = "chooser=random" if control == "random" else "termination=oracle"
+        for layout, seed in cases:
+            arguments = ("train-meta", str(ensembles[seed]), "--set", change, "--set", f"steps={budget}")
+            agents.append(add(f"meta-{control}", arguments, seed, layout, (ensembles[seed],)))
+    for baseline in config.baselines:
+        agent, _, kind = baseline.partition("-")
+        for layout, seed in cases:
+            changes = ("--set", f"setting={kind}", "--set", f"steps={budget}")
+            agents.append(add(baseline, ("train-baseline", DOMAIN, "--agent", agent, *changes), seed, layout, ()))
+    return planned + closing_cells(out, (*ensembles.values(), *agents))

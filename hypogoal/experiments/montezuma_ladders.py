@@ -1,0 +1,78 @@
+"""Figures 3, 4 and 5: sub-goals and options on the ladders of Montezuma's Revenge (Spec B5, D4, F1, F3, F4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.config import setting
+from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
+
+DOMAIN = "montezuma"
+STAGES = ("collect", "train-ensemble", "train-options")
+METHODS: dict[str, tuple[str, ...]] = {
+    "dbat": ("--diversity", "dbat"),
+    "none": ("--diversity", "none"),
+    "cnn": ("--diversity", "none", "--members", "1"),
+}
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Which cells the experiment has."""
+
+    groups: tuple[int, ...] = setting((1, 2, 3, 7), "labelled ladder groups (N)", source="Spec B5", low=1, high=7)
+    seeds: tuple[int, ...] = setting((0,), "run seeds, each with ensembles of its own", low=0)
+    methods: tuple[str, ...] = setting(
+        tuple(METHODS),
+        "ensembles: D-BAT, the same without diversity, a single CNN",
+        source="Spec F1",
+        choices=METHODS,
+    )
+    ladders: tuple[str, ...] = setting((), "ladders to learn options on; empty for none", source="Spec D4")
+    option_groups: tuple[int, ...] = setting(
+        (2,), "the N whose ensembles get options; they must be among 'groups'", low=1, high=7
+    )
+    option_methods: tuple[str, ...] = setting(
+        tuple(METHODS), "the ensembles that get options; they must be among 'methods'", choices=METHODS
+    )
+    oracle: bool = setting(True, "options that end at the true sub-goal beside them, on each ladder", source="Spec E6")
+    workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
+
+
+def cells(
+    out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
+) -> list[Cell]:
+    """The cells of a run; arguments as of ``experiments.doorkey.cells``."""
+    planned: list[Cell] = []
+    made: list[Path] = []
+
+    def add(place: str, arguments: tuple[str, ...], needs: tuple[Path, ...] = ()) -> Path:
+        planned.append(stage_cell(out / place, out, (*arguments, *common[arguments[0]]), needs))
+        return out / place
+
+    for groups in config.groups:
+        data = add(f"data/groups-{groups}.h5", ("collect", DOMAIN, "--set", f"groups={groups}"))
+        for method in config.methods:
+            for seed in config.seeds:
+                place = f"ensemble/{method}/groups-{groups}-seed-{seed}"
+                arguments = ("train-ensemble", str(data), *METHODS[method], "--seed", str(seed))
+                made.append(add(place, arguments, (data,)))
+    for ladder in config.ladders:
+        for seed in config.seeds:
+            for groups in config.option_groups:
+                for method in config.option_methods:
+                    source = out / f"ensemble/{method}/groups-{groups}-seed-{seed}"
+                    place = f"options/{method}/groups-{groups}-ladder-{ladder}-seed-{seed}"
+                    arguments = ("train-options", str(source), "--set", f"start={ladder}", "--seed", str(seed))
+                    made.append(add(place, arguments, (source,)))
+            if config.oracle and config.option_groups and config.option_methods:
+                first = f"{config.option_methods[0]}/groups-{config.option_groups[0]}-seed-{seed}"
+                source = out / f"ensemble/{first}"
+                changes = ("--set", f"start={ladder}", "--set", "termination=oracle")
+                place = f"options/oracle/ladder-{ladder}-seed-{seed}"
+                arguments = ("train-options", str(source), *changes, "--seed", str(seed))
+                made.append(add(place, arguments, (source,)))
+    return planned + closing_cells(out, made)
