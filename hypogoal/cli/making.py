@@ -201,7 +201,7 @@ def run(
     force: Force = False,
     resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, make the rest.")] = False,
     quiet: Quiet = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the commands, run none.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")] = False,
 ) -> None:
     """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
     import json
@@ -214,6 +214,7 @@ def run(
     if dry_run:
         for cell in planned.cells:
             typer.echo(cell.text)
+        typer.echo(planned.cost(), err=True)
         return
     stage(planned, out, force=force, resume=resume, quiet=quiet)
     print_table(summary_table(json.loads((out / "evaluation" / "metrics.json").read_text(encoding="utf-8"))))

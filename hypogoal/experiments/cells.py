@@ -19,12 +19,14 @@ class Cell:
         arguments: of ``hypogoal``, without ``--force``.
         out: what it writes.
         needs: outputs of other cells that must be complete first.
+        seconds: what it costs, on one core like that of docs/performance.md; 0 where that is not known.
     """
 
     name: str
     arguments: tuple[str, ...]
     out: Path
     needs: tuple[Path, ...] = ()
+    seconds: float = 0.0
 
     @property
     def text(self) -> str:
@@ -43,17 +45,34 @@ class Plan:
     cells: list[Cell]
     workers: int
 
+    def cost(self, cells: Sequence[Cell] | None = None) -> str:
+        """How many of the plan's cells (all, or those given) there are to run, and for how long."""
+        some = self.cells if cells is None else cells
+        seconds = sum(cell.seconds for cell in some)
+        longest = max((cell.seconds for cell in some), default=0.0)
+        wall = max(seconds / self.workers, longest)
+        time = f"about {_duration(seconds)} of one core, {_duration(wall)} with {self.workers} at once"
+        return f"{len(some)} commands, {time} (rates of a 2.5 GHz core, docs/performance.md)"
 
-def stage_cell(out: Path, run: Path, arguments: Sequence[str], needs: Sequence[Path] = ()) -> Cell:
+
+def _duration(seconds: float) -> str:
+    if seconds < 90 * 60:
+        return f"{max(1, round(seconds / 60))} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} days"
+
+
+def stage_cell(
+    out: Path, run: Path, arguments: Sequence[str], needs: Sequence[Path] = (), seconds: float = 0.0
+) -> Cell:
     """The cell of a stage that writes ``out`` within the run's folder; its name is its place there."""
     name = out.relative_to(run).with_suffix("").as_posix().replace("/", "-")
-    return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs))
+    return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), seconds)
 
 
-def closing_cells(run: Path, needs: Sequence[Path]) -> list[Cell]:
-    """Evaluate and report, when everything else is there."""
+def closing_cells(run: Path, needs: Sequence[Path], seconds: float = 0.0) -> list[Cell]:
+    """Evaluate (which takes ``seconds``) and report, when everything else is there."""
     evaluation = run / "evaluation"
     return [
-        Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs)),
+        Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs), seconds),
         Cell("report", ("report", str(run)), run / "report", (evaluation,)),
     ]

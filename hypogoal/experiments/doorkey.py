@@ -13,6 +13,13 @@ from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
 DOMAIN = "doorkey"
 STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
 
+# What things cost on one core of the machine of docs/performance.md: seconds per environment step, per gradient step of
+# a member (all five sub-goals), per ensemble that is evaluated.
+PER_STEP = {"light": 1e-3, "paper": 65e-3}
+PER_BASELINE_STEP = {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45e-3, "dqn-tuned": 0.3e-3}
+PER_MEMBER_STEP = 0.2
+PER_EVALUATION = 20.0
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -47,35 +54,47 @@ def cells(
     single = len(config.layout_seeds) * len(config.seeds) == 1
     data = out / "data.h5"
     planned = [stage_cell(data, out, ("collect", DOMAIN, *common["collect"]))]
+    ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
     spent = resolved["train-options"].steps if config.pretrain else 0
-    budget = str(spent + resolved["train-meta"].steps)
+    steps = spent + play.steps
+    budget = str(steps)
     agents: list[Path] = []
 
-    def add(name: str, arguments: Sequence[str], seed: int, layout: int | None, needs: tuple[Path, ...]) -> Path:
+    def add(
+        name: str, arguments: Sequence[str], seed: int, layout: int | None, needs: tuple[Path, ...], seconds: float
+    ) -> Path:
         place = name if single else f"{name}/seed-{seed}" if layout is None else f"{name}/layout-{layout}-seed-{seed}"
         at = ("--seed", str(seed), *(("--layout-seed", str(layout)) if layout is not None else ()))
         stage = arguments[0]
-        planned.append(stage_cell(out / place, out, (*arguments, *common[stage], *at), needs))
+        planned.append(stage_cell(out / place, out, (*arguments, *common[stage], *at), needs, seconds))
         return out / place
 
-    ensembles = {seed: add("ensemble", ("train-ensemble", str(data)), seed, None, (data,)) for seed in config.seeds}
+    training = PER_MEMBER_STEP * ensemble.members * ensemble.steps
+    ensembles = {
+        seed: add("ensemble", ("train-ensemble", str(data)), seed, None, (data,), training) for seed in config.seeds
+    }
     cases = [(layout, seed) for layout in config.layout_seeds for seed in config.seeds]
     for layout, seed in cases:
         source = ensembles[seed]
         extra: tuple[str, ...] = ()
         needs: tuple[Path, ...] = (source,)
         if config.pretrain:
-            options = add("options", ("train-options", str(source)), seed, layout, (source,))
+            options = add(
+                "options", ("train-options", str(source)), seed, layout, (source,), spent * PER_STEP[play.network]
+            )
             extra, needs = ("--options", str(options)), (source, options)
-        agents.append(add("meta", ("train-meta", str(source), *extra), seed, layout, needs))
+        costs = play.steps * PER_STEP[play.network]
+        agents.append(add("meta", ("train-meta", str(source), *extra), seed, layout, needs, costs))
     for control in config.controls:
         change = "chooser=random" if control == "random" else "termination=oracle"
         for layout, seed in cases:
             arguments = ("train-meta", str(ensembles[seed]), "--set", change, "--set", f"steps={budget}")
-            agents.append(add(f"meta-{control}", arguments, seed, layout, (ensembles[seed],)))
+            costs = steps * PER_STEP[play.network]
+            agents.append(add(f"meta-{control}", arguments, seed, layout, (ensembles[seed],), costs))
     for baseline in config.baselines:
         agent, _, kind = baseline.partition("-")
         for layout, seed in cases:
-            changes = ("--set", f"setting={kind}", "--set", f"steps={budget}")
-            agents.append(add(baseline, ("train-baseline", DOMAIN, "--agent", agent, *changes), seed, layout, ()))
-    return planned + closing_cells(out, (*ensembles.values(), *agents))
+            arguments = ("train-baseline", DOMAIN, "--agent", agent, "--set", f"setting={kind}")
+            costs = steps * PER_BASELINE_STEP[baseline]
+            agents.append(add(baseline, (*arguments, "--set", f"steps={budget}"), seed, layout, (), costs))
+    return planned + closing_cells(out, (*ensembles.values(), *agents), PER_EVALUATION * len(ensembles))

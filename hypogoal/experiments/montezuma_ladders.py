@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
+from hypogoal.domains.montezuma_ladders import ladder_named
 from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
 
 DOMAIN = "montezuma"
@@ -42,10 +44,30 @@ class RunConfig:
     workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
 
 
+def _check(config: RunConfig) -> None:
+    for ladder in config.ladders:
+        ladder_named(ladder)
+    if not config.ladders:
+        return
+    for name, wanted, there in (
+        ("option_groups", config.option_groups, config.groups),
+        ("option_methods", config.option_methods, config.methods),
+    ):
+        if not set(wanted) <= set(there):  # type: ignore[arg-type]
+            missing = ",".join(str(item) for item in wanted if item not in there)
+            whole = name.removeprefix("option_")
+            raise UserError(f"no ensembles of {missing} to learn options for", name, f"Add it to {whole}.")
+
+
 def cells(
     out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
 ) -> list[Cell]:
-    """The cells of a run; arguments as of ``experiments.doorkey.cells``."""
+    """The cells of a run; arguments as of ``experiments.doorkey.cells``.
+
+    Raises:
+        UserError: an unknown ladder, or options of ensembles that the run does not have.
+    """
+    _check(config)
     planned: list[Cell] = []
     made: list[Path] = []
 

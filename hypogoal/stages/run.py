@@ -111,6 +111,7 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
     cells, workers = planned.cells, planned.workers
     waiting = [cell for cell in cells if not (resume and cell.complete())]
     made = {cell.out for cell in cells if cell not in waiting}
+    _say(planned.cost(waiting), quiet)
     running: dict[Cell, tuple[subprocess.Popen[bytes], float]] = {}
     begun = told = time.monotonic()
     total = len(cells)

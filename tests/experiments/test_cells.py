@@ -1,0 +1,68 @@
+"""Experiments as data (Spec A6, G4): what their cells are, in which order they can run, and what they cost."""
+
+from pathlib import Path
+
+import pytest
+
+from hypogoal.core.errors import UserError
+from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.stages.run import EXPERIMENTS, plan
+
+OUT = Path("somewhere")
+
+
+@pytest.mark.parametrize(
+    ("experiment", "changes"),
+    [
+        ("doorkey", ["layout_seeds=100,101", "seeds=0,1"]),
+        ("doorkey", ["pretrain=false"]),
+        ("montezuma-ladders", ["ladders=1L,2-6", "seeds=0,1"]),
+    ],
+)
+def test_every_cell_needs_only_what_cells_before_it_write(experiment: str, changes: list[str]) -> None:
+    """Spec A6: an order in which they can run; no two write the same place; evaluate waits for all, report for it."""
+    cells = plan(experiment, OUT, assignments=changes).cells
+    made: set[Path] = set()
+    for cell in cells:
+        assert set(cell.needs) <= made
+        assert cell.out not in made
+        made.add(cell.out)
+    *others, evaluation, report = cells
+    needed = {need for cell in others for need in cell.needs} | set(evaluation.needs)
+    assert needed == {cell.out for cell in others} and report.needs == (evaluation.out,)
+    assert len({cell.name for cell in cells}) == len(cells)
+    assert {cell.arguments[0] for cell in others} <= set(EXPERIMENTS[experiment].STAGES)
+
+
+def test_the_ladders_experiment_has_every_method_group_and_control() -> None:
+    """Spec F1, F3, D4: methods x N x seeds of ensembles; options for each ladder, and the oracle beside them."""
+    changes = ["groups=1,2", "ladders=1L,2-6", "seeds=0,1,2", "option_groups=2", "methods=dbat,cnn"]
+    cells = plan("montezuma-ladders", OUT, assignments=[*changes, "option_methods=dbat"]).cells
+    stages = [cell.arguments[0] for cell in cells]
+    assert stages.count("collect") == 2 and stages.count("train-ensemble") == 2 * 2 * 3
+    options = [cell for cell in cells if cell.arguments[0] == "train-options"]
+    assert sum("termination=oracle" in cell.arguments for cell in options) == 2 * 3
+    assert len(options) == 2 * 3 * 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (["option_groups=3", "groups=1,2", "ladders=1L"], "option_groups"),
+        (["option_methods=none", "methods=dbat", "ladders=1L"], "option_methods"),
+        (["ladders=1X"], "unknown ladder"),
+        (["train-meta.steps=3"], "no such stage"),
+    ],
+)
+def test_a_ladders_experiment_that_cannot_be_is_told_in_one_line(changes: list[str], words: str) -> None:
+    """Options of ensembles that are not there, ladders that do not exist."""
+    with pytest.raises(UserError, match=words):
+        plan("montezuma-ladders", OUT, assignments=changes)
+
+
+def test_the_cost_is_that_of_the_cells_given_shared_among_the_workers() -> None:
+    """Two workers halve it, but never below the longest cell."""
+    cells = [Cell(str(n), (), OUT / str(n), (), seconds) for n, seconds in enumerate((3600.0, 3600.0, 7200.0))]
+    assert Plan(cells, 2).cost().startswith("3 commands, about 4.0 h of one core, 2.0 h with 2 at once")
+    assert Plan(cells, 4).cost().startswith("3 commands, about 4.0 h of one core, 2.0 h with 4 at once")
+    assert Plan(cells, 2).cost(cells[:1]).startswith("1 commands, about 60 min of one core, 60 min")
