@@ -32,3 +32,9 @@ class MetaConfig:
     clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0)
     entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
     value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0)
+    advantage_floor: float = setting(
+        0.1,
+        "advantages are divided by their standard deviation, but by no less than this",
+        source="ours: docs/decisions.md; paper: 0",
+        low=0.0,
+    )

@@ -131,7 +131,7 @@ class MetaPolicy:
         drawn = torch.from_numpy(np.stack([decision.drawn for decision in flat]))
         old = torch.tensor([decision.log_prob for decision in flat])
         goal = torch.from_numpy(advantages + values).float()
-        scaled = torch.from_numpy((advantages - advantages.mean()) / (advantages.std() + 1e-8)).float()
+        scaled = torch.from_numpy(scaled_advantages(advantages, config.advantage_floor)).float()
         entropy_seen = 0.0
         for _ in range(config.epochs):
             order = self.rng.permutation(len(flat))
@@ -171,6 +171,15 @@ class MetaPolicy:
             module.load_state_dict(
                 {name[len(part) + 1 :]: value for name, value in state.items() if name.startswith(f"{part}.")}
             )
+
+
+def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
+    """Advantages (n,) less their mean, in units of their standard deviation, or of ``floor`` where that is larger.
+
+    Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts until it
+    is sure of something arbitrary.
+    """
+    return (advantages - advantages.mean()) / max(float(advantages.std()), floor, 1e-8)
 
 
 def clipped_surrogate(log_prob: Tensor, old: Tensor, advantages: Tensor, clip: float) -> Tensor:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork
-from hypogoal.meta.ppo import clipped_surrogate
+from hypogoal.meta.ppo import clipped_surrogate, scaled_advantages
 from hypogoal.meta.smdp import smdp_advantages
 
 
@@ -53,6 +53,16 @@ def test_lambda_one_is_the_discounted_return_minus_the_value() -> None:
     for t in reversed(range(6)):
         total = returns[t] + discounts[t] * total
         assert advantages[t] == pytest.approx(total - values[t])
+
+
+def test_the_advantages_scale_by_hand() -> None:
+    """Spec E1: a floor above their spread keeps noise small; below it, and without one, they are standardised."""
+    noise = np.array([0.001, -0.003, 0.002])
+    np.testing.assert_allclose(scaled_advantages(noise, 0.1), noise * 10)
+    signal = np.array([1.0, 3.0])
+    np.testing.assert_allclose(scaled_advantages(signal, 0.1), [-1.0, 1.0])
+    np.testing.assert_allclose(scaled_advantages(signal, 0.0), [-1.0, 1.0])
+    np.testing.assert_allclose(scaled_advantages(np.full(3, 7.0), 0.0), np.zeros(3))
 
 
 def test_the_clipped_surrogate_by_hand() -> None:
