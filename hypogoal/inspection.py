@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST, check_files, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import SPLITS, open_dataset
+from hypogoal.domains.base import load_domain
 
 
 def describe_path(path: Path) -> dict[str, Any]:
@@ -46,6 +48,55 @@ def lines(about: dict[str, Any]) -> list[str]:
         else:
             text.append(f"{key}: {value}")
     return text
+
+
+def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
+    """Pictures of a data file's labelled and held-out states, for each room and label one, to check labels by eye.
+
+    Args:
+        path: the data file.
+        folder: where ``labelled/room-01-positives.png`` and so on are written; by sub-goal too where there are several.
+
+    Returns:
+        The pictures written.
+
+    Raises:
+        UserError: not a data file, its states are no pictures, or the folder cannot be written to.
+    """
+    from PIL import Image
+
+    from hypogoal.evaluation.contact_sheet import contact_sheets
+
+    if not path.is_file():
+        raise UserError("contact sheets are of data files", path, "Give the .h5 file that 'hypogoal collect' wrote.")
+    dataset = open_dataset(path)
+    if len(dataset.observation_shape) != 3:
+        raise UserError("the states are no pictures", f"observation shape {dataset.observation_shape}")
+    kinds = kinds_of(dataset.domain)
+    written = []
+    for split in SPLITS:
+        for sub_goal in dataset.sub_goals:
+            place = folder / split / (sub_goal if len(dataset.sub_goals) > 1 else "")
+            for name, sheet in contact_sheets(getattr(dataset, split)(sub_goal), kinds).items():
+                file = place / f"{name}.png"
+                try:
+                    place.mkdir(parents=True, exist_ok=True)
+                    Image.fromarray(sheet).save(file)
+                except OSError as error:
+                    reason = error.strerror or str(error)
+                    raise UserError(
+                        f"the picture cannot be written ({reason})", file, "Choose another folder."
+                    ) from None
+                written.append(file)
+    return written
+
+
+def kinds_of(domain: str) -> Sequence[str]:
+    """What the values of the origin ``kind`` mean in a domain; nothing where it is not installed or has no kinds."""
+    try:
+        return getattr(load_domain(domain), "kinds", ())
+    except UserError:
+        return ()
 
 
 def faults_of(path: Path) -> list[str]:

@@ -12,13 +12,20 @@ from hypogoal.cli.common import AsJson, app, echo
 
 @app.command()
 def show(
-    path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")], as_json: AsJson = False
+    path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")],
+    as_json: AsJson = False,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Of a data file: draw its states with their labels into this folder.")
+    ] = None,
 ) -> None:
     """What is this: kind, configuration, inputs, numbers."""
-    from hypogoal.inspection import describe_path, lines
+    from hypogoal.inspection import describe_path, lines, write_contact_sheets
 
     about = describe_path(path)
     echo(about, as_json, lines(about))
+    if pictures is not None:
+        for sheet in write_contact_sheets(path, pictures):
+            typer.echo(sheet)
 
 
 @app.command()

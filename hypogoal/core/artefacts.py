@@ -32,6 +32,8 @@ PACKAGES = (
     "gymnasium",
     "minigrid",
     "ale-py",
+    "opencv-python-headless",
+    "captum",
     "h5py",
     "safetensors",
     "stable-baselines3",

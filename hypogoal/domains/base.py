@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import Collected
 
-BUILT_IN = {"doorkey": "hypogoal.domains.doorkey:DOMAIN"}
+BUILT_IN = {
+    "doorkey": "hypogoal.domains.doorkey:DOMAIN",
+    "montezuma": "hypogoal.domains.montezuma:DOMAIN",
+}
 ENTRY_POINTS = "hypogoal.domains"
 
 
@@ -62,7 +65,14 @@ class Engine(Protocol):
 
 @runtime_checkable
 class Domain(Protocol):
-    """What hypogoal needs to know of a domain."""
+    """What hypogoal needs to know of a domain.
+
+    It may also have ``starts`` (names of places where episodes begin, one of which ``make_engine`` takes as ``start``),
+    ``distance`` (positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
+    sub-goal holds), ``picture`` (room -> uint8 (height, width, 3)) and ``pixel`` (positions -> column and row in that
+    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``)
+    and ``defaults`` (see ``defaults_of``).
+    """
 
     name: str
     sub_goals: tuple[str, ...]

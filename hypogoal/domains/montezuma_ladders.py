@@ -1,4 +1,4 @@
-"""The twelve ladders of Montezuma's Revenge: where they are, when one is climbed down, and how far it is (Spec B4, B5, F3).
+"""The ladders of Montezuma's Revenge: where they are, when one is climbed down, and how far it is (Spec B4, B5, F3).
 
 Positions are the RAM's (see ``montezuma_emulator``). They were read off the emulator while the agent climbed down; a
 test marked ``atari`` plays every descent again.
@@ -58,8 +58,8 @@ LADDER_ROOMS = frozenset(room for group in GROUPS for room in group)
 
 # The rooms side by side and row upon row, in one plane. Each row begins half a step of the pyramid further left: the
 # room below room c of a row is c + 1 of the next.
-ROOM_WIDTH, ROOM_HEIGHT = 150, 122
-SHAFT_EXIT, SHAFT_ENTRY = 134, 255  # y where one leaves a room through its floor, and where one then is
+ROOM_WIDTH, ROOM_HEIGHT = 149, 121  # so that crossing, x 149 to 1, y 134 to 254, is one unit
+SHAFT_EXIT, SHAFT_ENTRY = 134, 254  # y where one leaves a room through its floor, and where one then is
 # Neighbours with a wall between them, tried at y 235. Doors that take a key count as open.
 WALLS = frozenset({(9, 10), (20, 21)})
 
@@ -82,12 +82,9 @@ def at_base(positions: NDArray[np.int64], *, runs_on: bool | None = None) -> NDA
         positions: int (n, 3).
         runs_on: only ladders that do or do not run on through the floor; None for all twelve.
     """
-    found = np.zeros(len(positions), dtype=np.bool_)
-    for ladder in LADDERS:
-        if runs_on is None or ladder.runs_on == runs_on:
-            away = np.abs(positions - np.array(ladder.base))
-            found |= (away[:, 0] == 0) & (away[:, 1:] <= REACH).all(1)
-    return found
+    bases = np.array([ladder.base for ladder in LADDERS if runs_on is None or ladder.runs_on == runs_on])
+    away = np.abs(positions[:, None] - bases)
+    return ((away[..., 0] == 0) & (away[..., 1:] <= REACH).all(-1)).any(1)
 
 
 def plane(positions: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -128,13 +125,13 @@ def _landmarks() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64
         so_far, place = heapq.heappop(queue)
         if so_far > distance[place]:
             continue
-        steps = [(int(away[place, other]), other) for other in np.flatnonzero(region == region[place])]
+        steps = [(int(away[place, other]), int(other)) for other in np.flatnonzero(region == region[place])]
         if place in joined:
             steps.append((int(np.abs(at[place] - at[joined[place]]).sum()), joined[place]))
         for step, other in steps:
             if so_far + step < distance[other]:
                 distance[other] = so_far + step
-                heapq.heappush(queue, (so_far + step, int(other)))
+                heapq.heappush(queue, (so_far + step, other))
     return region, at, distance
 
 

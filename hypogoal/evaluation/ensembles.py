@@ -87,11 +87,14 @@ def _pairs(unlabelled: NDArray[np.bool_], heldout: NDArray[np.bool_]) -> list[di
 
 
 def ensemble_name(config: Mapping[str, Any]) -> str:
-    """How an ensemble is called in tables: its objective and its number of members."""
-    if config["members"] == 1:
-        return "single CNN"
+    """How an ensemble is called in tables: its objective and its number of members.
+
+    One that is told where the agent is, which no observation says, is called what it is: an oracle.
+    """
     objective = "no diversity" if config["diversity"] == "none" else config["diversity"]
-    return f"{objective}, K={config['members']}"
+    name = "single CNN" if config["members"] == 1 else f"{objective}, K={config['members']}"
+    told = config.get("view") == "agent-crop" and config.get("localiser") == "ram"
+    return f"{name}, position oracle" if told else name
 
 
 def ensemble_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -112,11 +115,14 @@ def hypotheses_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, A
     """Spec F1: per kind of ensemble and sub-goal: best, mean and worst member's balanced accuracy, over seeds.
 
     Args:
-        ensembles: what was computed of each, with ``name`` and ``sub_goals`` (see :func:`sub_goal_metrics`).
+        ensembles: what was computed of each, with ``name`` and ``sub_goals`` (see :func:`sub_goal_metrics`). Those
+            judged room by room are left out: their table is ``rooms.rooms_table``.
     """
     cells: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for ensemble in ensembles:
         for row in ensemble["sub_goals"]:
+            if "rooms" in row:
+                continue
             cells.setdefault((ensemble["name"], row["sub_goal"]), []).append(row)
     table = []
     for (name, sub_goal), rows in cells.items():

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
+import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -50,7 +51,8 @@ STYLE: dict[str, Any] = {
 }
 
 
-def _style(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None]:
+def styled(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None]:
+    """What all figures have in common, and ``more`` of matplotlib's settings, for the time of a ``with``."""
     settings: Any = {**STYLE, **(more or {})}
     return matplotlib.rc_context(settings)
 
@@ -81,7 +83,7 @@ def learning_curves(
         references: horizontal lines with their names.
         bounds: of the y axis.
     """
-    with _style():
+    with styled():
         rows = -(-(len(lines) + len(references)) // 2)
         figure = Figure(figsize=(WIDTH, 3.1 + 0.22 * rows), layout="constrained")
         axes = figure.subplots()
@@ -118,7 +120,7 @@ def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str,
         sub_goals: G names.
         kinds: (name, float (G, 3)) with each sub-goal's best, mean and worst member, mean over seeds.
     """
-    with _style():
+    with styled():
         step = 0.8 / max(1, len(kinds))
         height = 1.2 + len(sub_goals) * max(0.42, 0.2 * len(kinds)) + 0.25 * -(-len(kinds) // 3)
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
@@ -155,7 +157,7 @@ def preference_against_match(
         preference: float (R, G, K), chosen / expected under uniform choice.
         control: the same two arrays, flat, of the random chooser.
     """
-    with _style():
+    with styled():
         figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
         axes = figure.subplots()
         if control is not None:
@@ -186,10 +188,11 @@ def to_svg(figure: Figure, name: str) -> str:
         name: makes the ids inside unique among several on one page.
     """
     buffer = io.StringIO()
-    with _style({"svg.hashsalt": name}):
+    with styled({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
+    text = re.sub(r' id="image[0-9a-f]+"', "", text)  # a hash of the picture: the same where it is drawn twice
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'((?:xlink:)?href)="#', rf'\1="#{name}-', text)
     return re.sub(r"url\(#", f"url(#{name}-", text)
@@ -198,9 +201,27 @@ def to_svg(figure: Figure, name: str) -> str:
 def to_png(figure: Figure) -> bytes:
     """The figure as a PNG on white, for READMEs and slides."""
     buffer = io.BytesIO()
-    with _style():
+    with styled():
         figure.savefig(buffer, format="png", dpi=160, facecolor="white", metadata={"Software": None})
     return buffer.getvalue()
+
+
+def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) -> bytes:
+    """Figures 2 and 9: signed attributions as a PNG of their own size.
+
+    Orange where positive, blue where negative (a pair that all readers tell apart), white where none; full colour at
+    the 99.5th percentile of the absolute values. The state shows through as a light shade.
+
+    Args:
+        values: float (H, W).
+        grey: the state's brightness, float (H, W) in 0..1.
+    """
+    size = float(np.quantile(np.abs(values), 0.995)) or 1.0
+    strength = np.clip(np.abs(values) / size, 0, 1)[..., None]
+    ends = np.array([matplotlib.colors.to_rgb(colour) for colour in (BLUE, VERMILLION)])
+    paper = np.repeat(1 - 0.28 * grey[..., None], 3, axis=-1)
+    image = (1 - strength) * paper + strength * ends[(values > 0).astype(np.int64)]
+    return image_png((255 * image).round().astype(np.uint8))
 
 
 def image_png(image: NDArray[np.uint8]) -> bytes:

@@ -1,4 +1,12 @@
-"""What each number in ``metrics.json`` is: its unit and its meaning."""
+"""What each number in ``metrics.json`` is, its unit and its meaning, and how numbers are written there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 
 QUANTITIES: dict[str, dict[str, str]] = {
     "balanced_accuracy": {
@@ -29,6 +37,56 @@ QUANTITIES: dict[str, dict[str, str]] = {
     "steps": {"unit": "environment steps", "meaning": "budget, summed over parallel environments and stages"},
     "shortest_path": {"unit": "steps", "meaning": "primitive steps from the start to the goal, at least"},
     "random_success": {"unit": "fraction", "meaning": "share of episodes of uniformly random actions that succeed"},
+    "groups": {"unit": "ladder groups", "meaning": "N: how many ladder groups the labelled states are from"},
+    "seen": {
+        "unit": "code",
+        "meaning": "a held-out state's room: 0 in no training set, 1 among the unlabelled, 2 among the labelled states",
+    },
+    "scopes": {
+        "unit": "rooms",
+        "meaning": "unseen: seen is 0; all: every held-out room, the paper's way; labelled: seen is 2, for validation",
+    },
+    "best": {"unit": "as said beside it", "meaning": "of the members: the highest score, or the least distance"},
+    "worst": {"unit": "as said beside it", "meaning": "of the members: the lowest score, or the greatest distance"},
+    "validated": {
+        "unit": "as said beside it",
+        "meaning": "of the member with the highest balanced accuracy on the labelled rooms, the first of several",
+    },
+    "always_no": {"unit": "fraction", "meaning": "accuracy of a member that never says yes: the share of negatives"},
+    "validation": {"unit": "fraction", "meaning": "the validated member's balanced accuracy on the labelled rooms"},
+    "tied": {"unit": "members", "meaning": "members that have that balanced accuracy; in tables the mean over seeds"},
+    "false_positives": {
+        "unit": "fraction",
+        "meaning": "per kind of negatives, each member's share that it calls positive",
+    },
+    "executions": {"unit": "executions", "meaning": "the last ones of an option that count, 100 at most"},
+    "distance": {
+        "unit": "units of position",
+        "meaning": "mean over executions of the way from where it stopped to the nearest true base, through the rooms; "
+        "300 for one that began inside its own termination set",
+    },
+    "executions_deviation": {
+        "unit": "units of position",
+        "meaning": "standard deviation of that over an option's last executions; in tables the best member's",
+    },
+    "reached_base": {
+        "unit": "fraction",
+        "meaning": "share of executions that stopped within 4 of a true base and did not begin inside",
+    },
+    "inside_at_start": {"unit": "fraction", "meaning": "share of executions that began in their own termination set"},
+    "timed_out": {"unit": "fraction", "meaning": "share of executions that neither their classifier nor a death ended"},
+    "died": {"unit": "fraction", "meaning": "share of executions that ended in a terminal state of the episode"},
+    "log_odds": {
+        "unit": "log-odds",
+        "meaning": "a member's difference of logits, positive: reached more likely than not",
+    },
+    "baseline_log_odds": {"unit": "log-odds", "meaning": "the same of the baseline that a state is compared with"},
+    "attributed": {"unit": "log-odds", "meaning": "sum of a state's DeepLift attributions over pixels and frames"},
+    "completeness_error": {
+        "unit": "log-odds",
+        "meaning": "|attributed - (log_odds - baseline_log_odds)|; 0 but for rounding if attributions are complete",
+    },
+    "last_frame": {"unit": "fraction", "meaning": "share of all attribution, absolute, that is in the last channel"},
     "match": {
         "unit": "fraction",
         "meaning": "a member's balanced accuracy against the true sub-goal on the layout's reachable states",
@@ -49,5 +107,19 @@ QUANTITIES: dict[str, dict[str, str]] = {
     "standard_error": {"unit": "as said beside it", "meaning": "of the mean over runs"},
     "iqm": {"unit": "as said beside it", "meaning": "interquartile mean over runs"},
     "interval": {"unit": "as said beside it", "meaning": "95 % bootstrap interval of the interquartile mean"},
+    "standard_deviation": {"unit": "as said beside it", "meaning": "over runs (n - 1)"},
     "n": {"unit": "runs", "meaning": "runs that have this number"},
 }
+
+
+def plain(value: Any) -> Any:
+    """JSON-ready: NaN becomes null, NumPy numbers become Python's."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

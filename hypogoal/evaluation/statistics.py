@@ -90,3 +90,12 @@ def aggregate(
         "n": len(known),
         "unit": unit,
     }
+
+
+def aggregate_with_deviation(
+    values: Sequence[float], strata: Sequence[Hashable], unit: str, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Spec F1, F3: :func:`aggregate` and the standard deviation over runs (n - 1), the bands of Figures 3 and 4."""
+    known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
+    deviation = float(known.std(ddof=1)) if len(known) > 1 else float("nan")
+    return {**aggregate(values, strata, unit, rng), "standard_deviation": deviation}

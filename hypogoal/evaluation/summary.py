@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from rich.console import Group
 from rich.table import Table
 
 
-def summary_table(metrics: Mapping[str, Any]) -> Table:
-    """Every agent's headline numbers, mean over runs; at most 80 columns wide. See ``quantities.QUANTITIES``."""
+def summary_table(metrics: Mapping[str, Any]) -> Table | Group:
+    """The headline numbers of a run, mean over seeds; at most 80 columns wide. See ``quantities.QUANTITIES``.
+
+    Of a run with ladders what its ensembles and its options came to, of one with agents, or neither, the agents'.
+    """
+    tables = []
+    if metrics["rooms"]:
+        tables.append(rooms_summary(metrics))
+    if metrics["distance"]["options"]:
+        tables.append(distance_summary(metrics))
+    if metrics["agents"] or not tables:
+        tables.append(agents_summary(metrics))
+    if metrics["missing"]:
+        last = tables[-1]
+        last.caption, last.caption_justify = f"In this run: {'; '.join(metrics['missing'])}.", "left"
+    return tables[0] if len(tables) == 1 else Group(*tables)
+
+
+def agents_summary(metrics: Mapping[str, Any]) -> Table:
+    """Every agent's headline numbers, mean over runs; at most 80 columns wide."""
     table = Table(title="Training episodes, the last 100 of each run", title_justify="left", width=79)
     table.add_column("agent", ratio=1)
     for heading in ("runs", "success", "length", "x shortest", "95 % at"):
@@ -23,9 +42,61 @@ def summary_table(metrics: Mapping[str, Any]) -> Table:
             number(agent["length_over_shortest"]["mean"], 1),
             solved(agent["steps_to_95"]),
         )
-    if metrics["missing"]:
-        table.caption, table.caption_justify = f"In this run: {'; '.join(metrics['missing'])}.", "left"
     return table
+
+
+def rooms_summary(metrics: Mapping[str, Any]) -> Table:
+    """Figure 3 by method and N: on unseen rooms, and the paper's number; at most 80 columns wide."""
+    title = "Balanced accuracy on unseen rooms; the best member's accuracy on all rooms"
+    table = Table(title=title, title_justify="left", width=79)
+    table.add_column("method", ratio=1)
+    for heading in ("N", "best", "validated", "mean", "worst", "acc., all", "seeds"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    several = len({row["sub_goal"] for row in metrics["rooms"]}) > 1
+    for row in metrics["rooms"]:
+        unseen = row["scores"]["unseen"]["balanced_accuracy"]
+        table.add_row(
+            f"{row['method']} ({row['sub_goal']})" if several else row["method"],
+            "–" if row["groups"] is None else str(row["groups"]),
+            *(number(unseen[which]["mean"], 2) for which in ("best", "validated", "mean", "worst")),
+            number(row["scores"]["all"]["accuracy"]["best"]["mean"], 2),
+            str(row["ensembles"]),
+        )
+    return table
+
+
+def distance_summary(metrics: Mapping[str, Any]) -> Table:
+    """Figure 4: by ladder and N the best member's distance, a column per method; at most 80 columns wide."""
+    found = metrics["distance"]
+    methods = list(dict.fromkeys(_method(row, found["over_ladders"]) for row in found["over_ladders"]))
+    title = "Distance from a true base where the best member's options stop"
+    table = Table(title=title, title_justify="left", width=79)
+    table.add_column("ladder", no_wrap=True)
+    table.add_column("N", no_wrap=True)
+    for method in methods:
+        table.add_column(method, justify="right", ratio=1)
+
+    def add(name: str, rows: Sequence[Mapping[str, Any]], shown: Callable[[Mapping[str, Any]], str]) -> None:
+        numbers = sorted({row["groups"] for row in rows if row["groups"] is not None}) or [None]
+        for groups in numbers:
+            own = {_method(row, found["over_ladders"]): row for row in rows if row["groups"] in (groups, None)}
+            cells = [shown(own[method]) if method in own else "–" for method in methods]
+            table.add_row(name, "–" if groups is None else str(groups), *cells)
+            name = ""
+
+    for ladder in dict.fromkeys(row["ladder"] for row in found["by_ladder"]):
+        here = [row for row in found["by_ladder"] if row["ladder"] == ladder]
+        add(ladder, here, lambda row: number(row["best"]["mean"], 0))
+    table.add_section()
+    add("mean", found["over_ladders"], lambda row: number(row["best"]["mean"], 0))
+    add("at base", found["over_ladders"], lambda row: percent(row["reached_base"]["mean"]))
+    return table
+
+
+def _method(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    """A method, with its sub-goal where there are several."""
+    several = len({one["sub_goal"] for one in rows}) > 1
+    return f"{row['method']} ({row['sub_goal']})" if several else str(row["method"])
 
 
 def hypotheses_summary(metrics: Mapping[str, Any]) -> Table:

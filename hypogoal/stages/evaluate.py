@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,45 +16,65 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Split, open_dataset
-from hypogoal.domains.base import load_domain
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.base import Domain, load_domain
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.evaluation.agents import (
     LEARNED,
     PRETRAINING,
     RANDOM,
     Run,
-    agent_curves,
     agent_metrics,
     base_name,
-    common_grid,
     group_runs,
     missing_agents,
 )
+from hypogoal.evaluation.arrays import write_curves
 from hypogoal.evaluation.choices import selection_of_run
 from hypogoal.evaluation.curves import GAMMA, SOLVED, WINDOW
+from hypogoal.evaluation.distance import INSIDE, LAST, NEAR, ORACLE, distance_tables, ladder_numbers
 from hypogoal.evaluation.ensembles import ensemble_name, ensemble_names, hypotheses_table, sub_goal_metrics
-from hypogoal.evaluation.examples import overlay, pick_examples
-from hypogoal.evaluation.quantities import QUANTITIES
-from hypogoal.evaluation.reading import read_choices, read_episodes, read_layout, read_terminations
+from hypogoal.evaluation.examples import overlay
+from hypogoal.evaluation.ladders import ladder_names, missing_ladders
+from hypogoal.evaluation.quantities import QUANTITIES, plain
+from hypogoal.evaluation.reading import read_choices, read_episodes, read_executions, read_layout, read_terminations
+from hypogoal.evaluation.rooms import groups_of, method_names, room_metrics, rooms_table
+from hypogoal.evaluation.saliency import BASELINE
+from hypogoal.evaluation.shown import Unlabelled, show_states, show_stops
 from hypogoal.evaluation.statistics import aggregate
 from hypogoal.evaluation.summary import hypotheses_summary, summary_table
+from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
-from hypogoal.options.verdicts import THRESHOLD
+from hypogoal.hypotheses.views import positions_of
 
 __all__ = ["evaluate", "hypotheses_summary", "summary_table"]
 
 SELECTED = (LEARNED, RANDOM, PRETRAINING)  # agents whose options are members: the others have nothing to select
 SETTINGS = {"window": WINDOW, "solved": SOLVED, "gamma": GAMMA, "threshold": THRESHOLD}
+LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
 
 
 @dataclass(frozen=True)
 class Found:
-    """The artefacts of a run that are evaluated."""
+    """The artefacts of a run that are evaluated.
+
+    Attributes:
+        run: its folder.
+        ensembles: every one.
+        agents: what plays a layout: metas, options that no meta continues, baselines.
+        ladders: options learned from a named start each, with a table of where they stopped.
+        silent: options learned from a named start without that table; they are not evaluated.
+    """
 
     run: Path
     ensembles: list[Artefact]
     agents: list[Artefact]
+    ladders: list[Artefact]
+    silent: list[Artefact]
+
+    def everything(self) -> list[Artefact]:
+        """All of them."""
+        return [*self.ensembles, *self.agents, *self.ladders]
 
     def name(self, artefact: Artefact) -> str:
         """Its path within the run."""
@@ -81,7 +100,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
     prepare()
     claim(out, force=force)
     found = find(run)
-    inputs = [artefact.path for artefact in (*found.ensembles, *found.agents)]
+    inputs = [artefact.path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force
@@ -96,15 +115,20 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             if runs:
                 write_curves(arrays, groups)
             selection = evaluate_selection(found, groups, arrays, progress)
-            ensembles = evaluate_ensembles(found, arrays, progress)
+            ensembles, saliency = evaluate_ensembles(found, arrays, progress)
+            distance = evaluate_distance(found, ensembles, arrays, progress)
+        rooms = rooms_table(ensembles)
         metrics = {
             "run": found.run.resolve().name,
-            "settings": SETTINGS,
-            "missing": missing(found, list(groups)),
+            "settings": {**SETTINGS, **(LADDERS if found.ladders else {})},
+            "missing": missing(found, list(groups), rooms, distance),
             "agents": agents,
             "layouts": layouts_of(runs),
             "hypotheses": hypotheses_table(ensembles),
             "ensembles": ensembles,
+            "rooms": rooms,
+            "distance": distance,
+            "saliency": saliency,
             "selection": selection,
             "provenance": provenance(found, data),
             "quantities": QUANTITIES,
@@ -129,50 +153,140 @@ def find(run: Path) -> Found:
         if entry["kind"] == "options"
     }
     options = [artefact for artefact in find_artefacts(run, "options") if artefact.path.resolve() not in continued]
-    found = Found(run, find_artefacts(run, "ensemble"), [*metas, *options, *find_artefacts(run, "baseline")])
-    if not found.ensembles and not found.agents:
+    ladders = [artefact for artefact in options if "executions.csv" in artefact.manifest["files"]]
+    silent = [artefact for artefact in options if artefact not in ladders and artefact.config.get("start")]
+    others = [artefact for artefact in options if artefact not in (*ladders, *silent)]
+    agents = [*metas, *others, *find_artefacts(run, "baseline")]
+    found = Found(run, find_artefacts(run, "ensemble"), agents, ladders, silent)
+    if not found.everything():
         raise UserError("nothing to evaluate", run, "Train something into it first, see 'hypogoal run --help'.")
     return found
 
 
-def evaluate_ensembles(found: Found, arrays: Any, progress: Progress) -> list[dict[str, Any]]:
-    """Spec F1, F2: every ensemble of the run on its data's held-out and unlabelled states."""
-    names = ensemble_names([artefact.config for artefact in found.ensembles])
-    metrics = [
-        {"path": found.name(artefact), "name": name, "seed": artefact.seed, "members": artefact.config["members"]}
-        for artefact, name in zip(found.ensembles, names, strict=True)
-    ]
-    rows: list[list[dict[str, Any]]] = [[] for _ in metrics]
-    sources = [artefact.input("data") for artefact in found.ensembles]
+def evaluate_ensembles(
+    found: Found, arrays: Any, progress: Progress
+) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+    """Spec F1, F2: every ensemble of the run on its data's held-out and unlabelled states.
+
+    Of one ensemble, the first of those with the most members, example states and attributions are kept too.
+    """
+    artefacts = found.ensembles
+    configs = [artefact.config for artefact in artefacts]
+    rows: list[list[dict[str, Any]]] = [[] for _ in artefacts]
+    shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
+    explained = []
+    sources = [artefact.input("data") for artefact in artefacts]
     for path in sorted(set(sources)):
         dataset = open_dataset(path)
-        unlabelled = dataset.unlabelled()
+        unlabelled = Unlabelled(dataset.unlabelled(), positions_of(dataset.unlabelled_origins()))
+        kinds = getattr(domain_named(dataset.domain), "kinds", ())
         for sub_goal in dataset.sub_goals:
             split = dataset.heldout(sub_goal)  # read once for all ensembles: it is the largest thing here
-            for index, artefact in enumerate(found.ensembles):
-                if sources[index] == path and sub_goal in artefact.config["sub_goals"]:
-                    examples = arrays.create_group(f"examples/{sub_goal}") if index == 0 else None
-                    rows[index].append(_evaluate_sub_goal(artefact, sub_goal, split, unlabelled, examples))
-    progress.advance(len(metrics))
-    return [{**about, "sub_goals": own} for about, own in zip(metrics, rows, strict=True)]
+            for index, artefact in enumerate(artefacts):
+                if sources[index] != path or sub_goal not in configs[index]["sub_goals"]:
+                    continue
+                ensemble = read_ensemble(artefact.path, configs[index], sub_goal)
+                judged = judge(ensemble, split.observations, positions_of(split.origins))
+                _, told = judge(ensemble, unlabelled.observations, unlabelled.positions)
+                row = sub_goal_metrics(sub_goal, judged[1], split.labels, split.origins.get("layout_seed"), told)
+                if "seen" in split.origins:
+                    row["rooms"] = room_metrics(judged[1], split.labels, split.origins, kinds)
+                rows[index].append(row)
+                if index == shown:
+                    explained.append(show_states(ensemble, sub_goal, split, judged, unlabelled, arrays))
+                progress.advance(len(rows[index]) == len(configs[index]["sub_goals"]))
+    metrics = _named(found, rows)
+    if shown is None:
+        return metrics, None
+    about = {"ensemble": metrics[shown]["path"], "seed": metrics[shown]["seed"], "baseline": BASELINE}
+    return metrics, {**about, "sub_goals": explained}
 
 
-def _evaluate_sub_goal(
-    artefact: Artefact, sub_goal: str, split: Split, unlabelled: NDArray[np.uint8], examples: Any
-) -> dict[str, Any]:
-    ensemble = read_ensemble(artefact.path, artefact.config, sub_goal)
-    probabilities = ensemble.predict(split.observations)
-    seeds = split.origins.get("layout_seed")
-    if examples is not None:
-        picked = pick_examples(probabilities, split.labels, threshold=THRESHOLD)
-        index = np.array([index for index, _ in picked], dtype=np.int64)
-        examples["observations"] = split.observations[index]
-        examples["probabilities"] = probabilities[index]
-        examples["labels"] = split.labels[index]
-        examples["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
-        examples["kinds"] = json.dumps([kind for _, kind in picked])
-    verdicts = ensemble.predict(unlabelled) > THRESHOLD
-    return sub_goal_metrics(sub_goal, probabilities > THRESHOLD, split.labels, seeds, verdicts)
+def judge(
+    ensemble: Ensemble, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Every member's probability of each state, and its verdict at its own threshold, (N, K) each."""
+    probabilities = ensemble.predict(observations, positions)
+    return probabilities, probabilities > ensemble.thresholds.numpy()
+
+
+def _named(found: Found, rows: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """What was computed of each ensemble with its names; the method and N where it was judged room by room."""
+    configs = [artefact.config for artefact in found.ensembles]
+    named = []
+    for artefact, name, method, own in zip(
+        found.ensembles, ensemble_names(configs), method_names(configs), rows, strict=True
+    ):
+        about: dict[str, Any] = {"path": found.name(artefact), "name": name, "seed": artefact.seed}
+        about["members"] = artefact.config["members"]
+        if any("rooms" in row for row in own):
+            about |= {"method": method, "groups": groups_of(artefact.config)}
+        named.append({**about, "sub_goals": own})
+    return named
+
+
+def evaluate_distance(
+    found: Found, ensembles: list[dict[str, Any]], arrays: Any, progress: Progress
+) -> dict[str, list[dict[str, Any]]]:
+    """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
+
+    Returns:
+        ``options``: a row per artefact and sub-goal; ``by_ladder`` and ``over_ladders``: over seeds; ``shown``: what
+        Figure 5 is drawn of, for each ladder and N the best members of the first seed, whose stops are in the arrays.
+    """
+    abouts = _ladders_named(found, ensembles)
+    executions = {}
+    rows = []
+    for artefact, about in zip(found.ladders, abouts, strict=True):
+        config, path = artefact.config, found.name(artefact)
+        own = executions[path] = read_executions(artefact.path / "executions.csv")
+        validated = about.pop("validated")
+        found_rows = ladder_numbers(
+            own, config["sub_goals"], config["members"], validated, masked=config["mask_reached"]
+        )
+        rows += [{"path": path, "ladder": config["start"], "seed": artefact.seed, **about, **row} for row in found_rows]
+        progress.advance()
+    names = {artefact.config["domain"] for artefact in found.ladders}
+    domain = domain_named(names.pop()) if len(names) == 1 else None
+    used = {row["ladder"] for row in rows}
+    starts = [start for start in getattr(domain, "starts", ()) if start in used]
+    ladders = [*starts, *sorted(used - set(starts))]
+    shown = show_stops(rows, ladders, executions, domain, arrays)
+    return {"options": rows, **distance_tables(rows, ladders), "shown": shown}
+
+
+def _ladders_named(found: Found, ensembles: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of each ladder's options method and N, those of its ensemble, and the member that validation chooses."""
+    by_path = {(found.run / ensemble["path"]).resolve(): ensemble for ensemble in ensembles}
+    methods: list[str] = []
+    groups: list[int | None] = []
+    validated: list[dict[str, int | None]] = []
+    for artefact in found.ladders:
+        source = open_artefact(artefact.input("ensemble"), "ensemble")
+        known = by_path.get(source.path.resolve(), {})
+        oracle = artefact.config["termination"] == "oracle"
+        methods.append(ORACLE if oracle else known.get("method", ensemble_name(source.config)))
+        groups.append(None if oracle else groups_of(source.config))
+        validated.append({} if oracle else validated_members(known))
+    names = ladder_names(methods, groups, [artefact.config for artefact in found.ladders])
+    return [
+        {"method": name, "groups": own, "validated": member}
+        for name, own, member in zip(names, groups, validated, strict=True)
+    ]
+
+
+def validated_members(ensemble: Mapping[str, Any]) -> dict[str, int | None]:
+    """Per sub-goal the member that the rooms of labelled groups pick."""
+    rows = [row for row in ensemble.get("sub_goals", ()) if "rooms" in row]
+    return {row["sub_goal"]: row["rooms"]["validated"]["member"] for row in rows}
+
+
+def domain_named(name: str) -> Domain | None:
+    """The domain; None where it is not installed here."""
+    try:
+        return load_domain(name)
+    except UserError:
+        return None
 
 
 def read_run(found: Found, artefact: Artefact) -> Run:
@@ -184,15 +298,6 @@ def read_run(found: Found, artefact: Artefact) -> Run:
     episodes = read_episodes(artefact.path / "episodes.csv")
     layout = read_layout(artefact.path / "layout.json")
     return Run(artefact.kind, found.name(artefact), artefact.seed, config, episodes, layout)
-
-
-def write_curves(arrays: Any, groups: Mapping[str, list[Run]]) -> None:
-    """Figure 6: ``curves/grid`` and ``curves/<agent's index>/{reward,success,length}``, float (runs, grid)."""
-    grid = common_grid([run for same in groups.values() for run in same])
-    arrays["curves/grid"] = grid
-    for index, same in enumerate(groups.values()):
-        for key, values in agent_curves(same, grid).items():
-            arrays[f"curves/{index}/{key}"] = values
 
 
 def evaluate_selection(
@@ -236,7 +341,8 @@ def match_on_layout(source: Artefact, layout_seed: int) -> NDArray[np.float64]:
     columns = [domain.sub_goals.index(sub_goal) for sub_goal in source.config["sub_goals"]]
     match = []
     for sub_goal, column in zip(source.config["sub_goals"], columns, strict=True):
-        verdicts = read_ensemble(source.path, source.config, sub_goal).predict(images) > THRESHOLD
+        ensemble = read_ensemble(source.path, source.config, sub_goal)
+        verdicts = ensemble.verdicts(images, engine.positions(ids) if ensemble.needs_positions else None)
         match.append(member_scores(verdicts, labels[:, column])["balanced_accuracy"])
     return np.concatenate(match)
 
@@ -263,10 +369,20 @@ def layouts_of(runs: Iterable[Run]) -> list[dict[str, Any]]:
     return [by_seed[seed] for seed in sorted(by_seed)]
 
 
-def missing(found: Found, names: list[str]) -> list[str]:
-    """One line for everything of section F that this run has no artefacts for."""
+def missing(
+    found: Found, names: list[str], rooms: list[dict[str, Any]], distance: Mapping[str, list[dict[str, Any]]]
+) -> list[str]:
+    """One line for everything of section F that this run has no artefacts for.
+
+    A run with ladders is asked for what Figures 3 to 5 need, one with agents or with neither for Figure 6's.
+    """
     lines = [] if found.ensembles else ["no ensemble"]
-    return [*lines, *missing_agents(names)]
+    lines += [f"no executions.csv in {found.name(artefact)}: its domain tells no distance" for artefact in found.silent]
+    if rooms or found.ladders:
+        lines += missing_ladders(rooms, distance["options"])
+    if names or not (rooms or found.ladders):
+        lines += missing_agents(names)
+    return lines
 
 
 def provenance(found: Found, data: list[Path]) -> dict[str, Any]:
@@ -281,7 +397,7 @@ def provenance(found: Found, data: list[Path]) -> dict[str, Any]:
             "command": artefact.manifest.get("command", []),
             "versions": artefact.manifest.get("versions", {}),
         }
-        for artefact in (*found.ensembles, *found.agents)
+        for artefact in found.everything()
     ]
     collected = []
     for path in data:
@@ -289,16 +405,3 @@ def provenance(found: Found, data: list[Path]) -> dict[str, Any]:
         about = {"path": path.name, "domain": dataset.domain, "config": dataset.config, "counts": dataset.counts()}
         collected.append({**about, "seed": dataset.attributes.get("seed")})
     return {"artefacts": artefacts, "data": collected}
-
-
-def plain(value: Any) -> Any:
-    """JSON-ready: NaN becomes null, NumPy numbers become Python's."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(inner) for inner in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -26,7 +26,7 @@ def report(run: Path, *, force: bool = False) -> Path:
     Raises:
         UserError: the run was not evaluated, the evaluation is damaged, or the report exists.
     """
-    from hypogoal.evaluation.figures import to_png, to_svg
+    from hypogoal.evaluation.figures import to_png
     from hypogoal.evaluation.page import Material, render
 
     out = run / "report"
@@ -38,7 +38,7 @@ def report(run: Path, *, force: bool = False) -> Path:
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
         for name, figure in material.figures.items():
-            (folder / "figures" / f"{name}.svg").write_text(to_svg(figure, name), encoding="utf-8")
+            (folder / "figures" / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
             (folder / "figures" / f"{name}.png").write_bytes(to_png(figure))
     return out / "index.html"
 

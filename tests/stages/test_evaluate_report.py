@@ -87,6 +87,23 @@ def test_members_are_judged_on_heldout_states(run, metrics):
     assert len(metrics["hypotheses"]) == len(SUB_GOALS) + 1
 
 
+def test_attributions_are_complete(run, metrics):
+    """Spec F2: DeepLift of every member on a few held-out states of every sub-goal adds up to its log-odds."""
+    found = metrics["saliency"]
+    assert found["ensemble"] == "ensemble"
+    assert [goal["sub_goal"] for goal in found["sub_goals"]] == list(SUB_GOALS)
+    members = [member for goal in found["sub_goals"] for state in goal["states"] for member in state["members"]]
+    assert members
+    assert max(member["completeness_error"] for member in members) < 1e-9
+    assert set(members[0]) - {"member"} <= set(metrics["quantities"])
+    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+        goal = next(goal for goal in found["sub_goals"] if goal["states"])
+        group = arrays[f"saliency/{goal['sub_goal']}"]
+        values = group["attributions"][0, 0].astype(float).sum()
+        assert values == pytest.approx(goal["states"][0]["members"][0]["attributed"], abs=1e-4)
+        assert group["attributions"].shape == (len(goal["states"]), 2, 64, 64, 3)
+
+
 def test_selection_counts_every_decision(run, metrics):
     """Spec F6: what was chosen and offered, and the random chooser's control beside it; oracle has no members."""
     assert [agent["name"] for agent in metrics["selection"]] == ["options (learned members)", "random choice"]
@@ -194,7 +211,7 @@ def test_the_page_shows_all_of_it(run, page):
     """Spec F5, F6, F7: curves, hypotheses, examples, overlays, choices, provenance, with seeds in the captions."""
     for title in (
         "Summary", "Learning curves", "Hypotheses", "Example states", "Where options stop",
-        "Which hypotheses are chosen", "Data, settings, provenance",
+        "Which hypotheses are chosen", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     assert page.count("<figure") == 4

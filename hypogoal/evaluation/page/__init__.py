@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import resources
 
 from hypogoal.evaluation.page.agents import curves_section, summary_section
-from hypogoal.evaluation.page.blocks import Material, listed
+from hypogoal.evaluation.page.blocks import Block, Material, listed
 from hypogoal.evaluation.page.choices import choices_section, terminations_section
+from hypogoal.evaluation.page.distance import distance_section, stops_section
 from hypogoal.evaluation.page.hypotheses import examples_section, hypotheses_section
+from hypogoal.evaluation.page.ladders import ladders_section
 from hypogoal.evaluation.page.provenance import provenance_section
+from hypogoal.evaluation.page.rooms import rooms_section
+from hypogoal.evaluation.page.saliency import saliency_section
 
 __all__ = ["Material", "render"]
 
-SECTIONS = (
-    summary_section,
-    curves_section,
-    hypotheses_section,
-    examples_section,
-    terminations_section,
-    choices_section,
-    provenance_section,
-)
+AGENTS = (summary_section, curves_section)
+LADDERS = (ladders_section, rooms_section, distance_section, stops_section)
+STATES = (examples_section, saliency_section)
+CHOICES = (terminations_section, choices_section)
+
+
+def sections_of(material: Material) -> list[Block]:
+    """What a run has artefacts for; of either kind, agents or ladders, also what it lacks.
+
+    A run with neither, an ensemble alone, say, is taken for one whose agents are still to come.
+    """
+    metrics = material.metrics
+    ladders = bool(metrics["rooms"] or metrics["distance"]["options"])
+    agents = bool(metrics["agents"]) or not ladders
+    makers: list[Callable[[Material], Block]] = [*(AGENTS if agents else ()), *(LADDERS if ladders else ())]
+    makers += [hypotheses_section] if metrics["hypotheses"] or agents else []
+    makers += [*STATES, *(CHOICES if agents else ()), provenance_section]
+    return [make(material) for make in makers]
 
 
 def render(material: Material, version: str) -> str:
@@ -41,7 +55,7 @@ def render(material: Material, version: str) -> str:
         subtitle=f"{listed(domains)}; {len(about['artefacts'])} artefacts evaluated; hypogoal {version}",
         version=version,
         css=resources.files("hypogoal.evaluation").joinpath("templates/report.css").read_text(encoding="utf-8"),
-        sections=[make(material) for make in SECTIONS],
+        sections=sections_of(material),
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
 

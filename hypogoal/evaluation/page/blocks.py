@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,12 +24,13 @@ class Material:
     Attributes:
         metrics: what ``metrics.json`` holds.
         arrays: what ``arrays.h5`` holds, by name.
-        figures: filled while the page is made, to be written as files too.
+        figures: filled while the page is made, to be written as files too; ``drawings`` with their SVG.
     """
 
     metrics: Mapping[str, Any]
     arrays: Mapping[str, NDArray[Any]]
     figures: dict[str, Figure] = field(default_factory=dict)
+    drawings: dict[str, str] = field(default_factory=dict)
 
     def agents(self) -> list[Mapping[str, Any]]:
         """Every agent's numbers, in the report's order."""
@@ -66,8 +68,12 @@ def table(
     heading: str = "",
     folded: str = "",
     wrap: bool = False,
+    tight: bool = False,
 ) -> Block:
-    """A table; the first ``texts`` columns are text, the others numbers; ``wrap`` breaks long texts."""
+    """A table; the first ``texts`` columns are text, the others numbers.
+
+    Long texts are broken where ``wrap``; columns are nearer to each other where ``tight``.
+    """
     named = [{"name": name, "number": index >= texts} for index, name in enumerate(columns)]
     return {
         "kind": "table",
@@ -76,7 +82,7 @@ def table(
         "caption": caption,
         "heading": heading,
         "folded": folded,
-        "wrap": wrap,
+        "class": "wrap" if wrap else "tight" if tight else "",
     }
 
 
@@ -91,7 +97,13 @@ def cell(text: str, small: str = "", mark: str = "") -> dict[str, str]:
 
 
 def figure(
-    material: Material, name: str, label: str, drawn: Figure | None, caption: str = "", missing: str = ""
+    material: Material,
+    name: str,
+    label: str,
+    drawn: Figure | None,
+    caption: str = "",
+    missing: str = "",
+    folded: str = "",
 ) -> Block:
     """A figure, or what it would have needed.
 
@@ -102,11 +114,12 @@ def figure(
         drawn: None where it cannot be drawn.
         caption: with seeds and intervals.
         missing: which artefact would be needed.
+        folded: what is shown of it until asked for.
     """
     svg = ""
     if drawn is not None:
         material.figures[name] = drawn
-        svg = to_svg(drawn, name)
+        svg = material.drawings[name] = to_svg(drawn, name)
         for colour, variable in COLOURS.items():
             svg = svg.replace(colour, f"var(--{variable})")
     return {
@@ -116,6 +129,7 @@ def figure(
         "svg": svg,
         "caption": caption,
         "missing": missing,
+        "folded": folded,
     }
 
 
@@ -124,6 +138,12 @@ def picture(image: NDArray[np.uint8]) -> str:
     if image.ndim == 3 and image.shape[2] != 3:
         image = image[..., -1]
     return base64.b64encode(image_png(np.ascontiguousarray(image))).decode("ascii")
+
+
+def texts(packed: Any) -> list[str]:
+    """A JSON list of texts out of the arrays."""
+    raw = packed.item() if isinstance(packed, np.ndarray) else packed
+    return list(json.loads(raw.decode() if isinstance(raw, bytes) else raw))
 
 
 def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "", opened: bool = False) -> Block:
@@ -148,6 +168,14 @@ def spread(aggregated: Mapping[str, Any], digits: int, scale: float = 1.0) -> di
     if mean is None:
         return cell("–")
     return cell(fixed(scale * mean, digits), f"± {scale * error:.{digits}f}" if error is not None else "")
+
+
+def deviation(aggregated: Mapping[str, Any], digits: int, scale: float = 1.0) -> dict[str, str]:
+    """Mean, and beside it the standard deviation over seeds where there are several."""
+    mean, wide = aggregated["mean"], aggregated["standard_deviation"]
+    if mean is None:
+        return cell("–")
+    return cell(fixed(scale * mean, digits), f"± {scale * wide:.{digits}f}" if wide is not None else "")
 
 
 def interval(aggregated: Mapping[str, Any], digits: int, scale: float = 1.0) -> str:

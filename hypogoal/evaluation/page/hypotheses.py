@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from hypogoal.evaluation.page.blocks import (
     section,
     spread,
     table,
+    texts,
 )
 
 KINDS = {
@@ -128,7 +128,8 @@ def examples_section(material: Material) -> Block:
     if not names:
         missing = ["No example states: they need an ensemble artefact."]
         return section("examples", "Example states", [], [], missing)
-    source = material.metrics["ensembles"][0]
+    shown = material.metrics["saliency"]["ensemble"]
+    source = next(ensemble for ensemble in material.metrics["ensembles"] if ensemble["path"] == shown)
     text = (
         f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
         "probability that the sub-goal is reached. Coloured: verdicts that differ from the truth. Chosen to show "
@@ -142,20 +143,19 @@ def examples_section(material: Material) -> Block:
 def _cards(material: Material, sub_goal: str) -> Block:
     arrays = {
         key: material.arrays[f"examples/{sub_goal}/{key}"]
-        for key in ("observations", "probabilities", "labels", "layout_seeds", "kinds")
+        for key in ("observations", "probabilities", "verdicts", "labels", "places", "kinds")
     }
-    threshold = material.metrics["settings"]["threshold"]
+    places = texts(arrays["places"])
     cards = []
-    for index, kind in enumerate(_texts(arrays["kinds"])):
+    for index, kind in enumerate(texts(arrays["kinds"])):
         truth = bool(arrays["labels"][index])
         lines = []
         for member, probability in enumerate(arrays["probabilities"][index]):
-            verdict = bool(probability > threshold)
+            verdict = bool(arrays["verdicts"][index, member])
             said = "yes" if verdict else "no"
             mark = "wrong" if verdict != truth else "yes" if verdict else "no"
             lines.append({"class": mark, "text": f"member {member}: {said} {probability:.2f}"})
-        seed = int(arrays["layout_seeds"][index])
-        place = f", layout {seed}" if seed >= 0 else ""
+        place = f", {places[index]}" if places[index] else ""
         cards.append(
             {
                 "png": picture(arrays["observations"][index]),
@@ -165,8 +165,3 @@ def _cards(material: Material, sub_goal: str) -> Block:
             }
         )
     return {"kind": "cards", "heading": sub_goal, "cards": cards}
-
-
-def _texts(packed: Any) -> Sequence[str]:
-    raw = packed.item() if isinstance(packed, np.ndarray) else packed
-    return list(json.loads(raw.decode() if isinstance(raw, bytes) else raw))

@@ -9,6 +9,8 @@ from typing import Any
 
 from hypogoal.evaluation.page.blocks import Block, Material, facts, row, section, table
 
+SAID_ELSEWHERE = ("layout_seed", "start", "domain_config")  # settings that alone do not make another list
+
 
 def provenance_section(material: Material) -> Block:
     """Data, artefacts, settings, versions and the meaning of every number."""
@@ -61,13 +63,12 @@ def _artefacts(about: Mapping[str, Any]) -> Block:
 
 def _settings(about: Mapping[str, Any]) -> list[Block]:
     blocks = []
-    for data in about["data"]:
-        blocks.append(
-            facts(f"Settings of {data['path']} ({data['domain']})", _lines(data["config"]), heading="Settings")
-        )
+    for index, data in enumerate(about["data"]):
+        name = f"Settings of {data['path']} ({data['domain']})"
+        blocks.append(facts(name, _lines(data["config"]), heading="" if index else "Settings"))
     shown: set[str] = set()
     for artefact in about["artefacts"]:
-        varying = {key: value for key, value in artefact["config"].items() if key != "layout_seed"}
+        varying = {key: value for key, value in artefact["config"].items() if key not in SAID_ELSEWHERE}
         same = json.dumps([artefact["kind"], varying], sort_keys=True)
         if same not in shown:
             shown.add(same)

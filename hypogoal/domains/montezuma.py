@@ -1,0 +1,279 @@
+"""Montezuma's Revenge, climbing down ladders (Spec B4, B5): the domain as the stages see it, how states are collected.
+
+The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezuma_ladders`` (where the ladders are),
+``montezuma_rollouts`` and ``montezuma_states`` (what is collected), ``montezuma_pictures`` (rooms), ``montezuma_env``
+and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``montezuma_registration`` (its id).
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import Collected, States
+from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
+from hypogoal.domains.montezuma_engine import MontezumaEngine
+from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS, MontezumaLadder
+from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
+from hypogoal.domains.montezuma_pictures import picture, pixel
+from hypogoal.domains.montezuma_registration import ENV_ID, register
+from hypogoal.domains.montezuma_rollouts import PLAYS
+from hypogoal.domains.montezuma_states import KINDS, RoomStates, emulator_of_process, gather, labels_of, origins_of
+
+__all__ = [
+    "DOMAIN",
+    "ENV_ID",
+    "SUB_GOALS",
+    "MontezumaConfig",
+    "MontezumaDomain",
+    "MontezumaEngine",
+    "MontezumaLadder",
+    "collect",
+    "register",
+]
+
+register()
+
+# The unlabelled rooms where none are given: the first of these ladder rooms that has no labels, and a room without a
+# ladder; where all have labels, two without.
+UNLABELLED_LADDER_ROOMS = (9, 21, 19, 22, 10)
+UNLABELLED_OTHER_ROOMS = (18, 12)
+SEEN_NOWHERE, SEEN_UNLABELLED, SEEN_LABELLED = range(3)
+
+
+@dataclass(frozen=True)
+class MontezumaConfig:
+    """What ``hypogoal collect montezuma`` can be told."""
+
+    groups: int = setting(
+        1, "ladder groups with labels (N), of which there are seven", source="Figure 3", low=1, high=len(GROUPS)
+    )
+    unlabelled_rooms: tuple[int, ...] = setting(
+        (),
+        "rooms of the unlabelled states; none given, one with a ladder that has no labels, and room 18, without one",
+        source="paper: for N = 1 one room of each kind",
+        low=0,
+        high=ROOMS - 1,
+    )
+    states_per_room: int = setting(
+        600, "labelled states of each room of the groups", unit="states", source="own choice", low=1, high=100_000
+    )
+    unlabelled_per_room: int = setting(
+        600, "unlabelled states of each of their rooms", unit="states", source="own choice", low=1, high=100_000
+    )
+    heldout_per_room: int = setting(
+        300, "held-out states of each of the 24 rooms", unit="states", source="own choice", low=1, high=100_000
+    )
+    heldout_seed: int = setting(0, "another number draws other held-out states, the rest stays", low=0)
+    unlabelled_from: str = setting(
+        "expert",
+        "who plays in the unlabelled rooms: the labelled states' expert, or uniformly random actions from their sides",
+        source="Spec B7",
+        choices=PLAYS,
+    )
+    workers: int = setting(0, "rooms played in at once, each by a process; 0 for one per core", low=0, high=1024)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The states of one room for one of the three sets; ``begin``: the index of the first of them there."""
+
+    name: str
+    room: int
+    begin: int
+    wanted: int
+    seed: int
+    stream: tuple[str | int, ...]
+    play: str = "expert"
+
+    def gather(self) -> RoomStates:
+        """Play in the room, in whatever process."""
+        held_out, unlabelled = self.name == "heldout", self.name == "unlabelled"
+        return gather(
+            self.room, self.wanted, self.seed, self.stream, play=self.play, held_out=held_out, runs_on=unlabelled
+        )
+
+
+def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
+    """Spec B5: labelled, unlabelled and held-out states, each with its origin.
+
+    Labelled are the rooms of the first N ladder groups; held out are states of all 24 rooms, the same ones for every
+    N. States at the base of a ladder that runs on through the floor are in the unlabelled set only. No stack of the
+    held-out set is in another one, and none is twice in one room of a set. Nothing depends on how many processes play.
+
+    Args:
+        config: see ``MontezumaConfig``.
+        seed: of the rollouts; each room of each set has a stream of its own.
+        progress: told how many states there will be, and of each room that is done.
+
+    Returns:
+        Labels of all three sets (those of the unlabelled are for tests only). Origins: see
+        ``montezuma_states.origins_of``; of held-out states also ``seen``: 0 the room is in no training set, 1 it is
+        among the unlabelled rooms, 2 among the labelled ones.
+
+    Raises:
+        UserError: there is no such room, or no emulator, or a room does not show so many different states.
+    """
+    labelled, unlabelled = labelled_rooms(config.groups), unlabelled_rooms(config)
+    tasks: list[_Task] = []
+    whole: dict[str, RoomStates] = {}
+    for name, rooms, wanted, stream, play in (
+        ("labelled", labelled, config.states_per_room, (), "expert"),
+        ("unlabelled", unlabelled, config.unlabelled_per_room, (), config.unlabelled_from),
+        ("heldout", range(ROOMS), config.heldout_per_room, (config.heldout_seed,), "expert"),
+    ):
+        for room in rooms:
+            begin = wanted * rooms.index(room)
+            tasks.append(_Task(name, room, begin, wanted, seed, ("montezuma", name, *stream), play))
+        whole[name] = RoomStates.empty(wanted * len(rooms))
+
+    def put(task: _Task, states: RoomStates) -> None:
+        whole[task.name].put(task.begin, states)
+        progress.advance(task.wanted)
+
+    progress.expect(sum(task.wanted for task in tasks))
+    _play(tasks, config.workers or len(os.sched_getaffinity(0)), put)
+    heldout = _states_of(whole["heldout"])
+    seen = np.full(len(heldout.labels), SEEN_NOWHERE)
+    seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
+    seen[np.isin(heldout.origins["room"], labelled)] = SEEN_LABELLED
+    heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
+    return Collected(
+        OBSERVATION_SHAPE, SUB_GOALS, _states_of(whole["labelled"]), _states_of(whole["unlabelled"]), heldout
+    )
+
+
+def labelled_rooms(groups: int) -> tuple[int, ...]:
+    """The rooms of the first N ladder groups."""
+    return tuple(room for group in GROUPS[:groups] for room in group)
+
+
+def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
+    """The rooms of the unlabelled states: those given, or one with a ladder that has no labels and one without.
+
+    Raises:
+        UserError: there is no such room.
+    """
+    for room in config.unlabelled_rooms:
+        if not 0 <= room < ROOMS:
+            raise UserError("no such room", f"unlabelled_rooms={room}", f"Rooms are 0 to {ROOMS - 1}.")
+    if config.unlabelled_rooms:
+        return tuple(dict.fromkeys(config.unlabelled_rooms))
+    labelled = labelled_rooms(config.groups)
+    left = [room for room in UNLABELLED_LADDER_ROOMS if room not in labelled]
+    return (left[0], UNLABELLED_OTHER_ROOMS[0]) if left else UNLABELLED_OTHER_ROOMS
+
+
+def _play(tasks: Sequence[_Task], workers: int, put: Callable[[_Task, RoomStates], None]) -> None:
+    """Gather every task's states, ``workers`` at once, and ``put`` each as soon as it is there."""
+    if workers == 1:
+        for task in tasks:
+            put(task, task.gather())
+        return
+    before = set(multiprocessing.active_children())
+    # Started anew rather than forked: a fork takes along whatever threads and locks the caller has. Ctrl-C is for the
+    # caller alone.
+    pool = ProcessPoolExecutor(
+        min(workers, len(tasks)), multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    )
+    try:
+        futures = {pool.submit(task.gather): task for task in tasks}
+        for future in as_completed(list(futures)):
+            put(futures.pop(future), future.result())
+    except BaseException:  # what was begun would otherwise be waited for
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _states_of(states: RoomStates) -> States:
+    return States(states.observations, labels_of(states.ram)[:, None], origins_of(states))
+
+
+class MontezumaDomain:
+    """Spec B6: the ladders of Montezuma's Revenge behind the interface of ``hypogoal.domains.base.Domain``.
+
+    Attributes:
+        starts: the ladders at whose tops episodes can begin.
+        kinds: what the values of the origin ``kind`` mean.
+        defaults: per stage, this domain's own (Tables 1 and 2).
+    """
+
+    name = "montezuma"
+    sub_goals: tuple[str, ...] = SUB_GOALS
+    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    config_class = MontezumaConfig
+    env_id = ENV_ID
+    starts: tuple[str, ...] = tuple(ladder.name for ladder in LADDERS)
+    kinds = KINDS
+    defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+        {
+            "train-ensemble": {
+                "network": "montezuma",
+                "members": 6,
+                "diversity_weight": 3e-4,
+                "learning_rate": 5e-4,
+                "l2_weight": 5e-4,
+                "class_weight_negative": 0.8,
+                "class_weight_positive": 0.2,
+            },
+            "train-options": {"option_timeout": MAX_STEPS, "epsilon_steps": 400_000},
+        }
+    )
+
+    def collect(self, config: MontezumaConfig, seed: int, progress: Any) -> Collected:
+        """See ``collect``."""
+        return collect(config, seed, progress)
+
+    def make_engine(
+        self,
+        layout_seed: int,
+        count: int,
+        max_steps: int = MAX_STEPS,
+        *,
+        start: str = LADDERS[0].name,
+        **arguments: Any,
+    ) -> MontezumaEngine:
+        """An engine of ``count`` games that begin at the ladder ``start``.
+
+        The game has one layout: ``layout_seed`` is that of the start states where ``arguments`` have no ``seed``. The
+        other arguments are ``MontezumaEngine``'s.
+        """
+        return MontezumaEngine(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
+
+    def label(self, env: Any) -> NDArray[np.bool_]:
+        """The true sub-goal predicates of a Gymnasium environment's current state, bool (1,)."""
+        return env.unwrapped.labels()
+
+    def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Spec F3: from positions (n, 3) to the nearest base, int (n,); see ``montezuma_ladders.distance_to_base``."""
+        return distance_to_base(positions)
+
+    def rooms_of(self, start: str) -> tuple[int, ...]:
+        """The rooms of a ladder, from its top to its base."""
+        ladder = ladder_named(start)
+        return tuple(dict.fromkeys((ladder.top.room, ladder.base.room)))
+
+    def picture(self, room: int) -> NDArray[np.uint8]:
+        """A room as the console shows it, but for the agent: uint8 (210, 160, 3)."""
+        return picture(emulator_of_process(), room)
+
+    def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Where in that picture the agent's middle is, at positions (n, 3): column, row (n, 2)."""
+        return pixel(positions)
+
+
+DOMAIN = MontezumaDomain()

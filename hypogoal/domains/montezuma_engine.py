@@ -1,0 +1,242 @@
+"""The training engine of Montezuma's Revenge: many emulators stepped together, states by id, frames kept once each.
+
+An observation is four frames of which a step makes one: states share them. The newest ``memory`` states are kept, the
+frames of older ones are forgotten.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Step
+from hypogoal.domains.montezuma_emulator import (
+    N_ACTIONS,
+    OBSERVATION_SHAPE,
+    RAM,
+    Emulator,
+    Frames,
+    Snapshot,
+    stack_frames,
+    state_from_bytes,
+)
+from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, draw_start, labels_of, make_starts
+from hypogoal.domains.montezuma_ladders import ladder_named
+
+MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and what is not yet in it
+ROOM, X, Y, DYING = (RAM[name] for name in ("room", "x", "y", "dying"))
+
+
+class MontezumaEngine:
+    """Many games that begin at one ladder, stepped together; see ``hypogoal.domains.base.Engine``.
+
+    Ids 0 .. S-1 are the S start states, for ever; every step of every environment gets a new one. The images of the
+    newest ``memory`` of these can be had, positions, labels and who is alive of all.
+
+    Args:
+        start: the ladder, see ``montezuma_ladders.LADDERS``.
+        count: environments (E).
+        max_steps: agent steps after which an episode is truncated.
+        start_states: S; see ``montezuma_env.make_starts``.
+        along: the share of episodes that begin somewhere on the way down instead of at the top.
+        end_at_death: an episode terminates when the agent begins to die; False, when the game is over.
+        memory: states whose images are kept; 7 kB each, taken when first needed.
+        seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
+
+    Attributes:
+        ids: int64 (E,), the current state of each environment.
+        elapsed: int64 (E,), steps since its episode began.
+        starts: the start states.
+
+    Raises:
+        UserError: no such ladder, too few start states, too small a memory, or no emulator.
+    """
+
+    n_actions = N_ACTIONS
+    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+
+    def __init__(
+        self,
+        start: str,
+        count: int,
+        *,
+        max_steps: int = MAX_STEPS,
+        start_states: int = START_STATES,
+        along: float = 0.0,
+        end_at_death: bool = True,
+        memory: int = MEMORY,
+        seed: int = 0,
+    ):
+        if memory < count or count < 1:
+            raise UserError(
+                "no such engine",
+                f"count={count}, memory={memory}",
+                "Give one environment or more, and memory for each.",
+            )
+        self.count, self.max_steps, self.along, self.end_at_death = count, max_steps, along, end_at_death
+        self.memory = memory
+        self._arguments = json.dumps(
+            [start, count, max_steps, start_states, along, end_at_death, memory, seed]
+        ).encode()
+        self._emulators = [Emulator(seed + number) for number in range(count)]
+        self.starts = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
+        self._rng = rng_for(seed, "start-of-episode")
+        self._seen: list[Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
+        self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
+        self._alive = bytearray([True] * len(self.starts))
+        self.reset()
+
+    @property
+    def n_states(self) -> int:
+        """Ids known so far are 0 .. n_states - 1."""
+        return len(self._alive)
+
+    @property
+    def oldest(self) -> int:
+        """Ids below this one, but for the S start states', are forgotten: there are no images of them."""
+        return self.n_states - len(self._seen)
+
+    def reset(self) -> NDArray[np.int64]:
+        """Every environment at the start of an episode; returns the ids, int64 (E,)."""
+        self.ids = np.array([self._begin(number) for number in range(self.count)])
+        self.elapsed = np.zeros(self.count, np.int64)
+        return self.ids.copy()
+
+    def restart(self, where: NDArray[np.bool_]) -> None:
+        """Begin a new episode now in the environments ``where``, bool (E,)."""
+        ids, elapsed = self.ids.copy(), self.elapsed.copy()
+        for number in where.nonzero()[0].tolist():
+            ids[number], elapsed[number] = self._begin(number), 0
+        self.ids, self.elapsed = ids, elapsed
+
+    def _begin(self, number: int) -> int:
+        """An episode of one environment; returns the start state."""
+        begin = draw_start(self.starts, self.along, self._rng)
+        self._emulators[number].restore(self.starts[begin].snapshot)
+        return begin
+
+    def step(self, actions: NDArray[np.int64]) -> Step:
+        """Step every environment with actions int (E,), 0 .. 17; where an episode ends, a start state follows.
+
+        Raises:
+            IndexError: no such action, or not one for each environment.
+        """
+        played = actions.tolist()
+        if len(played) != self.count or not all(0 <= action < N_ACTIONS for action in played):
+            raise IndexError(f"actions are {self.count} numbers from 0 to {N_ACTIONS - 1}, not {played}")
+        # Plain Python, since NumPy's operations make the emulator's next frames slower: see ``Emulator.step``.
+        first, elapsed = self.n_states, self.elapsed.tolist()
+        ids = list(range(first, first + self.count))
+        rewards, terminated, truncated = [], [], []
+        for number, emulator in enumerate(self._emulators):
+            rewards.append(emulator.step(played[number]))
+            over = emulator.ale.game_over()
+            ram = emulator.ram().tobytes()
+            alive = not over and ram[DYING] == 0
+            self._remember(emulator.seen, ram, alive)
+            elapsed[number] += 1
+            terminated.append(over or (self.end_at_death and not alive))
+            truncated.append(elapsed[number] >= self.max_steps)
+            if terminated[-1] or truncated[-1]:
+                ids[number], elapsed[number] = self._begin(number), 0
+        self.ids, self.elapsed = np.array(ids), np.array(elapsed)
+        next_ids = np.arange(first, first + self.count)
+        return Step(next_ids, np.array(rewards, np.float32), np.array(terminated), np.array(truncated))
+
+    def _remember(self, seen: Frames, ram: bytes, alive: bool) -> None:
+        """A new state, its id the next."""
+        if len(self._seen) < self.memory:
+            self._seen.append(seen)
+        else:
+            self._seen[self._place(self.n_states)] = seen
+        self._positions += bytes((ram[ROOM], ram[X], ram[Y]))
+        self._alive.append(alive)
+
+    def _place(self, state: int) -> int:
+        """Where in the ring a state is, or will be."""
+        return (state - len(self.starts)) % self.memory
+
+    def _known(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        if len(ids) and not 0 <= ids.min() <= ids.max() < self.n_states:
+            raise ValueError(f"ids are 0 to {self.n_states - 1}, not {ids.min()} to {ids.max()}")
+        return ids
+
+    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Observations uint8 (n, 84, 84, 4) of states (n,), into ``out`` where given.
+
+        Raises:
+            ValueError: there is no such state, it is forgotten, or ``out`` is of the wrong kind.
+        """
+        fixed, oldest = len(self.starts), self.oldest
+        shape = (len(ids), *OBSERVATION_SHAPE)
+        if out is None:
+            out = np.empty(shape, np.uint8)
+        elif out.dtype != np.uint8 or out.shape != shape or not out.flags.c_contiguous:
+            raise ValueError(f"out must be contiguous uint8 {shape}, not {out.dtype} {out.shape}")
+        for image, state in zip(out, self._known(ids).tolist(), strict=True):
+            if fixed <= state < oldest:
+                raise ValueError(f"state {state} is forgotten; the oldest kept is {oldest}")
+            seen = self.starts[state].snapshot.seen if state < fixed else self._seen[self._place(state)]
+            stack_frames(seen, image)
+        return out
+
+    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Where the agent is, int64 (n, 3): room, x, y in the RAM's units; of forgotten states too."""
+        return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._known(ids)].astype(np.int64)
+
+    def alive(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the agent is not dying and the game is not over, bool (n,); of forgotten states too."""
+        return np.frombuffer(self._alive, np.bool_)[self._known(ids)]
+
+    def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Spec B4: the true predicates, bool (n, 1); of forgotten states too."""
+        return labels_of(self.positions(ids), self.alive(ids))
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        """What a resumed run needs to go on exactly. Nearly all of it is the frames in memory, 7 kB a state."""
+        saved = [emulator.save() for emulator in self._emulators]
+        states = [np.frombuffer(each.state.serialize(), np.uint8) for each in saved]
+        frames: dict[int, NDArray[np.uint8]] = {}  # by address: each once, in the order of first use
+        stacks = [*self._seen, *(each.seen for each in saved)]
+        for seen in stacks:
+            frames.update((id(frame), frame) for frame in seen)
+        row = {address: number for number, address in enumerate(frames)}
+        return {
+            "arguments": np.frombuffer(self._arguments, np.uint8),
+            "rng": np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8),
+            "ids": self.ids.copy(),
+            "elapsed": self.elapsed.copy(),
+            "positions": np.frombuffer(self._positions, np.uint8).copy(),
+            "alive": np.frombuffer(self._alive, np.uint8).copy(),
+            "frames": np.stack(list(frames.values())),
+            "stacks": np.array([[row[id(frame)] for frame in seen] for seen in stacks], np.int32),
+            "states": np.concatenate(states),
+            "state_sizes": np.array([len(state) for state in states]),
+            "screens": np.stack([each.screen for each in saved]),
+        }
+
+    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from a ``snapshot`` of an engine made with the same arguments.
+
+        Raises:
+            ValueError: it was made with others.
+        """
+        if snapshot["arguments"].tobytes() != self._arguments:
+            raise ValueError("the snapshot is of an engine made with other arguments")
+        self._rng.bit_generator.state = json.loads(snapshot["rng"].tobytes())
+        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
+        self._positions = bytearray(snapshot["positions"].tobytes())
+        self._alive = bytearray(snapshot["alive"].tobytes())
+        frames = [frame.copy() for frame in snapshot["frames"]]  # to be freed one by one
+        stacks = [tuple(frames[row] for row in rows) for rows in snapshot["stacks"].tolist()]
+        self._seen = stacks[: -self.count]
+        states = np.split(snapshot["states"], np.cumsum(snapshot["state_sizes"])[:-1])
+        now = zip(self._emulators, states, stacks[-self.count :], snapshot["screens"], strict=True)
+        for emulator, state, seen, screen in now:
+            emulator.restore(Snapshot(state_from_bytes(state.tobytes()), seen, screen.copy()))

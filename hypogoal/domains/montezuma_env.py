@@ -1,0 +1,231 @@
+"""Spec B4, D4: Montezuma's Revenge from the top of a ladder on, as a Gymnasium environment; where episodes begin.
+
+This is the reference: the training engine (``montezuma_engine.py``) is tested to be exact to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.montezuma_emulator import (
+    DOWN,
+    FRAME_SKIP,
+    N_ACTIONS,
+    OBSERVATION_SHAPE,
+    Emulator,
+    Position,
+    Snapshot,
+)
+from hypogoal.domains.montezuma_ladders import REACH, SUB_GOAL, Ladder, at_base, ladder_named
+
+SUB_GOALS = (SUB_GOAL,)
+MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
+START_STATES = 32
+PHASES = range(2, 258)  # frames that the agent is kept waiting, from which the start states' are drawn
+TRIES = 4  # phases tried for each start state wanted
+FRAMES_PER_SECOND = 60
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where an episode begins.
+
+    Attributes:
+        snapshot: the state.
+        position: of the agent.
+        on_the_way: on the way down, not at the top.
+        picture: the console's, uint8 (210, 160, 3): a restored emulator has none to show before its first step.
+    """
+
+    snapshot: Snapshot
+    position: Position
+    on_the_way: bool
+    picture: NDArray[np.uint8]
+
+
+def make_starts(emulator: Emulator, ladder: Ladder, count: int, seed: int, *, along: float = 0.0) -> list[Start]:
+    """Spec D4: states at the top of a ladder from which the scripted descent lives, and some on the way down.
+
+    They differ in the phase of what moves, drawn from ``seed``. No two look the same if ``TRIES`` phases for each of
+    them offer so many looks. The top of 14-22 has one only: its states differ in what is out of sight.
+
+    Args:
+        emulator: is left in some other state.
+        ladder: the ladder.
+        count: how many states.
+        seed: of the phases and of the places on the way. Same seed, same states, whatever was played before.
+        along: the share of the states that are on the way down, at random steps of the scripted descent; between 0
+            and 1 there is at least one of each kind.
+
+    Returns:
+        The states, those at the top first.
+
+    Raises:
+        UserError: there are fewer such states, or ``along`` is no share.
+    """
+    if not 0.0 <= along <= 1.0 or count < (2 if 0.0 < along < 1.0 else 1):
+        raise UserError(
+            "start states cannot be shared out like this",
+            f"start_states={count}, along={along}",
+            "Give along a share, 0 to 1, and one state or more of each kind.",
+        )
+    rng = rng_for(seed, "start-states", ladder.name)
+    ways = round(along * count) if along in (0.0, 1.0) else min(max(round(along * count), 1), count - 1)
+    tops = _looking_different(_tops(emulator, ladder, TRIES * count, rng), count)
+    found = [*tops[: count - ways], *_looking_different(_ways_down(emulator, ladder, tops, rng), ways)]
+    if len(found) < count:
+        raise UserError(
+            f"only {len(found)} of {count} start states live through the descent", ladder.name, "Ask for fewer."
+        )
+    return found
+
+
+def _tops(emulator: Emulator, ladder: Ladder, tries: int, rng: np.random.Generator) -> Iterator[Start]:
+    """The top in random phases, where the descent from it lives."""
+    for phase in rng.permutation(PHASES)[:tries].tolist():
+        snapshot = emulator.place(*ladder.top, phase=phase)
+        if snapshot is None or emulator.position() != ladder.top:
+            continue
+        start = _start(emulator, on_the_way=False)
+        emulator.screens = False
+        lives = descend(emulator, ladder)
+        emulator.screens = True
+        if lives:
+            yield start
+
+
+def _ways_down(emulator: Emulator, ladder: Ladder, tops: Sequence[Start], rng: np.random.Generator) -> Iterator[Start]:
+    """Random steps of the descents from ``tops``, but for the last: that is the base."""
+    for number in rng.permutation(len(tops) * (ladder.steps_down - 1)).tolist():
+        top, steps = divmod(number, ladder.steps_down - 1)
+        emulator.restore(tops[top].snapshot)
+        for _ in range(steps + 1):
+            emulator.step(DOWN)
+        yield _start(emulator, on_the_way=True)
+
+
+def _start(emulator: Emulator, *, on_the_way: bool) -> Start:
+    return Start(emulator.save(), emulator.position(), on_the_way, emulator.screen_rgb())
+
+
+def _looking_different(starts: Iterator[Start], count: int) -> list[Start]:
+    """The first ``count`` that look different; others make up for those that are missing when no more come."""
+    chosen: dict[bytes, Start] = {}
+    others: list[Start] = []
+    while len(chosen) < count and (start := next(starts, None)) is not None:
+        look = start.snapshot.stack.tobytes()
+        if look in chosen:
+            others.append(start)
+        else:
+            chosen[look] = start
+    return [*chosen.values(), *others][:count]
+
+
+def descend(emulator: Emulator, ladder: Ladder) -> bool:
+    """The scripted descent: DOWN from the top to the base. Whether the agent gets there alive."""
+    for _ in range(ladder.steps_down):
+        emulator.step(DOWN)
+        if not emulator.alive():
+            return False
+    room, x, y = emulator.position()
+    return room == ladder.base.room and max(abs(x - ladder.base.x), abs(y - ladder.base.y)) <= REACH
+
+
+def draw_start(starts: Sequence[Start], along: float, rng: np.random.Generator) -> int:
+    """The number of the start state that an episode begins with: with probability ``along`` one on the way down."""
+    tops = sum(not start.on_the_way for start in starts)
+    if along and rng.random() < along:
+        return int(rng.integers(tops, len(starts)))
+    return int(rng.integers(tops))
+
+
+def labels_of(positions: NDArray[np.int64], alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Spec B4: the true predicates, bool (n, 1), for positions (n, 3) of the agent and whether it is alive (n,)."""
+    return (at_base(positions) & alive)[:, None]
+
+
+class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
+    """Montezuma's Revenge from the top of a ladder on. Gymnasium id ``hypogoal/MontezumaLadder-v0``.
+
+    An observation is the last four agent steps' frames, uint8 (84, 84, 4), grey, the oldest first; 18 actions, each
+    played for four frames; the reward is the game's. ``info`` has ``labels`` (sub-goal: whether it is reached),
+    ``position`` (room, x, y in the RAM's units) and ``alive``.
+
+    Args:
+        start: the ladder, see ``montezuma_ladders.LADDERS``.
+        max_steps: agent steps after which an episode is truncated.
+        end_at_death: an episode terminates when the agent begins to die; False, when the game is over.
+        along: the share of episodes that begin somewhere on the way down instead of at the top.
+        render_mode: None, or ``rgb_array``: the console's picture, uint8 (210, 160, 3).
+        start_states: how many states episodes begin with; see ``make_starts``.
+        start_seed: of those states. ``reset(seed)`` draws one of them, ``reset(options={"start_state": n})`` takes the
+            n-th.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND // FRAME_SKIP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        start: str = "1L",
+        max_steps: int = MAX_STEPS,
+        end_at_death: bool = True,
+        along: float = 0.0,
+        render_mode: str | None = None,
+        start_states: int = START_STATES,
+        start_seed: int = 0,
+    ):
+        self.max_steps, self.end_at_death, self.along, self.render_mode = max_steps, end_at_death, along, render_mode
+        self.observation_space = spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
+        self.action_space = spaces.Discrete(N_ACTIONS)
+        self.emulator = Emulator()
+        self.starts = make_starts(self.emulator, ladder_named(start), start_states, start_seed, along=along)
+        self.elapsed = 0
+        self._picture: NDArray[np.uint8] | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """Begin an episode with one of the start states."""
+        super().reset(seed=seed)
+        number = (options or {}).get("start_state")
+        if number is None:
+            number = draw_start(self.starts, self.along, self.np_random)
+        self.emulator.restore(self.starts[number].snapshot)
+        self._picture = self.starts[number].picture
+        self.elapsed = 0
+        return self.emulator.stack, self._info()
+
+    def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        """Four frames of an action."""
+        reward = self.emulator.step(int(action))
+        self._picture = None
+        self.elapsed += 1
+        info = self._info()
+        terminated = self.emulator.ale.game_over() or (self.end_at_death and not info["alive"])
+        return self.emulator.stack, reward, terminated, self.elapsed >= self.max_steps, info
+
+    def labels(self) -> NDArray[np.bool_]:
+        """The true predicates of the current state, bool (1,)."""
+        return labels_of(np.array([self.emulator.position()]), np.array([self.emulator.alive()]))[0]
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "labels": dict(zip(SUB_GOALS, self.labels().tolist(), strict=True)),
+            "position": self.emulator.position(),
+            "alive": self.emulator.alive(),
+        }
+
+    def render(self) -> Any:
+        """The console's picture, uint8 (210, 160, 3); None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return self.emulator.screen_rgb() if self._picture is None else self._picture.copy()

@@ -1,0 +1,14 @@
+"""The ladder environment's Gymnasium id. Light on purpose: the emulator is loaded only when one is made."""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register as register_env
+from gymnasium.envs.registration import registry
+
+ENV_ID = "hypogoal/MontezumaLadder-v0"
+
+
+def register() -> None:
+    """Spec B4: make ``gymnasium.make("hypogoal/MontezumaLadder-v0")`` work; calling it again does nothing."""
+    if ENV_ID not in registry:
+        register_env(id=ENV_ID, entry_point="hypogoal.domains.montezuma:MontezumaLadder")

@@ -1,0 +1,373 @@
+"""The section on Figure 3: members on rooms that training did and did not see, over labelled ladder groups."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hypogoal.evaluation.ladder_figures import Panel, Series, scores_over_groups
+from hypogoal.evaluation.page.blocks import (
+    Block,
+    Material,
+    deviation,
+    figure,
+    fixed,
+    interval,
+    listed,
+    row,
+    section,
+    table,
+)
+
+SCOPES = {"unseen": "unseen rooms", "all": "all rooms"}
+SCORES = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}
+WHICH = {
+    "best": "best member",
+    "validated": "validated member",
+    "mean": "mean of members",
+    "worst": "worst member",
+}
+SEEN = {0: "no", 1: "unlabelled", 2: "labelled"}
+PAPER = (
+    "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
+    "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
+    "positive is not said, so look at the differences between methods and N rather than at the level."
+)
+
+
+def rooms_section(material: Material) -> Block:
+    """Figure 3, its tables, every room and every kind of false positive."""
+    rows = material.metrics["rooms"]
+    title = "Hypotheses against labelled ladders"
+    if not rows:
+        missing = ["Figure 3: it needs ensemble artefacts of data whose held-out states say which rooms training saw."]
+        return section("rooms", title, [], [], missing)
+    text = (
+        "N is the number of ladder groups with labels. Members are judged on held-out states of rooms that no training "
+        "state came from (unseen), and of all rooms, training rooms included, as in the paper. The best member is "
+        "picked on the very states that it is scored on, so it rises with the number of members by chance alone; the "
+        "validated member is the one with the highest balanced accuracy on held-out states in the rooms of labelled "
+        "groups, which a user could pick too."
+    )
+    blocks = []
+    for sub_goal in dict.fromkeys(entry["sub_goal"] for entry in rows):
+        own = [entry for entry in rows if entry["sub_goal"] == sub_goal]
+        blocks += [_best(material, own), _four(material, own), *(_table(own, scope) for scope in SCOPES)]
+        blocks += [_intervals(own), _differences(own)]
+        blocks += _kinds(material, own) + _rooms(material, own)
+    blocks.append(_members(material))
+    return section("rooms", title, [text], blocks)
+
+
+def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(entry["method"] for entry in rows))
+
+
+def _numbers(rows: Sequence[Mapping[str, Any]]) -> list[int | None]:
+    """The Ns of some rows, ascending, None (no such thing) last."""
+    return sorted({entry["groups"] for entry in rows}, key=lambda groups: (groups is None, groups or 0))
+
+
+def _panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str, which: str) -> Panel:
+    series = []
+    for name in _names(rows):
+        own = [entry for entry in rows if entry["method"] == name and entry["groups"] is not None]
+        found = [entry["scores"][scope][score][which] for entry in own]
+        series.append(
+            Series(
+                name,
+                np.array([entry["groups"] for entry in own], dtype=np.int64),
+                np.array([np.nan if one["mean"] is None else one["mean"] for one in found], dtype=np.float64),
+                np.array(
+                    [np.nan if one["standard_deviation"] is None else one["standard_deviation"] for one in found],
+                    dtype=np.float64,
+                ),
+            )
+        )
+    blind = {}
+    for entry in sorted(rows, key=lambda entry: entry["groups"] or 0):
+        never = entry["always_no"][scope] if score == "accuracy" else 0.5 if entry["positives"][scope] else None
+        if entry["groups"] is not None and never is not None:
+            blind[entry["groups"]] = never
+    return Panel(title, blind, series)
+
+
+def _identity(base: str, rows: Sequence[Mapping[str, Any]], material: Material) -> str:
+    """A figure's name; with the sub-goal where there are several."""
+    several = len({entry["sub_goal"] for entry in material.metrics["rooms"]}) > 1
+    return f"{base}-{rows[0]['sub_goal']}" if several else base
+
+
+def _best(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
+    label = "Figure 3: the best member against labelled ladder groups"
+    missing = "Its data do not say how many ladder groups have labels (setting 'groups')."
+    drawn = None
+    if any(entry["groups"] is not None for entry in rows):
+        panels = [
+            _panel(rows, f"{SCORES[score]}, {SCOPES[scope]}", scope, score, "best")
+            for score in ("accuracy", "balanced_accuracy")
+            for scope in ("all", "unseen")
+        ]
+        drawn = scores_over_groups(panels, _names(rows))
+    caption = (
+        f"Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; bands: ± "
+        f"one standard deviation over seeds, as in the paper. Dotted: never saying yes. {_seeds(material, rows)} "
+        f"{_why_dashes(rows)}{PAPER}"
+    )
+    return figure(material, _identity("figure3", rows, material), label, drawn, caption, missing)
+
+
+def _four(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
+    drawn = None
+    if any(entry["groups"] is not None for entry in rows):
+        panels = [_panel(rows, name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
+        drawn = scores_over_groups(panels, _names(rows))
+    caption = (
+        "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
+        f"over ensemble seeds, bands: ± one standard deviation. {_why_dashes(rows)}"
+        "Only the second can be had without labels from the rooms it is for."
+    )
+    label = "Balanced accuracy on unseen rooms"
+    return figure(material, _identity("unseen", rows, material), label, drawn, caption, "As above.")
+
+
+def _seeds(material: Material, rows: Sequence[Mapping[str, Any]]) -> str:
+    names = set(_names(rows))
+    seeds = sorted({one["seed"] for one in material.metrics["ensembles"] if one.get("method") in names})
+    return f"Ensemble seed{'s' if len(seeds) > 1 else ''} {listed(seeds)}."
+
+
+def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
+    bare = sorted({entry["groups"] for entry in rows if entry["positives"]["unseen"] == 0 and entry["groups"]})
+    if not bare:
+        return ""
+    return (
+        f"At N={listed(bare)} no unseen room has a ladder base left, so balanced accuracy on them is not defined (–) "
+        "and accuracy there is the share of negatives called negative. "
+    )
+
+
+def _table(rows: Sequence[Mapping[str, Any]], scope: str) -> Block:
+    lines, last = [], ""
+    for entry in rows:
+        found = entry["scores"][scope]
+        lines.append(
+            row(
+                entry["method"] if entry["method"] != last else "",
+                _number(entry["groups"]),
+                *(deviation(found[score][which], 2) for score in SCORES for which in WHICH),
+                str(entry["ensembles"]),
+                mark="first" if entry["method"] != last else "",
+            )
+        )
+        last = entry["method"]
+    columns = [f"{name} {which}" for name in ("bal.", "acc.") for which in WHICH]
+    return table(
+        ("method", "N", *columns, "seeds"),
+        lines,
+        texts=2,
+        tight=True,
+        heading=f"On held-out states of {SCOPES[scope]}",
+        caption="Balanced accuracy (bal.) and accuracy (acc.) of the best, the validated, the mean and the "
+        f"worst member: mean over ensemble seeds ± standard deviation over them. {_never(rows, scope)}"
+        f"{_why_dashes(rows) if scope == 'unseen' else PAPER}",
+    )
+
+
+def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
+    """What accuracy is worth here: that of a member that never says yes, by N."""
+    found = {entry["groups"]: entry["always_no"][scope] for entry in rows if entry["always_no"][scope] is not None}
+    told = [
+        f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in sorted(found.items(), key=str)
+    ]
+    return f"Never saying yes has accuracy {listed(told)}. " if told else ""
+
+
+def _number(groups: int | None) -> str:
+    return "–" if groups is None else str(groups)
+
+
+def _intervals(rows: Sequence[Mapping[str, Any]]) -> Block:
+    lines, last = [], ""
+    for entry in rows:
+        found = [entry["scores"][scope]["balanced_accuracy"] for scope in SCOPES]
+        lines.append(
+            row(
+                entry["method"] if entry["method"] != last else "",
+                _number(entry["groups"]),
+                *(interval(own[which], 3) for own in found for which in ("best", "validated", "mean")),
+                mark="first" if entry["method"] != last else "",
+            )
+        )
+        last = entry["method"]
+    columns = [f"{scope}: {which}" for scope in ("unseen", "all") for which in ("best", "validated", "mean")]
+    return table(
+        ("method", "N", *columns),
+        lines,
+        texts=2,
+        tight=True,
+        folded="Interquartile means of balanced accuracy with intervals",
+        caption="Interquartile mean over ensemble seeds with its 95 % bootstrap interval (2,000 resamples of seeds); "
+        "no interval with one seed.",
+    )
+
+
+def _differences(rows: Sequence[Mapping[str, Any]]) -> Block:
+    lines, last = [], ""
+    for entry in rows:
+        lines.append(
+            row(
+                entry["method"] if entry["method"] != last else "",
+                _number(entry["groups"]),
+                deviation(entry["disagreement_unlabelled"], 3),
+                deviation(entry["disagreement_heldout"], 3),
+                fixed(entry["tied"], 1),
+                mark="first" if entry["method"] != last else "",
+            )
+        )
+        last = entry["method"]
+    return table(
+        ("method", "N", "disagree, unlabelled", "disagree, held-out", "tied on validation"),
+        lines,
+        texts=2,
+        tight=True,
+        heading="How different the members are",
+        caption="Share of states on which two members' verdicts differ, mean over pairs; mean over seeds ± standard "
+        "deviation. Tied: members with the same, highest balanced accuracy in the rooms of labelled groups, of which "
+        "the first counts as validated; where all are tied, validation chooses nothing.",
+    )
+
+
+def _ensembles(material: Material, entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The sub-goal rows of all ensembles (seeds) behind a row of the table."""
+    found = []
+    for ensemble in material.metrics["ensembles"]:
+        if ensemble.get("method") == entry["method"] and ensemble["groups"] == entry["groups"]:
+            found += [goal for goal in ensemble["sub_goals"] if goal["sub_goal"] == entry["sub_goal"]]
+    return found
+
+
+def _kinds(material: Material, rows: Sequence[Mapping[str, Any]]) -> list[Block]:
+    blocks = []
+    for place, groups in enumerate(_numbers(rows)):
+        here = [entry for entry in rows if entry["groups"] == groups]
+        found = [[goal["rooms"] for goal in _ensembles(material, entry)] for entry in here]
+        kinds = {
+            (one["scope"], one["kind"]): one["negatives"]
+            for own in found
+            for rooms in own
+            for one in rooms["false_positives"]
+        }
+        lines: list[dict[str, Any]] = []
+        for (scope, kind), negatives in kinds.items():
+            cells = []
+            for own in found:
+                shares = [_shares(rooms, scope, kind) for rooms in own]
+                cells.append(_percent([float(np.mean(share)) for share, _ in shares]))
+                cells.append(_percent([picked for _, picked in shares if picked is not None]))
+            first = not lines or lines[-1]["scope"] != scope
+            line = row(SCOPES[scope] if first else "", kind, f"{negatives:,}", *cells, mark="first" if first else "")
+            lines.append({**line, "scope": scope})
+        if lines:
+            name = f"False positives by kind, N={_number(groups)}"
+            columns = [f"{entry['method']}: {which}" for entry in here for which in ("mean", "validated")]
+            blocks.append(
+                table(
+                    ("held-out states of", "negatives", "states", *columns),
+                    lines,
+                    texts=2,
+                    tight=True,
+                    heading=name if place == 0 else "",
+                    folded="" if place == 0 else name,
+                    caption="Share of each kind of negatives that a member calls reached, in %: mean over members and "
+                    "seeds, and of the validated member, mean over seeds. Balanced accuracy hides these: a "
+                    "member that says yes on the ladder ends an option half-way.",
+                )
+            )
+    return blocks
+
+
+def _shares(rooms: Mapping[str, Any], scope: str, kind: str) -> tuple[list[float], float | None]:
+    """Of one ensemble every member's share, and the validated member's."""
+    for one in rooms["false_positives"]:
+        if (one["scope"], one["kind"]) == (scope, kind):
+            validated = rooms["validated"]["member"]
+            return one["share"], None if validated is None else one["share"][validated]
+    return [float("nan")], None
+
+
+def _percent(values: Sequence[float]) -> str:
+    known = [value for value in values if not np.isnan(value)]
+    return f"{100 * float(np.mean(known)):.1f}" if known else "–"
+
+
+def _rooms(material: Material, rows: Sequence[Mapping[str, Any]]) -> list[Block]:
+    blocks = []
+    for groups in _numbers(rows):
+        here = [entry for entry in rows if entry["groups"] == groups]
+        found = [[goal["rooms"]["by_room"] for goal in _ensembles(material, entry)] for entry in here]
+        lines = []
+        for index, room in enumerate(found[0][0] if found and found[0] else ()):
+            cells = []
+            for own in found:
+                for score in ("balanced_accuracy", "accuracy"):
+                    values = [value for by_room in own for value in by_room[index][score] if value is not None]
+                    cells.append(fixed(float(np.mean(values)) if values else None, 2))
+            about = (str(room["room"]), SEEN.get(room["seen"], str(room["seen"])))
+            lines.append(row(*about, f"{room['states']:,}", f"{room['positives']:,}", *cells))
+        if lines:
+            columns = [f"{entry['method']}: {name}" for entry in here for name in ("bal. acc.", "accuracy")]
+            blocks.append(
+                table(
+                    ("room", "in training", "states", "positives", *columns),
+                    lines,
+                    texts=2,
+                    tight=True,
+                    folded=f"Every room, N={_number(groups)}",
+                    caption="Mean over members and ensemble seeds, on the room's held-out states. Rooms without a "
+                    "ladder base have no positives and so no balanced accuracy.",
+                )
+            )
+    return blocks
+
+
+def _members(material: Material) -> Block:
+    lines = []
+    count = 0
+    for ensemble in material.metrics["ensembles"]:
+        for goal in ensemble["sub_goals"]:
+            if "rooms" not in goal:
+                continue
+            count += 1
+            scopes, validated = goal["rooms"]["scopes"], goal["rooms"]["validated"]["member"]
+            for index, member in enumerate(goal["members"]):
+                scores = [
+                    fixed(scopes[scope]["members"][index][score], 3)
+                    for scope, names in (
+                        ("unseen", ("balanced_accuracy", "accuracy", "precision", "recall")),
+                        ("all", ("balanced_accuracy", "accuracy", "precision", "recall")),
+                        ("labelled", ("balanced_accuracy",)),
+                    )
+                    for score in names
+                ]
+                lines.append(
+                    row(
+                        ensemble["path"] if index == 0 else "",
+                        f"{index}{' (validated)' if index == validated else ''}",
+                        *scores,
+                        fixed(member["says_yes_unlabelled"], 3),
+                        mark="first" if index == 0 else "",
+                    )
+                )
+    columns = [f"{scope}: {score}" for scope in ("unseen", "all") for score in ("bal. acc.", "acc.", "prec.", "recall")]
+    return table(
+        ("ensemble", "member", *columns, "validation: bal. acc.", "yes, unlabelled"),
+        lines,
+        texts=2,
+        tight=True,
+        folded=f"Every member of {count} ensembles",
+        caption="Validation: held-out states in rooms of labelled groups. The last column is the share of unlabelled "
+        "states that the member calls positive.",
+    )

@@ -1,0 +1,301 @@
+"""The emulator: what is seen is Gymnasium's, states are exact, RAM means what its names say (Spec B4, B5)."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import ale_py
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.domains.montezuma_emulator import (
+    DOWN,
+    FIRE,
+    LEFT,
+    N_ACTIONS,
+    NOOP,
+    OBSERVATION_SHAPE,
+    ON_LADDER,
+    RAM,
+    RIGHT,
+    ROOMS,
+    TORCH,
+    UP,
+    Emulator,
+    Position,
+    Snapshot,
+    load_ale,
+    row_of,
+    stack_frames,
+    state_from_bytes,
+)
+
+pytestmark = pytest.mark.atari
+
+TOP_1L, TOP_1M = Position(1, 21, 192), Position(1, 77, 235)
+
+
+@pytest.fixture(scope="module")
+def emulator() -> Emulator:
+    return Emulator()
+
+
+@pytest.fixture(scope="module")
+def another() -> Emulator:
+    return Emulator(seed=12345)
+
+
+def clumsy(seed: int, count: int, repeat: int = 3) -> NDArray[np.int64]:
+    """Random actions, each a few times, with a bias to walk off to the right: all lives are lost in 300 steps."""
+    rng = np.random.default_rng(seed)
+    drawn = np.where(rng.random(count) < 0.3, RIGHT, rng.integers(N_ACTIONS, size=count))
+    return np.repeat(drawn, repeat)[:count]
+
+
+def placed(emulator: Emulator, where: Position, phase: int = 10) -> Snapshot:
+    """The agent at a place where it lives."""
+    snapshot = emulator.place(*where, phase=phase)
+    assert snapshot is not None
+    assert emulator.position() == where
+    return snapshot
+
+
+def gymnasiums() -> FrameStackObservation:
+    """Gymnasium's own wrappers, as the paper's state is usually made."""
+    gymnasium.register_envs(ale_py)
+    env = gymnasium.make("ALE/MontezumaRevenge-v5", frameskip=1, repeat_action_probability=0.0)
+    return FrameStackObservation(AtariPreprocessing(env, noop_max=0, frame_skip=4, screen_size=84), 4)
+
+
+def test_what_is_seen_is_gymnasiums(emulator: Emulator) -> None:
+    """Spec B4: pixels and rewards of two whole games, all lives lost, the step that ends the game included."""
+    env = gymnasiums()
+    assert env.unwrapped.ale.getLegalActionSet() == emulator.actions  # type: ignore[attr-defined]
+    assert env.action_space == gymnasium.spaces.Discrete(N_ACTIONS)
+    for seed in (0, 1):
+        image, _ = env.reset(seed=seed)
+        assert np.array_equal(emulator.reset(), np.moveaxis(image, 0, -1))
+        assert emulator.stack.shape == OBSERVATION_SHAPE
+        steps = deaths = dying = 0
+        for action in clumsy(seed, 600).tolist():
+            image, reward, terminated, _, _ = env.step(action)
+            assert emulator.step(action) == reward
+            assert np.array_equal(emulator.stack, np.moveaxis(image, 0, -1))
+            assert emulator.ale.game_over() == terminated
+            deaths += not dying and emulator.read("dying") > 0
+            dying, steps = emulator.read("dying"), steps + 1
+            if terminated:
+                break
+        assert terminated
+        assert not emulator.alive()
+        assert deaths == 6
+        assert steps > 150
+
+
+def test_rewards_are_gymnasiums(emulator: Emulator) -> None:
+    """Spec B4: the key left of the first ladder gives 100; four steps on, the pictures are the same again."""
+    env = gymnasiums()
+    env.reset()
+    env.unwrapped.ale.restoreState(placed(emulator, TOP_1L).state)  # type: ignore[attr-defined]
+    rewards = []
+    for action in (LEFT, FIRE, FIRE, NOOP, NOOP):
+        image, reward, *_ = env.step(action)
+        rewards.append(reward)
+        assert emulator.step(action) == reward
+    assert sum(rewards) == 100
+    assert np.array_equal(emulator.stack, np.moveaxis(image, 0, -1))
+
+
+@pytest.mark.parametrize(
+    ("room", "action", "phase"), [(1, LEFT, 2), (1, LEFT, 45), (7, LEFT, 2), (7, LEFT, 45), (8, RIGHT, 2)]
+)
+def test_the_step_that_ends_the_game(emulator: Emulator, another: Emulator, room: int, action: int, phase: int) -> None:
+    """Spec B4: it ends within four frames, and what is then seen is Gymnasium's, before and after a restore."""
+    placed(emulator, Position(room, 77, 235), phase)
+    emulator.write("lives", 0)
+    env = gymnasiums()
+    env.reset()
+    env.unwrapped.ale.restoreState(emulator.save().state)  # type: ignore[attr-defined]
+    while not emulator.ale.game_over():
+        before = emulator.save()
+        emulator.step(action)
+        image, _, terminated, _, _ = env.step(action)
+        assert terminated == emulator.ale.game_over()
+    assert np.array_equal(emulator.stack, np.moveaxis(image, 0, -1))
+    placed(another, TOP_1L)  # something else on its screen and in its buffers
+    another.restore(before)
+    another.step(action)
+    assert another.ale.game_over()
+    assert np.array_equal(another.stack, emulator.stack)
+
+
+def test_states_are_exact(emulator: Emulator, another: Emulator) -> None:
+    """Spec G1: 400 actions, game over among them, in another emulator of another seed, through bytes: every bit."""
+    emulator.reset()
+    actions = clumsy(1, 440).tolist()
+    for action in actions[:40]:
+        emulator.step(action)
+    saved = emulator.save()
+    looks, memory, rewards = [], [], []
+    for action in actions[40:]:
+        rewards.append(emulator.step(action))
+        looks.append(emulator.stack)
+        memory.append(emulator.ram().copy())
+    assert emulator.ale.game_over()
+    placed(another, TOP_1M)
+    another.restore(Snapshot(state_from_bytes(saved.state.serialize()), saved.seen, saved.screen))
+    for number, action in enumerate(actions[40:]):
+        assert another.step(action) == rewards[number]
+        assert np.array_equal(another.stack, looks[number])
+        assert np.array_equal(another.ram(), memory[number])
+    assert another.ale.game_over()
+
+
+def test_stacks_are_the_callers_to_keep(emulator: Emulator) -> None:
+    """Later steps do not draw into a stack or a saved state; a stack is the four frames side by side."""
+    saved = placed(emulator, TOP_1L)
+    stack, copies = emulator.stack, (emulator.stack.copy(), saved.screen.copy(), saved.stack)
+    for action in (DOWN, DOWN, LEFT, UP, UP):
+        emulator.step(action)
+    assert np.array_equal(stack, copies[0])
+    assert np.array_equal(saved.screen, copies[1])
+    assert np.array_equal(saved.stack, copies[2])
+    emulator.restore(saved)
+    assert np.array_equal(emulator.stack, np.stack(saved.seen, axis=-1))
+    out = np.zeros((2, *OBSERVATION_SHAPE), np.uint8)
+    stack_frames(saved.seen, out[1])
+    assert np.array_equal(out[1], copies[2])
+    assert not out[0].any()
+
+
+def test_playing_unseen_is_the_same_game(emulator: Emulator) -> None:
+    """``screens=False`` plays on without a look; single frames are no agent steps."""
+    saved = placed(emulator, TOP_1L)
+    for _ in range(4):
+        emulator.step(DOWN)
+    memory, stack = emulator.ram().copy(), emulator.stack
+    emulator.restore(saved)
+    emulator.screens = False
+    for _ in range(3):
+        emulator.step(DOWN)
+    emulator.frames(DOWN, 4)
+    emulator.screens = True
+    assert np.array_equal(emulator.ram(), memory)
+    assert np.array_equal(emulator.stack, saved.stack)
+    assert not np.array_equal(stack, saved.stack)
+
+
+def traced(emulator: Emulator, action: int, steps: int, *names: str) -> list[list[int]]:
+    """The named bytes of RAM after each of some steps of one action."""
+    rows = []
+    for _ in range(steps):
+        emulator.step(action)
+        rows.append([emulator.read(name) for name in names])
+    return rows
+
+
+def test_ram_says_where_the_agent_is_and_how(emulator: Emulator) -> None:
+    """Spec B4: walking right moves x, climbing moves y and has a pose, a jump counts down, standing is idle."""
+    saved = placed(emulator, TOP_1L)
+    assert (emulator.read("pose"), emulator.read("jump"), emulator.read("fall")) == (8, 255, 0)
+    climbed = traced(emulator, DOWN, 9, "pose", "room", "x", "y")
+    assert all(row[:3] == [ON_LADDER, 1, 21] for row in climbed)
+    heights = [row[3] for row in climbed]
+    assert heights == sorted(heights, reverse=True)
+    assert heights[-1] == 148
+    emulator.restore(saved)
+    jumped = traced(emulator, FIRE, 8, "jump", "y", "pose", "fall")
+    counters = [row[0] for row in jumped[:4]]
+    assert counters == sorted(counters, reverse=True)
+    assert counters[0] < 20
+    assert max(row[1] for row in jumped) > 192
+    assert all(row[2] == 6 and row[3] == 0 for row in jumped[:4])
+    assert jumped[-1] == [255, 192, 8, 0]
+    placed(emulator, TOP_1M)
+    assert traced(emulator, RIGHT, 2, "pose", "x", "y") == [[18, 81, 235], [18, 85, 235]]
+
+
+def test_ram_says_when_the_agent_dies(emulator: Emulator) -> None:
+    """Spec B4: off the ledge it falls, the fall is counted, the death counts down and has taken a life."""
+    placed(emulator, TOP_1M)
+    lives = emulator.read("lives")
+    assert emulator.ale.lives() == lives + 1 == 6
+    rows = traced(emulator, LEFT, 21, "fall", "dying", "lives")
+    falling = [row[0] for row in rows if row[0]]
+    assert falling == sorted(falling)
+    assert len(falling) == 5
+    dying = [row[1] for row in rows if row[1]]
+    assert dying == list(range(12, 0, -1))
+    assert rows[-1] == [0, 0, lives - 1]
+    assert all(row[2] == lives - 1 for row in rows if row[1])
+
+
+def test_alive_is_not_dying(emulator: Emulator) -> None:
+    """Spec B4: an agent is alive until its death begins."""
+    placed(emulator, TOP_1M)
+    seen = []
+    for _ in range(14):
+        emulator.step(LEFT)
+        assert emulator.alive() == (emulator.read("dying") == 0)
+        seen.append(emulator.alive())
+    assert seen == [True] * 8 + [False] * 6
+
+
+@pytest.mark.parametrize("room", range(ROOMS))
+def test_the_agent_can_be_put_into_every_room(emulator: Emulator, another: Emulator, room: int) -> None:
+    """Spec B5: with the torch, alive, in the row of the pyramid that the room is in, drawn; always the same."""
+    places = [(x, phase) for phase in (2, 60, 120) for x in (77, 20, 130)]
+    for x, phase in places:
+        snapshot = emulator.place(room, x, 235, phase=phase)
+        if snapshot is not None:
+            break
+    assert snapshot is not None
+    assert emulator.position().room == room
+    assert emulator.alive()
+    assert emulator.read("inventory") & TORCH
+    assert emulator.read("row") == row_of(room)
+    lit = (emulator.screen_rgb().max(axis=2) > 0).mean()
+    assert lit > 0.15
+    if room >= 16:  # dark without the torch
+        emulator.write("inventory", emulator.read("inventory") & ~TORCH)
+        emulator.step(NOOP)
+        assert (emulator.screen_rgb().max(axis=2) > 0).mean() < lit - 0.05
+    again = another.place(room, x, 235, phase=phase)
+    assert again is not None
+    assert np.array_equal(again.stack, snapshot.stack)
+
+
+def test_places_where_nobody_lives(emulator: Emulator) -> None:
+    """Spec B5: None where the agent falls to its death; no such room is one clear line (Spec G2)."""
+    assert emulator.place(1, 63, 235, settle=4) is not None  # beside the upper floor, still falling
+    assert emulator.place(1, 63, 235, settle=10) is None
+    for room in (-1, ROOMS):
+        with pytest.raises(UserError, match=r"no such room: -?\d+\. Rooms are 0 to 23"):
+            emulator.place(room, 77, 235)
+
+
+def test_ram_names_are_addresses_of_the_console() -> None:
+    """Spec B5: 0x82, which restarts the game, is none of them; each is in the console's 128 bytes, once."""
+    assert 0x02 not in RAM.values()
+    assert len(set(RAM.values())) == len(RAM)
+    assert all(0 <= index < 128 for index in RAM.values())
+
+
+def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Spec G2: no emulator, no OpenCV or no ROM gives one line with what to do."""
+    for module in ("cv2", "ale_py"):
+        with monkeypatch.context() as patched:
+            patched.setitem(sys.modules, module, None)
+            with pytest.raises(UserError, match=r"cannot be played .*pip install ale-py opencv") as error:
+                load_ale(0)
+            assert "\n" not in str(error.value)
+    for rom in (None, tmp_path / "none.bin"):
+        monkeypatch.setattr("ale_py.roms.get_rom_path", lambda name, rom=rom: rom)
+        with pytest.raises(UserError, match=r"no ROM of the game: montezuma_revenge\. Install") as error:
+            load_ale(0)
+        assert "\n" not in str(error.value)

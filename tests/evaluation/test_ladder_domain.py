@@ -1,0 +1,48 @@
+"""Spec F1, F3, F4: what the evaluation asks of a domain with rooms, Montezuma's Revenge has."""
+
+import h5py
+import numpy as np
+import pytest
+from ladder_run import COLUMNS
+
+from hypogoal.domains.base import load_domain
+from hypogoal.evaluation.distance import at_base, distance_tables, fates, ladder_numbers
+from hypogoal.evaluation.reading import read_executions
+from hypogoal.evaluation.shown import show_stops
+from hypogoal.options.recording import write_table
+
+
+@pytest.mark.atari
+def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
+    """Spec F3, F4: of 2-6 the top, the base and half-way: 0 only at the base, drawn in two rooms inside the picture."""
+    domain = load_domain("montezuma")
+    stops = np.array([(2, 77, 235), (6, 77, 235), (6, 77, 250), (6, 79, 237), (6, 80, 237)])
+    away = domain.distance(stops)
+    rows = [(n, 0, 9, 1, 0, 0, *stop, distance) for n, (stop, distance) in enumerate(zip(stops, away, strict=True))]
+    write_table(tmp_path / "executions.csv", COLUMNS, rows)
+    own = read_executions(tmp_path / "executions.csv")
+    assert own.distance[1] == 0
+    assert own.distance[0] > own.distance[2] > 4
+    assert at_base(own).tolist() == [False, True, False, True, False]
+    (numbers,) = ladder_numbers(own, domain.sub_goals, 1, {}, masked=False)
+    row = {"path": "options", "method": "single CNN", "groups": 2, "ladder": "2-6", "seed": 0, **numbers}
+    (over,) = distance_tables([row], ["2-6"])["over_ladders"]
+    assert over["best"]["mean"] == pytest.approx(away.mean())
+    with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
+        (shown,) = show_stops([row], ["2-6"], {"options": own}, domain, arrays)
+        assert shown["rooms"] == [2, 6]
+        assert arrays["stops/options/0/fates"][()].tolist() == fates(own).tolist()
+        pictures = [arrays[f"pictures/{room}"][()] for room in shown["rooms"]]
+        pixels = arrays["stops/options/0/pixels"][()]
+    assert all(picture.shape == (210, 160, 3) and picture.dtype == np.uint8 for picture in pictures)
+    assert (pictures[0] != pictures[1]).any()
+    assert (pixels >= 0).all() and (pixels < [160, 210]).all()
+    assert set(shown["columns"][0]) >= {"method", "member", "option", "distance"}
+
+
+def test_the_domain_names_its_kinds_and_starts():
+    """Spec F1, F3: kinds of negatives and the ladders' order come from the domain."""
+    domain = load_domain("montezuma")
+    assert "on-ladder" in domain.kinds
+    assert domain.starts[0] == "1L"
+    assert domain.rooms_of("2-6") == (2, 6)

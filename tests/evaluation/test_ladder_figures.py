@@ -1,0 +1,88 @@
+"""Spec F1, F3, F4: Figures 3, 4 and 5 say what they show, whatever is not a number in them."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.figures import to_png, to_svg
+from hypogoal.evaluation.ladder_figures import (
+    Bar,
+    Panel,
+    Series,
+    Stops,
+    distance_bars,
+    scores_over_groups,
+    stops_over_rooms,
+)
+
+GROUPS = np.array([1, 2, 7])
+
+
+def scores():
+    several = Series("dbat, K=6", GROUPS, np.array([0.6, 0.9, np.nan]), np.array([0.1, 0.05, np.nan]))
+    single = Series("single CNN", GROUPS[:1], np.array([0.5]), np.array([np.nan]))
+    panels = [
+        Panel("accuracy, all rooms", {1: 0.9, 7: 0.8}, [several, single]),
+        Panel("balanced, unseen", {1: 0.5}, [several]),
+    ]
+    return scores_over_groups(panels, ["dbat, K=6", "single CNN"])
+
+
+def bars():
+    found = [
+        Bar("dbat, K=6", "N=1", 40.0, 5.0, (35.0, 45.0)),
+        Bar("single CNN", "N=1", 280.0, np.nan, (280.0,)),
+        Bar("oracle termination", "true sub-goal", 2.0, 0.0, (2.0, 2.0)),
+    ]
+    return distance_bars(found, ["dbat, K=6", "single CNN"], 300)
+
+
+def stops(rooms=(1, 4)):
+    pictures = [(room, np.full((210, 160, 3), 40, np.uint8)) for room in rooms]
+    where = np.array([1, 1, 4, 9])
+    pixels = np.array([[20.5, 30], [40, 50], [60, 70], [0, 0]])
+    return stops_over_rooms(pictures, [Stops("dbat", where, pixels, np.array([0, 1, 2, 0])) for _ in range(3)])
+
+
+@pytest.mark.parametrize(
+    ("draw", "texts"),
+    [
+        (scores, ["accuracy, all rooms", "balanced, unseen", "dbat, K=6", "single CNN", "labelled ladder groups, N"]),
+        (bars, ["N=1", "true sub-goal", "oracle termination", "distance to the nearest true base", "began inside"]),
+        (stops, ["dbat, room 1", "room 4", "at a true base", "elsewhere", "began inside: counts 300"]),
+    ],
+)
+def test_figures_say_what_they_show(draw, texts):
+    """Spec F: axes and legends are text in the SVG, which is the same bytes each time."""
+    svg = to_svg(draw(), "name")
+    for text in texts:
+        assert text in svg
+    assert svg == to_svg(draw(), "name")
+    assert "NaN" not in svg
+    assert to_png(draw()).startswith(b"\x89PNG")
+
+
+def test_where_there_is_no_number_there_is_no_point():
+    """Figure 3: a method's line ends where its score is not defined."""
+    line = scores().axes[1].get_lines()[0]
+    np.testing.assert_array_equal(line.get_ydata(), [0.6, 0.9, np.nan])
+    assert scores().axes[1].get_xticks().tolist() == [1, 2, 7]
+    blind = scores().axes[0].get_lines()[-1]
+    assert (list(blind.get_xdata()), list(blind.get_ydata())) == ([1, 7], [0.9, 0.8])
+
+
+def test_a_bar_is_as_high_as_its_mean():
+    """Figure 4: bars of methods side by side, the oracle's in a group of its own."""
+    heights = [patch.get_height() for patch in bars().axes[0].patches]
+    assert heights == [40, 280, 2]
+
+
+def test_stops_are_drawn_in_their_room_by_shape():
+    """Figure 5: hits, misses and what began inside differ in marker and in colour; a stop is in one room only."""
+    axes = stops().axes
+    assert len(axes) == 6
+    first = {line.get_marker(): line.get_xdata().tolist() for line in axes[0].get_lines()[:3]}
+    assert first == {"o": [20.5], "x": [40], "s": []}
+    second = {line.get_marker(): line.get_xdata().tolist() for line in axes[1].get_lines()[:3]}
+    assert second == {"o": [], "x": [], "s": [60]}
+    assert len({line.get_color() for line in axes[0].get_lines()[:3]}) == 3
+    assert len(stops((1,)).axes) == 3

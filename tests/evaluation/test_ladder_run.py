@@ -1,0 +1,271 @@
+"""Spec A5, F1-F4, F7: a small run with ladders, in the real file formats, is evaluated and drawn end to end."""
+
+import io
+import json
+import re
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from ladder_run import ROOMS, STATES_PER_ROOM, SUB_GOAL, executions, write_data, write_members, write_options, write_run
+from rich.console import Console
+
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import open_dataset
+from hypogoal.evaluation.accuracy import member_scores
+from hypogoal.hypotheses.storage import read_ensemble
+from hypogoal.stages.evaluate import evaluate, summary_table
+from hypogoal.stages.report import report
+
+QUIET = {"quiet": True}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """N of 1, 2, 3 (3: every ladder), two seeds, three methods; options at N=2 on two ladders, oracles beside."""
+    run = tmp_path_factory.mktemp("runs") / "ladders"
+    write_run(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def metrics(run):
+    return evaluate(run, run / "evaluation", **QUIET)
+
+
+@pytest.fixture(scope="module")
+def page(run, metrics):
+    return report(run).read_text(encoding="utf-8")
+
+
+def test_members_are_judged_room_by_room(run, metrics):
+    """Spec F1: recomputed here from the file and the weights: unseen rooms, all rooms, and the validated member."""
+    ensemble = next(one for one in metrics["ensembles"] if one["path"] == "ensemble/dbat/groups-2-seed-1")
+    assert (ensemble["method"], ensemble["groups"], ensemble["name"]) == ("dbat, K=2", 2, "dbat, K=2, groups=2")
+    source = open_artefact(run / ensemble["path"])
+    split = open_dataset(run / "data/groups-2.h5").heldout(SUB_GOAL)
+    yes = read_ensemble(source.path, source.config, SUB_GOAL).predict(split.observations) > 0.5
+    rooms = ensemble["sub_goals"][0]["rooms"]
+    for name, inside in (
+        ("unseen", np.isin(split.origins["room"], (9, 20))),
+        ("all", np.ones(len(split.labels), dtype=bool)),
+        ("labelled", np.isin(split.origins["room"], (1, 2, 6))),
+    ):
+        scores = member_scores(yes[inside], split.labels[inside])
+        for score in ("accuracy", "balanced_accuracy", "recall"):
+            found = [member[score] for member in rooms["scopes"][name]["members"]]
+            assert found == pytest.approx(scores[score].tolist())
+        if name == "labelled":
+            assert rooms["validated"]["member"] == int(scores["balanced_accuracy"].argmax())
+    assert {row["room"]: row["positives"] for row in rooms["by_room"]} == ROOMS
+    assert sum(row["negatives"] for row in rooms["false_positives"] if row["scope"] == "all") == (
+        len(ROOMS) * STATES_PER_ROOM - sum(ROOMS.values())
+    )
+    assert {row["kind"] for row in rooms["false_positives"]} == {"near-base", "on-ladder", "elsewhere"}
+
+
+def test_figure_3_has_a_row_per_method_and_n(metrics):
+    """Spec F1: over both seeds, in order; with every ladder labelled no balanced accuracy, yet accuracy."""
+    assert [(row["method"], row["groups"], row["ensembles"]) for row in metrics["rooms"]] == [
+        (method, groups, 2) for method in ("dbat, K=2", "no diversity, K=2", "single CNN") for groups in (1, 2, 3)
+    ]
+    last = metrics["rooms"][2]
+    assert last["positives"] == {"unseen": 0, "all": sum(ROOMS.values())}
+    assert last["scores"]["unseen"]["balanced_accuracy"]["best"]["mean"] is None
+    assert last["scores"]["unseen"]["balanced_accuracy"]["best"]["n"] == 0
+    assert last["scores"]["unseen"]["accuracy"]["best"]["n"] == 2
+    first = metrics["rooms"][0]
+    own = [one for one in metrics["ensembles"] if (one["method"], one["groups"]) == ("dbat, K=2", 1)]
+    values = [one["sub_goals"][0]["rooms"]["scopes"]["unseen"]["scores"]["balanced_accuracy"]["best"] for one in own]
+    found = first["scores"]["unseen"]["balanced_accuracy"]["best"]
+    assert found["mean"] == pytest.approx(np.mean(values))
+    assert found["standard_deviation"] == pytest.approx(np.std(values, ddof=1))
+    assert metrics["hypotheses"] == []
+    assert first["disagreement_heldout"]["mean"] is not None
+
+
+def test_distances_are_those_of_the_tables(metrics):
+    """Spec F3: members stop 10 (m + 1) + seed away on 1L and twice that on 2-6; the oracle at 0, 0, 4 and 8."""
+    found = metrics["distance"]
+    over = {row["method"]: row for row in found["over_ladders"]}
+    assert list(over) == ["dbat, K=2", "no diversity, K=2", "single CNN", "oracle termination"]
+    dbat, oracle = over["dbat, K=2"], over["oracle termination"]
+    assert dbat["best"]["mean"] == pytest.approx(((10 + 20) / 2 + (11 + 22) / 2) / 2)
+    assert dbat["worst"]["mean"] == pytest.approx(((20 + 40) / 2 + (21 + 42) / 2) / 2)
+    assert dbat["best"]["standard_deviation"] == pytest.approx(np.sqrt(0.5) * 1.5)
+    assert dbat["ladders"] == ["1L", "2-6"]
+    assert (oracle["groups"], oracle["best"]["mean"], oracle["reached_base"]["mean"]) == (None, 3, 0.75)
+    assert (oracle["died"]["mean"], oracle["timed_out"]["mean"]) == (0.25, 0)
+    validated = {
+        one["seed"]: one["sub_goals"][0]["rooms"]["validated"]["member"]
+        for one in metrics["ensembles"]
+        if (one["method"], one["groups"]) == ("dbat, K=2", 2)
+    }
+    wanted = [1.5 * (10 * (validated[seed] + 1) + seed) for seed in (0, 1)]
+    assert dbat["validated"]["mean"] == pytest.approx(np.mean(wanted))
+    assert len(found["options"]) == 2 * 2 * 4
+    assert metrics["agents"] == metrics["selection"] == []
+    assert metrics["missing"] == []
+
+
+def test_stops_are_kept_to_be_drawn(run, metrics):
+    """Spec F4: of the first seed's best members, in the room's picture, by what became of them."""
+    one, other = metrics["distance"]["shown"]
+    assert (one["ladder"], one["groups"], one["seed"], one["rooms"]) == ("1L", 2, 0, [1, 6])
+    assert other["rooms"] == [2, 6, 1]
+    assert [column["method"] for column in one["columns"]] == [
+        "dbat, K=2", "no diversity, K=2", "single CNN", "oracle termination",
+    ]  # fmt: skip
+    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+        assert set(arrays["pictures"]) == {"1", "2", "6"}
+        assert arrays["pictures/6"][0, 0, 0] == 30
+        path = "stops/options/oracle/ladder-1L-seed-0/0"
+        assert arrays[f"{path}/positions"][()].tolist() == [[1, 20 + away, 100] for away in (0, 0, 4, 8)]
+        assert arrays[f"{path}/pixels"][0].tolist() == [20.5, 100.5]
+        assert arrays[f"{path}/fates"][()].tolist() == [0, 0, 0, 1]
+
+
+def test_attributions_are_of_an_ensemble_that_can_disagree(run, metrics):
+    """Spec F2: of the smallest N with the most members, on states in unseen rooms, each complete."""
+    found = metrics["saliency"]
+    assert found["ensemble"] == "ensemble/dbat/groups-1-seed-0"
+    (goal,) = found["sub_goals"]
+    errors = [member["completeness_error"] for state in goal["states"] for member in state["members"]]
+    assert len(errors) == 2 * len(goal["states"]) > 0
+    assert max(errors) < 1e-9
+    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+        group = arrays[f"saliency/{SUB_GOAL}"]
+        assert group["attributions"].shape == (len(goal["states"]), 2, 36, 36, 4)
+        places = json.loads(group["places"][()])
+        assert all(re.fullmatch(r"room (2|6|9|20) \(unseen\)", place) for place in places)
+
+
+def test_every_number_is_explained(metrics):
+    """Spec A5: what metrics.json calls a number is in its own glossary; strict JSON as written."""
+    known = set(metrics["quantities"])
+    rooms = metrics["ensembles"][0]["sub_goals"][0]["rooms"]
+    option = metrics["distance"]["options"][0]["options"][0]
+    state = metrics["saliency"]["sub_goals"][0]["states"][0]
+    for numbers in (
+        rooms["scopes"]["all"]["members"][0],
+        rooms["scopes"]["all"]["scores"]["accuracy"],
+        rooms["validated"],
+        option,
+        state["members"][0],
+        metrics["rooms"][0]["scores"]["all"]["accuracy"]["best"],
+        metrics["distance"]["over_ladders"][0]["best"],
+    ):
+        assert set(numbers) - {"member", "option", "unit", "interval_over"} <= known
+    assert {"scopes", "false_positives", "groups", "tied", "always_no"} <= known
+
+
+def test_the_terminal_summary_fits(metrics):
+    """Spec A5: methods x N, ladders x methods, at 80 columns."""
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(summary_table(metrics))
+    lines = console.export_text().splitlines()
+    assert max(map(len, lines)) <= 80
+    text = "\n".join(lines)
+    assert re.search(r"no diversity, K=2 +│ 2 │ 0\.\d\d │", text)
+    assert re.search(r"2-6 +│ 2 +│ +21 │ +21 │ +21 │ +3 ", text)
+    assert re.search(r"at base +│ 2 +│ +0 % │ +0 % │ +0 % │ +75 % ", text)
+
+
+def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
+    """Spec F7: its sections, Figures 3 to 5 with seeds, intervals, and what the paper claims; no empty section."""
+    titles = re.findall(r"<h2>(.*?)</h2>", page)
+    assert titles == [
+        "Summary", "Hypotheses against labelled ladders", "Options on ladders", "Where options stop on the ladders",
+        "Example states", "What members look at", "Data, settings, provenance",
+    ]  # fmt: skip
+    assert page.count("<figure") == 5
+    assert "about 70 % for the best member at N=1" in page
+    assert "Its test files include training rooms" in page
+    assert "At N=3 no unseen room has a ladder base left" in page
+    assert "Ensemble seeds 0 and 1" in page
+    assert "Never saying yes has accuracy 0.88 (N=1), 0.88 (N=2) and 1.00 (N=3)" in page
+    assert "mean over the ladders 1L and 2-6" in page
+    assert "not drawn" not in re.sub(r"rooms that are not drawn none", "", page)
+    assert "Missing in this run" not in page
+    names = {path.stem for path in (run / "report" / "figures").iterdir()}
+    assert names == {"figure3", "unseen", "figure4", "figure5-1L-N2", "figure5-2-6-N2"}
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+    links = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert all(link.startswith("data:image/png;base64,") or link[1:] in ids for link in links)
+
+
+def test_the_report_is_the_same_each_time(run, page):
+    """Spec G1, F7: pictures and all."""
+    assert report(run, force=True).read_text(encoding="utf-8") == page
+
+
+def test_ensembles_alone(tmp_path):
+    """Spec F1, F7: without options the page has Figure 3 and names what Figures 4 and 5 need."""
+    write_run(tmp_path, numbers=(1,), seeds=(0,), methods=("dbat",), ladders=())
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    assert metrics["missing"] == [
+        "no ensemble artefact of an ensemble without diversity (Figure 3)",
+        "no ensemble artefact of a single CNN (Figure 3)",
+        "no options artefact of a ladder (Figures 4 and 5)",
+    ]
+    page = report(tmp_path).read_text(encoding="utf-8")
+    assert page.count("<figure") == 2
+    assert page.count("train-options with --set start=LADDER") == 2
+    assert "Learning curves" not in page
+    Console(width=80, file=io.StringIO()).print(summary_table(metrics))
+
+
+def test_options_without_their_ensembles_evaluation(tmp_path):
+    """Spec F3: options may be made from an ensemble that is not in the run; N and method come from its manifest."""
+    write_data(tmp_path / "data.h5", 2)
+    source = tmp_path / "elsewhere/ensemble"
+    write_members(source, tmp_path / "data.h5", 2, "none", 0)
+    run = tmp_path / "run"
+    write_options(run / "options", source, "2-6", 3, executions(0, [7]) + executions(1, [5]), 2)
+    metrics = evaluate(run, run / "evaluation", **QUIET)
+    (row,) = metrics["distance"]["over_ladders"]
+    assert (row["method"], row["groups"], row["best"]["mean"]) == ("no diversity, K=2", 2, 5)
+    assert row["validated"]["mean"] is None
+    assert metrics["missing"][0] == "no ensemble"
+    page = report(run).read_text(encoding="utf-8")
+    assert "held-out states say which rooms training saw" in page
+    assert "Figure 5 of the paper: ladder 2-6, N=2, seed 3" in page
+
+
+def test_a_table_of_executions_that_is_not_there(run, tmp_path):
+    """Spec F, G2: options of a start without the table are named; a damaged table is one line."""
+    shutil.copytree(run, tmp_path / "copy", ignore=shutil.ignore_patterns("evaluation", "report", "none", "cnn"))
+    table = tmp_path / "copy/options/dbat/groups-2-ladder-1L-seed-0/executions.csv"
+    table.write_text("step\n1\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"executions\.csv"):
+        evaluate(tmp_path / "copy", tmp_path / "copy/evaluation", **QUIET)
+    shutil.rmtree(table.parent)
+    source = tmp_path / "copy/ensemble/dbat/groups-2-seed-0"
+    silent = tmp_path / "copy/options/dbat/groups-2-ladder-1L-seed-0"
+    write_options(silent, source, "1L", 0, [], 2)
+    manifest = json.loads((silent / "manifest.json").read_text())
+    del manifest["files"]["executions.csv"]
+    (silent / "manifest.json").write_text(json.dumps(manifest))
+    metrics = evaluate(tmp_path / "copy", tmp_path / "copy/evaluation", **QUIET)
+    assert (
+        "no executions.csv in options/dbat/groups-2-ladder-1L-seed-0: its domain tells no distance"
+        in metrics["missing"]
+    )
+    (row,) = (row for row in metrics["distance"]["over_ladders"] if row["method"].startswith("dbat"))
+    assert (row["seeds"], row["incomplete_seeds"]) == (1, [0])
+    assert "Seeds that lack a ladder are left out: dbat, K=2, N=2" in report(tmp_path / "copy").read_text()
+
+
+def test_a_domain_without_pictures(run, tmp_path, monkeypatch):
+    """Spec F4: what is missing is the pictures, not the numbers."""
+    from ladder_run import LadderDomain
+
+    monkeypatch.delattr(LadderDomain, "picture")
+    metrics = evaluate(run, tmp_path / "evaluation", **QUIET)
+    assert metrics["distance"]["shown"] == []
+    assert metrics["distance"]["over_ladders"][0]["best"]["mean"] is not None
+    shutil.copytree(tmp_path / "evaluation", tmp_path / "run/evaluation")
+    assert "The domain has no pictures of its rooms" in report(tmp_path / "run").read_text(encoding="utf-8")

@@ -1,0 +1,184 @@
+"""Spec F1, F2: Figure 3's numbers against values worked by hand: unseen rooms, validation, kinds of false positives."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.ladders import ladder_names, missing_ladders, rooms_shown
+from hypogoal.evaluation.rooms import choose, groups_of, method_names, room_metrics, rooms_table, with_validated
+
+YES, NO = True, False
+# Rooms 1 (labelled), 9 (unlabelled), 6 (unseen): two positives and two negatives each; 20 (unseen): two negatives.
+ROOMS = np.array([1, 1, 1, 1, 9, 9, 9, 9, 6, 6, 6, 6, 20, 20])
+SEEN = np.array([2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0])
+LABELS = np.array([YES, YES, NO, NO] * 3 + [NO, NO])
+KIND = np.array([0, 0, 1, 2] * 3 + [1, 1])
+KINDS = ("base", "near-base", "on-ladder")
+ORIGINS = {"room": ROOMS, "seen": SEEN, "kind": KIND}
+VERDICTS = np.array(
+    [
+        # knows room 1 by heart; knows bases; says yes to all
+        *([YES, YES, YES], [YES, YES, YES], [NO, NO, YES], [NO, YES, YES]),  # room 1
+        *([NO, YES, YES], [NO, YES, YES], [NO, NO, YES], [NO, NO, YES]),  # room 9
+        *([NO, YES, YES], [NO, YES, YES], [NO, NO, YES], [YES, YES, YES]),  # room 6
+        *([NO, NO, YES], [YES, NO, YES]),  # room 20
+    ]
+)
+
+
+def test_each_scope_by_hand():
+    """Spec F1: the member that knows the training room by heart is the best where that room counts least."""
+    found = room_metrics(VERDICTS, LABELS, ORIGINS, KINDS)
+    unseen, everything, labelled = (found["scopes"][name] for name in ("unseen", "all", "labelled"))
+    assert (unseen["states"], unseen["positives"], unseen["rooms"]) == (6, 2, [6, 20])
+    assert (everything["states"], everything["positives"], everything["rooms"]) == (14, 6, [1, 6, 9, 20])
+    assert (labelled["states"], labelled["positives"], labelled["rooms"]) == (4, 2, [1])
+
+    def of(scope, score):
+        return [member[score] for member in scope["members"]]
+
+    assert of(labelled, "balanced_accuracy") == pytest.approx([1, (1 + 1 / 2) / 2, 1 / 2])
+    assert of(unseen, "balanced_accuracy") == pytest.approx([(0 + 2 / 4) / 2, (1 + 3 / 4) / 2, 1 / 2])
+    assert of(unseen, "accuracy") == pytest.approx([2 / 6, 5 / 6, 2 / 6])
+    assert of(unseen, "precision") == pytest.approx([0, 2 / 3, 2 / 6])
+    assert of(everything, "recall") == pytest.approx([2 / 6, 1, 1])
+    assert of(everything, "accuracy") == pytest.approx([8 / 14, 12 / 14, 6 / 14])
+
+
+def test_validation_picks_by_the_labelled_rooms_only():
+    """Spec F1: the member chosen there may be the worst elsewhere; its score on unseen rooms is what it is."""
+    found = room_metrics(VERDICTS, LABELS, ORIGINS, KINDS)
+    assert found["validated"] == {"member": 0, "validation": 1.0, "tied": 1}
+    scores = found["scopes"]["unseen"]["scores"]["balanced_accuracy"]
+    assert scores == pytest.approx(
+        {"best": 7 / 8, "validated": 1 / 4, "mean": (1 / 4 + 7 / 8 + 1 / 2) / 3, "worst": 1 / 4}
+    )
+    assert found["scopes"]["unseen"]["scores"]["accuracy"]["validated"] == pytest.approx(2 / 6)
+
+
+def test_validation_says_when_it_cannot_choose():
+    """Spec F1: of members that are equally good the first, and how many there are; none without both classes."""
+    same = np.repeat(VERDICTS[:, :1], 3, axis=1)
+    assert choose(same, LABELS, SEEN) == {"member": 0, "validation": 1.0, "tied": 3}
+    nothing = choose(VERDICTS, LABELS, np.zeros_like(SEEN))
+    assert (nothing["member"], nothing["tied"]) == (None, 0)
+    assert np.isnan(nothing["validation"])
+    assert np.isnan(with_validated(np.array([0.5, 0.7]), None)["validated"])
+
+
+def test_false_positives_by_kind():
+    """Spec F1: the share of each kind of negatives that each member calls reached; the base is no kind of negative."""
+    rows = room_metrics(VERDICTS, LABELS, ORIGINS, KINDS)["false_positives"]
+    assert [(row["scope"], row["kind"], row["negatives"]) for row in rows] == [
+        ("unseen", "near-base", 3), ("unseen", "on-ladder", 1), ("all", "near-base", 5), ("all", "on-ladder", 3),
+    ]  # fmt: skip
+    assert rows[0]["share"] == pytest.approx([1 / 3, 0, 1])
+    assert rows[1]["share"] == pytest.approx([1, 1, 1])
+    assert rows[3]["share"] == pytest.approx([1 / 3, 2 / 3, 1])
+    unnamed = room_metrics(VERDICTS, LABELS, ORIGINS)["false_positives"]
+    assert [row["kind"] for row in unnamed] == ["1", "2", "1", "2"]
+    bare = room_metrics(VERDICTS, LABELS, {"seen": SEEN})
+    assert bare["false_positives"] == bare["by_room"] == bare["scopes"]["all"]["rooms"] == []
+
+
+def test_each_room():
+    """Spec F1: a room's scores are those of its states alone; without a base it has no balanced accuracy."""
+    rows = room_metrics(VERDICTS, LABELS, ORIGINS, KINDS)["by_room"]
+    assert [(row["room"], row["seen"], row["states"], row["positives"]) for row in rows] == [
+        (1, 2, 4, 2), (6, 0, 4, 2), (9, 1, 4, 2), (20, 0, 2, 0),
+    ]  # fmt: skip
+    assert rows[1]["balanced_accuracy"] == pytest.approx([1 / 4, 3 / 4, 1 / 2])
+    assert np.isnan(rows[3]["balanced_accuracy"]).all()
+    assert rows[3]["accuracy"] == pytest.approx([1 / 2, 1, 0])
+
+
+def test_no_positive_in_unseen_rooms_is_said():
+    """Spec F1: with every ladder labelled balanced accuracy on unseen rooms is not a number, accuracy is."""
+    seen = np.where(ROOMS == 20, 0, 2)
+    found = room_metrics(VERDICTS, LABELS, {**ORIGINS, "seen": seen}, KINDS)
+    unseen = found["scopes"]["unseen"]
+    assert unseen["positives"] == 0
+    assert np.isnan(list(unseen["scores"]["balanced_accuracy"].values())).all()
+    assert unseen["scores"]["accuracy"]["best"] == 1
+    assert found["validated"]["member"] == 1
+
+
+def ensemble(groups, seed, best, method="dbat, K=2", tied=1, sub_goal="down"):
+    scores = {"best": best, "validated": best - 0.2, "mean": best - 0.1, "worst": best - 0.3}
+    scope = {"states": 12, "positives": 3, "scores": {"balanced_accuracy": scores, "accuracy": scores}}
+    rooms = {"scopes": {"unseen": scope, "all": scope}, "validated": {"tied": tied}}
+    disagreement = {"unlabelled": 0.1 * seed, "heldout": 0.2}
+    row = {"sub_goal": sub_goal, "rooms": rooms, "disagreement": disagreement}
+    return {"method": method, "groups": groups, "seed": seed, "sub_goals": [row]}
+
+
+def test_the_table_over_seeds():
+    """Spec F1: Figure 3: mean and deviation over seeds, by method and N in their order; F2's numbers beside."""
+    rows = rooms_table(
+        [
+            ensemble(2, 0, 0.9),
+            ensemble(1, 0, 0.6, tied=2),
+            ensemble(1, 1, 0.8),
+            ensemble(1, 2, float("nan")),
+            ensemble(1, 0, 0.5, "single CNN"),
+            ensemble(1, 0, 0.7, "no diversity, K=2"),
+        ]
+    )
+    assert [(row["method"], row["groups"]) for row in rows] == [
+        ("dbat, K=2", 1), ("dbat, K=2", 2), ("no diversity, K=2", 1), ("single CNN", 1),
+    ]  # fmt: skip
+    found = rows[0]["scores"]["unseen"]["balanced_accuracy"]["best"]
+    assert (found["mean"], found["n"], rows[0]["ensembles"]) == (pytest.approx(0.7), 2, 3)
+    assert found["standard_deviation"] == pytest.approx(np.sqrt(2) * 0.1)
+    assert found["standard_error"] == pytest.approx(0.1)
+    assert 0.6 - 1e-9 <= found["interval"][0] <= found["interval"][1] <= 0.8 + 1e-9
+    assert rows[0]["scores"]["all"]["accuracy"]["validated"]["mean"] == pytest.approx(0.5)
+    assert rows[0]["always_no"] == {"unseen": 0.75, "all": 0.75}
+    assert rows[0]["tied"] == pytest.approx(4 / 3)
+    assert rows[0]["disagreement_unlabelled"]["mean"] == pytest.approx(0.1)
+    alone = rows[3]["scores"]["unseen"]["balanced_accuracy"]["best"]
+    assert np.isnan(alone["standard_deviation"])
+    assert rooms_table([{"method": "x", "groups": 1, "sub_goals": [{"sub_goal": "down"}]}]) == []
+
+
+def test_all_n_of_a_method_have_one_name():
+    """Spec F1: N is an axis, not a method; any other setting that differs splits."""
+    base = {"members": 6, "diversity": "dbat", "domain_config": {"groups": 1, "states": 10}}
+    more = {**base, "domain_config": {"groups": 2, "states": 10}}
+    assert method_names([base, more]) == ["dbat, K=6", "dbat, K=6"]
+    other = {**base, "domain_config": {"groups": 2, "states": 20}}
+    assert method_names([base, other]) == ["dbat, K=6, states=10", "dbat, K=6, states=20"]
+    assert (groups_of(more), groups_of({}), groups_of({"domain_config": None})) == (2, None, None)
+
+
+def test_options_are_named_after_their_ensembles_method():
+    """Spec F3: the ladder is no part of the name, a setting of the options that differs at the same N is."""
+    config = {"start": "1L", "steps": 10, "termination": "learned", "members": 6}
+    other = {**config, "start": "2-6"}
+    assert ladder_names(["dbat", "dbat"], [2, 2], [config, other]) == ["dbat", "dbat"]
+    assert ladder_names(["dbat", "dbat"], [1, 2], [config, {**config, "steps": 20}]) == ["dbat", "dbat"]
+    assert ladder_names(["dbat", "dbat"], [2, 2], [config, {**other, "steps": 20}]) == [
+        "dbat, steps=10",
+        "dbat, steps=20",
+    ]
+
+
+def test_what_a_ladder_run_lacks_is_named():
+    """Spec F: each missing artefact by its name; nothing is missing from a whole run."""
+    methods = [{"method": name} for name in ("dbat, K=6", "no diversity, K=6, steps=9", "single CNN")]
+    assert missing_ladders(methods, [*methods, {"method": "oracle termination"}]) == []
+    assert missing_ladders(methods[:2], []) == [
+        "no ensemble artefact of a single CNN (Figure 3)",
+        "no options artefact of a ladder (Figures 4 and 5)",
+    ]
+    assert missing_ladders(methods, methods[1:]) == [
+        "no options artefact of D-BAT (Figures 4 and 5)",
+        "no options artefact with oracle terminations beside them",
+    ]
+
+
+def test_the_rooms_that_are_drawn():
+    """Figure 5: the ladder's own rooms first, then those with the most stops, three in all."""
+    where = [np.array([7, 7, 6, 6, 6]), np.array([9, 9, 9, 9, 3])]
+    assert rooms_shown(where) == [9, 6, 7]
+    assert rooms_shown(where, (2, 6)) == [2, 6, 9]
+    assert rooms_shown([]) == []

@@ -1,0 +1,207 @@
+"""Spec F2: DeepLift against values worked by hand, and complete on both of the paper's networks."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from hypogoal.dataset import Split
+from hypogoal.evaluation.examples import pick_to_explain
+from hypogoal.evaluation.figures import attribution_png
+from hypogoal.evaluation.saliency import Attributions, attributable, deep_lift, explanation, mean_state
+from hypogoal.evaluation.shown import Unlabelled, show_states
+from hypogoal.hypotheses.ensemble import Ensemble
+
+SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4)}
+BOUND = 1e-9  # log-odds; in double what is left is rounding
+
+
+class Members:
+    """What DeepLift asks of an ensemble."""
+
+    def __init__(self, *members):
+        self.members = members
+
+
+def dense(weights):
+    """Flattened inputs -> logits (0, weights . inputs)."""
+    layer = nn.Linear(len(weights), 2, bias=False)
+    with torch.no_grad():
+        layer.weight[:] = torch.tensor([[0.0] * len(weights), weights])
+    return layer
+
+
+def states(*rows):
+    """States of one row of pixels in one channel, given in 0..1."""
+    return (255 * np.array(rows)[:, None, :, None]).round().astype(np.uint8)
+
+
+def test_a_linear_member_by_hand():
+    """Spec F2: each pixel's attribution is its weight times what it differs from the baseline."""
+    member = nn.Sequential(nn.Flatten(), dense([2.0, -3.0]))
+    found = deep_lift(Members(member), states([1, 0.2], [0, 0]), states([0.2, 0])[0])
+    np.testing.assert_allclose(found.values[:, 0, 0, :, 0], [[1.6, -0.6], [-0.4, 0]], atol=1e-7)
+    np.testing.assert_allclose(found.log_odds[:, 0], [1.4, 0], atol=1e-7)
+    np.testing.assert_allclose(found.baseline_log_odds, [0.4], atol=1e-7)
+    assert found.completeness_error().max() < BOUND
+
+
+def test_a_relu_by_hand():
+    """Spec F2: the rescale rule: relu(x0 + x1 - 1) of (1, 1) against (0, 0) gives each pixel half of the 1 it made.
+
+    The gradient would give each a whole 1, and the sum would not be the difference.
+    """
+    first = nn.Linear(2, 1)
+    with torch.no_grad():
+        first.weight[:], first.bias[:] = 1.0, -1.0
+    member = nn.Sequential(nn.Flatten(), first, nn.ReLU(), dense([1.0]))
+    found = deep_lift(Members(member), states([1, 1]), states([0, 0])[0])
+    np.testing.assert_allclose(found.values.ravel(), [0.5, 0.5], atol=1e-7)
+
+
+def test_overlapping_windows_by_hand():
+    """Spec F2: the pixel that is the maximum of two windows is credited for both.
+
+    Captum's own rule credits it for one, and its attributions do not add up.
+    """
+    member = nn.Sequential(nn.MaxPool2d((1, 2), stride=1), nn.Flatten(), dense([1.0, 10.0]))
+    found = deep_lift(Members(member), states([0, 1, 0]), states([0, 0, 0])[0])
+    np.testing.assert_allclose(found.values.ravel(), [0, 11, 0], atol=1e-7)
+    assert found.completeness_error().max() < BOUND
+
+    import warnings
+
+    from captum.attr import DeepLift
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plain = DeepLift(member.double()).attribute(
+            torch.tensor([[[[0.0, 1.0, 0.0]]]], dtype=torch.float64), torch.zeros(1, 1, 1, 3).double(), target=1
+        )
+    assert plain.sum().item() != pytest.approx(11), "Captum has mended its rule: attributable() can go"
+
+
+def trained(network, members=2):
+    """An ensemble whose normalisation has seen something, as after training."""
+    ensemble = Ensemble(network, SHAPES[network], members, torch.Generator().manual_seed(3))
+    height, width, channels = SHAPES[network]
+    for member in ensemble.members:
+        for seed in range(3):
+            member(torch.rand(8, channels, height, width, generator=torch.Generator().manual_seed(seed)))
+    return ensemble.eval()
+
+
+@pytest.mark.parametrize("network", SHAPES)
+def test_attributions_are_complete(network):
+    """Spec F2, C5: on both networks they add up to the change in log-odds, which is that of ``predict``."""
+    rng = np.random.default_rng(0)
+    observations = (255 * (rng.random((3, *SHAPES[network])) > 0.7)).astype(np.uint8)
+    ensemble = trained(network)
+    before = ensemble.state()
+    found = deep_lift(
+        ensemble, observations, mean_state(rng.integers(256, size=(20, *SHAPES[network]), dtype=np.uint8))
+    )
+    assert found.values.shape == (3, 2, *SHAPES[network])
+    assert found.completeness_error().max() < BOUND
+    assert np.abs(found.values.sum(axis=(2, 3, 4))).max() > 1e-3, "nothing was attributed"
+    probabilities = ensemble.predict(observations).astype(np.float64)
+    np.testing.assert_allclose(found.log_odds, np.log(probabilities / (1 - probabilities)), atol=1e-4)
+    assert all(torch.equal(value, before[name]) for name, value in ensemble.state().items())
+    assert all(parameter.dtype == torch.float32 for parameter in ensemble.parameters())
+
+
+@pytest.mark.parametrize("network", SHAPES)
+def test_the_chain_is_the_member(network):
+    """Spec F2: taking windows apart changes no output."""
+    member = trained(network, 1).members[0].double()
+    height, width, channels = SHAPES[network]
+    inputs = torch.rand(2, channels, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        logits = member(inputs)
+        odds = attributable(member, inputs)(inputs)
+    torch.testing.assert_close(odds[:, 0], logits[:, 1] - logits[:, 0])
+
+
+def test_global_pooling_is_taken_apart_too():
+    """Spec F2: a network that ends in a maximum over the whole image is complete as well."""
+    member = nn.Sequential(nn.AdaptiveMaxPool2d(1), nn.Flatten(), dense([2.0]))
+    found = deep_lift(Members(member), states([0.2, 1, 0.4]), states([0.6, 0.2, 0])[0])
+    assert found.completeness_error().max() < BOUND
+    assert found.values.sum() == pytest.approx(2 * (1 - 0.6))
+
+
+def test_the_state_that_is_the_baseline_has_no_attribution():
+    """Spec F2: and the mean state is the mean, rounded."""
+    observations = np.array([[[[10, 20]]], [[[13, 21]]]], np.uint8)
+    assert mean_state(observations).tolist() == [[[12, 20]]]
+    ensemble = trained("montezuma", 1)
+    state = np.full(SHAPES["montezuma"], 7, np.uint8)
+    assert np.abs(deep_lift(ensemble, state[None], state).values).max() < BOUND
+
+
+def test_attributions_are_to_what_members_see(tmp_path):
+    """Spec F2: of an ensemble that sees a window, what is attributed to, drawn and averaged is the window."""
+
+    class Windowed(Members):
+        def see(self, observations, positions=None):
+            seen_at.append(positions)
+            return observations[:, :, 1:]
+
+    seen_at = []
+    ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
+    observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
+    where = {name: np.arange(3) for name in ("room", "x", "y")}
+    split = Split(observations, np.array([True, False, False]), where)
+    judged = np.array([[0.9], [0.8], [0.1]], np.float32), np.array([[True], [True], [False]])
+    with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
+        found = show_states(ensemble, "down", split, judged, Unlabelled(observations[2:], None), arrays)
+        group = arrays["saliency/down"]
+        assert group["observations"].shape == (2, 1, 3, 1)
+        assert group["seen"].shape == (2, 1, 2, 1)
+        np.testing.assert_allclose(group["attributions"][:, 0, 0, :, 0], [[0, 2], [1, 0]])
+    assert [state["kind"] for state in found["states"]] == ["true positive", "false positive"]
+    assert seen_at[0].tolist() == [[0, 0, 0], [1, 1, 1]]
+    assert seen_at[1] is None
+
+
+def test_the_check_is_reported():
+    """Spec F2: by state and member; an attribution that does not add up shows."""
+    values = np.zeros((1, 2, 1, 1, 2))
+    values[0, 0] = [[[3.0, -1.0]]]
+    found = Attributions(values, np.array([[2.5, 0.0]]), np.array([0.25, 0.0]))
+    ((first, second),) = (row["members"] for row in explanation(found, [(7, "disagree")]))
+    assert first["attributed"] == 2
+    assert first["completeness_error"] == pytest.approx(0.25)
+    assert first["last_frame"] == pytest.approx(1 / 4)
+    assert np.isnan(second["last_frame"])
+
+
+def test_the_states_that_are_explained():
+    """Figures 2 and 9: a true positive that most see, one that members disagree about, a false positive; none twice."""
+    probabilities = np.array([[0.9, 0.1], [0.8, 0.9], [0.7, 0.2], [0.6, 0.8], [0.1, 0.1]], np.float32)
+    labels = np.array([True, True, False, False, False])
+    verdicts = probabilities > 0.5
+    assert pick_to_explain(probabilities, verdicts, labels) == [
+        (1, "true positive"), (0, "disagree"), (3, "false positive"),
+    ]  # fmt: skip
+    assert pick_to_explain(probabilities, np.zeros_like(verdicts), labels) == []
+    alone = pick_to_explain(probabilities[:, :1], verdicts[:, :1], labels)
+    assert alone == [(0, "true positive"), (2, "false positive")]
+
+
+def test_the_picture_tells_signs_apart():
+    """Figures 2 and 9: orange speaks for, blue against, white is nothing; the state shows through in grey."""
+    import io
+
+    from matplotlib.image import imread
+
+    values = np.array([[1.0, -1.0, 0.0, 0.0]])
+    image = imread(io.BytesIO(attribution_png(values, np.array([[0, 0, 0, 1.0]]))))[0, :, :3]
+    red, green, blue = image.T
+    assert red[0] > blue[0]
+    assert blue[1] > red[1]
+    assert image[2].tolist() == [1, 1, 1]
+    assert red[3] == green[3] == blue[3]
+    assert 0.6 < red[3] < 0.9
+    assert attribution_png(np.zeros((2, 2)), np.zeros((2, 2))).startswith(b"\x89PNG")
