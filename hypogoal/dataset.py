@@ -158,6 +158,12 @@ class Dataset:
         with _open(self.path) as file:
             return _read(file, "unlabelled/observations", self.path)
 
+    def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
+        """Where each unlabelled state comes from: int64 (M,) by name; empty where the file does not say."""
+        with _open(self.path) as file:
+            origins = file["unlabelled"].get("origin", {})
+            return {name: origins[name][()] for name in origins}
+
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""
         with _open(self.path) as file:

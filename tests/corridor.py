@@ -1,5 +1,8 @@
 """A corridor with the engine's interface: small enough to learn in seconds, with states that look alike."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 
 from hypogoal.domains.base import Step
@@ -47,3 +50,87 @@ class Corridor:
 
     def labels(self, ids: np.ndarray) -> np.ndarray:
         return np.stack([ids == 0, ids == LENGTH - 1], axis=1)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where an episode may begin."""
+
+    cell: int
+    on_the_way: bool
+
+
+class LongCorridor(Corridor):
+    """The corridor with what Montezuma's engine has: a new id at each step, the newest ``memory`` remembered.
+
+    Episodes begin at a named cell; a share ``along`` of them a cell nearer to the left end. Actions 2 and 3 go left and
+    right, 0 and 1 do nothing. The right end kills. Positions are (0, cell, 0).
+    """
+
+    n_actions = 4
+    observation_shape = (20, 84, 4)  # not made of cells
+    action_sets: ClassVar[dict[str, tuple[int, ...]]] = {"moves": (2, 3)}
+    cells: ClassVar[dict[str, int]] = {"middle": 2, "left": 0}
+
+    def __init__(
+        self,
+        count: int,
+        max_steps: int = 30,
+        *,
+        start: str = "middle",
+        along: float = 0.0,
+        memory: int = 200_000,
+        seed: int = 0,
+    ):
+        self.memory, self.along, self.rng = memory, along, np.random.default_rng(seed)
+        cell = self.cells[start]
+        self.starts = [Start(cell, False), *([Start(cell - 1, True)] if along else [])]
+        self.cell = [start.cell for start in self.starts]
+        self.n_states = len(self.starts)
+        self.count, self.max_steps = count, max_steps
+        self.reset()
+
+    @property
+    def oldest(self) -> int:
+        lost = self.n_states - len(self.starts) - self.memory
+        return len(self.starts) + (lost + 3 * self.count if lost > 0 else 0)  # with their oldest frame
+
+    def reset(self) -> np.ndarray:
+        self.ids = np.zeros(self.count, dtype=np.int64)
+        self.elapsed = np.zeros(self.count, dtype=np.int64)
+        self.restart(np.ones(self.count, dtype=bool))
+        return self.ids.copy()
+
+    def restart(self, where: np.ndarray) -> None:
+        way = self.rng.random(self.count) < self.along
+        self.ids = np.where(where, way.astype(np.int64), self.ids)
+        self.elapsed = np.where(where, 0, self.elapsed)
+
+    def step(self, actions: np.ndarray) -> Step:
+        here = np.array([self.cell[identity] for identity in self.ids])
+        following = np.clip(here + np.array([0, 0, -1, 1])[actions], 0, LENGTH - 1)
+        ids = self.n_states + np.arange(self.count)
+        self.cell.extend(following.tolist())
+        self.n_states += self.count
+        terminated = following == LENGTH - 1
+        self.elapsed = self.elapsed + 1
+        truncated = (self.elapsed >= self.max_steps) & ~terminated
+        self.ids = ids.copy()
+        self.restart(terminated | truncated)
+        return Step(ids, np.zeros(self.count, np.float32), terminated, truncated)
+
+    def images(self, ids: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        if ((ids >= len(self.starts)) & (ids < self.oldest)).any():
+            raise ValueError("a forgotten state")
+        images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8) if out is None else out
+        for row, identity in enumerate(ids):
+            images[row] = 0
+            images[row, :, 14 * self.cell[identity] : 14 * self.cell[identity] + 14] = 255
+        return images
+
+    def positions(self, ids: np.ndarray) -> np.ndarray:
+        return np.array([(0, self.cell[identity], 0) for identity in ids], dtype=np.int64).reshape(-1, 3)
+
+    def labels(self, ids: np.ndarray) -> np.ndarray:
+        cells = self.positions(ids)[:, 1]
+        return np.stack([cells == 0, cells == LENGTH - 1], axis=1)

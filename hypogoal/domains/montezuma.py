@@ -209,7 +209,7 @@ class MontezumaDomain:
     Attributes:
         starts: the ladders at whose tops episodes can begin.
         kinds: what the values of the origin ``kind`` mean.
-        defaults: per stage, this domain's own (Tables 1 and 2).
+        defaults: per stage, this domain's own: Table 1; for options, what lets them learn on a laptop.
     """
 
     name = "montezuma"
@@ -230,7 +230,23 @@ class MontezumaDomain:
                 "class_weight_negative": 0.8,
                 "class_weight_positive": 0.2,
             },
-            "train-options": {"option_timeout": MAX_STEPS, "epsilon_steps": 400_000},
+            "train-options": {
+                "option_timeout": MAX_STEPS,
+                "max_episode_steps": MAX_STEPS,
+                "restart_options": True,
+                "mask_reached": False,
+                "experience": "own",
+                "chooser": "even",
+                "steps": 40_000,
+                "steps_for": "each",
+                "option_gamma": 0.99,
+                "option_batch": 32,
+                "n_step": 10,
+                "exploration": "persistent",
+                "epsilon_steps": 10_000,
+                "epsilon_final": 0.01,
+                "random_episodes": 0,
+            },
         }
     )
 

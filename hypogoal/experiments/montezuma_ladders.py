@@ -14,6 +14,14 @@ from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
 
 DOMAIN = "montezuma"
 STAGES = ("collect", "train-ensemble", "train-options")
+
+# What things cost on one core of the machine of docs/performance.md: seconds per collection, per gradient step of a
+# member, per environment step of an option, per member that is evaluated.
+PER_COLLECTION = 30.0
+PER_MEMBER_STEP = 0.11
+PER_STEP = {"light": 2.5e-3, "paper": 0.1}
+PER_EVALUATED_MEMBER = 4.0
+
 METHODS: dict[str, tuple[str, ...]] = {
     "dbat": ("--diversity", "dbat"),
     "none": ("--diversity", "none"),
@@ -53,7 +61,7 @@ def _check(config: RunConfig) -> None:
         ("option_groups", config.option_groups, config.groups),
         ("option_methods", config.option_methods, config.methods),
     ):
-        if not set(wanted) <= set(there):  # type: ignore[arg-type]
+        if not set(wanted) <= set(there):
             missing = ",".join(str(item) for item in wanted if item not in there)
             whole = name.removeprefix("option_")
             raise UserError(f"no ensembles of {missing} to learn options for", name, f"Add it to {whole}.")
@@ -71,17 +79,23 @@ def cells(
     planned: list[Cell] = []
     made: list[Path] = []
 
-    def add(place: str, arguments: tuple[str, ...], needs: tuple[Path, ...] = ()) -> Path:
-        planned.append(stage_cell(out / place, out, (*arguments, *common[arguments[0]]), needs))
+    ensemble, play = resolved["train-ensemble"], resolved["train-options"]
+    members = {method: 1 if method == "cnn" else ensemble.members for method in METHODS}
+    option = play.steps * PER_STEP[play.network]
+    evaluated = 0
+
+    def add(place: str, arguments: tuple[str, ...], seconds: float, needs: tuple[Path, ...] = ()) -> Path:
+        planned.append(stage_cell(out / place, out, (*arguments, *common[arguments[0]]), needs, seconds))
         return out / place
 
     for groups in config.groups:
-        data = add(f"data/groups-{groups}.h5", ("collect", DOMAIN, "--set", f"groups={groups}"))
+        data = add(f"data/groups-{groups}.h5", ("collect", DOMAIN, "--set", f"groups={groups}"), PER_COLLECTION)
         for method in config.methods:
             for seed in config.seeds:
                 place = f"ensemble/{method}/groups-{groups}-seed-{seed}"
                 arguments = ("train-ensemble", str(data), *METHODS[method], "--seed", str(seed))
-                made.append(add(place, arguments, (data,)))
+                evaluated += members[method]
+                made.append(add(place, arguments, PER_MEMBER_STEP * ensemble.steps * members[method], (data,)))
     for ladder in config.ladders:
         for seed in config.seeds:
             for groups in config.option_groups:
@@ -89,12 +103,13 @@ def cells(
                     source = out / f"ensemble/{method}/groups-{groups}-seed-{seed}"
                     place = f"options/{method}/groups-{groups}-ladder-{ladder}-seed-{seed}"
                     arguments = ("train-options", str(source), "--set", f"start={ladder}", "--seed", str(seed))
-                    made.append(add(place, arguments, (source,)))
+                    options = members[method] if play.steps_for == "each" else 1
+                    made.append(add(place, arguments, option * options, (source,)))
             if config.oracle and config.option_groups and config.option_methods:
                 first = f"{config.option_methods[0]}/groups-{config.option_groups[0]}-seed-{seed}"
                 source = out / f"ensemble/{first}"
                 changes = ("--set", f"start={ladder}", "--set", "termination=oracle")
                 place = f"options/oracle/ladder-{ladder}-seed-{seed}"
                 arguments = ("train-options", str(source), *changes, "--seed", str(seed))
-                made.append(add(place, arguments, (source,)))
-    return planned + closing_cells(out, made)
+                made.append(add(place, arguments, option, (source,)))
+    return planned + closing_cells(out, made, PER_EVALUATED_MEMBER * evaluated)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
@@ -16,6 +17,9 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input
 
 CHUNK = 256  # states at once where no gradient is kept
+LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
+GREY_KNOTS = 8  # random steps of which a map of shades is made, straight in between
+GREY_DARKEST, GREY_BRIGHTEST = (0.0, 0.2), (0.7, 1.0)  # where black and white come to lie
 
 
 class TrainingStates:
@@ -27,6 +31,8 @@ class TrainingStates:
         unlabelled: uint8 (M, H, W, C).
         network: any of the networks that will see them (their layers decide how images are stored).
         device: where they are to be used.
+        ladders: int64 (N,), at which ladder each labelled state is, where batches are drawn by them.
+        tables: whether distinct patches may be tabled; not where the images are changed before use.
 
     Raises:
         UserError: shapes that do not fit, or labels of one class only.
@@ -39,6 +45,9 @@ class TrainingStates:
         unlabelled: NDArray[np.uint8],
         network: nn.Sequential,
         device: torch.device,
+        *,
+        ladders: NDArray[np.int64] | None = None,
+        tables: bool = True,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
@@ -47,20 +56,62 @@ class TrainingStates:
             counts = f"{int(labels.sum())} positives of {len(labels)}"
             raise UserError("labelled states of both classes are needed", counts, "Collect others.")
         self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
-        self.device = device
+        self.ladders, self.device = ladders, device
         images = np.concatenate([observations, unlabelled])
-        self._tables = patches.make_tables(images, patches.windows_of(network)) if device.type == "cpu" else None
+        self._tables = patches.make_tables(images, network) if tables and device.type == "cpu" else None
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
 
-    def forward(self, networks: Sequence[nn.Sequential], states: NDArray[np.int64]) -> list[Tensor]:
-        """Each network's logits (B, 2) of states (B,)."""
+    def forward(
+        self,
+        networks: Sequence[nn.Sequential],
+        *groups: NDArray[np.int64],
+        counted: Sequence[bool] = (),
+        greys: np.random.Generator | None = None,
+    ) -> list[list[Tensor]]:
+        """Each network's logits of groups of states.
+
+        BatchNorm sees each group on its own; all else takes them together, which reads the weights once.
+
+        Args:
+            networks: K of them.
+            groups: states (B,) each.
+            counted: for each group whether BatchNorm's running statistics take it in, in training mode; all where
+                empty.
+            greys: where given, what every state's shades are mapped at random with.
+
+        Returns:
+            For each network each group's logits (B, 2).
+        """
+        sizes = [len(group) for group in groups]
         if self._tables is not None:
-            batch = patches.take(self._tables, states)
-            return [patches.forward(network, batch) for network in networks]
+            batch = patches.take(self._tables, *groups)
+            return [list(patches.forward(network, batch, counted).split(sizes)) for network in networks]
+        inputs = self._inputs(np.concatenate(groups), greys)
+        return [list(_forward(network, inputs, sizes, counted).split(sizes)) for network in networks]
+
+    def count_in(
+        self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], greys: np.random.Generator | None = None
+    ) -> None:
+        """BatchNorm's running statistics of networks in training mode take states (B,) in; nothing else is computed."""
+        with torch.no_grad():
+            heads = [_up_to_last_norm(network) for network in networks]
+            if self._tables is not None:
+                batch = patches.take(self._tables, states)
+                for head in heads:
+                    patches.forward(head, batch)
+            else:
+                inputs = self._inputs(states, greys)
+                for head in heads:
+                    head(inputs)
+
+    def _inputs(self, states: NDArray[np.int64], greys: np.random.Generator | None) -> Tensor:
         assert self._images is not None
-        inputs = as_input(self._images[torch.from_numpy(states).to(self.device)])
-        return [network(inputs) for network in networks]
+        images = self._images[torch.from_numpy(states).to(self.device)]
+        if greys is None:
+            return as_input(images)
+        maps = torch.from_numpy(grey_maps(len(states), greys)).to(self.device)
+        return maps.gather(1, images.flatten(start_dim=1).long()).view(images.shape).permute(0, 3, 1, 2)
 
     def targets(self, states: NDArray[np.int64]) -> Tensor:
         """Classes int64 (B,) of labelled states (B,)."""
@@ -73,35 +124,84 @@ class TrainingStates:
             network.eval()
         with torch.no_grad():
             chunks = [self.forward(networks, every[at : at + CHUNK]) for at in range(0, len(every), CHUNK)]
-        return [torch.cat(logits) for logits in zip(*chunks, strict=True)]
+        return [torch.cat([chunk[member][0] for chunk in chunks]) for member in range(len(networks))]
 
     def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """``config.steps`` times: labelled states (B,), half of them positive if asked, and unlabelled (B,).
+        """``config.steps`` times: labelled states (B,) and unlabelled (B,), see ``batch_kind`` and ``class_balance``.
 
         Every state of a pool is drawn once before any is drawn again. Without unlabelled states theirs are
         empty.
         """
-        unlabelled = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
-        if config.class_balance == "batch":
-            positives = config.batch_size // 2
-            pools = [
-                (np.flatnonzero(self.labels), positives, "positives"),
-                (np.flatnonzero(~self.labels), config.batch_size - positives, "negatives"),
-            ]
-        else:
-            pools = [(np.arange(self.n_labelled), config.batch_size, "labelled")]
-        pools.append((unlabelled, config.batch_size if len(unlabelled) else 0, "unlabelled"))
-        draws = [_draw(pool, count, rng_for(seed, name)) for pool, count, name in pools]
+        draws = [_draw(pools, count, seed, name) for pools, count, name in self._pools(config)]
         for _ in range(config.steps):
             *labelled, others = (next(draw) for draw in draws)
             yield np.concatenate(labelled), others
 
+    def _pools(self, config: EnsembleConfig) -> list[tuple[list[NDArray[np.int64]], int, str]]:
+        """What a batch is made of: states that take turns, how many of them, and a name; last the unlabelled."""
+        positives, negatives = np.flatnonzero(self.labels), np.flatnonzero(~self.labels)
+        if config.batch_kind == "per-ladder":
+            assert self.ladders is not None
+            count = min(max(1, round(LADDER_POSITIVES * config.batch_size)), config.batch_size - 1)
+            ladders = self.ladders[positives]
+            each = [positives[ladders == ladder] for ladder in np.unique(ladders)]
+            labelled = [(each, count, "positives"), ([negatives], config.batch_size - count, "negatives")]
+        elif config.class_balance == "batch":
+            half = config.batch_size // 2
+            labelled = [([positives], half, "positives"), ([negatives], config.batch_size - half, "negatives")]
+        else:
+            labelled = [([np.arange(self.n_labelled)], config.batch_size, "labelled")]
+        unlabelled = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
+        return [*labelled, ([unlabelled], config.batch_size if len(unlabelled) else 0, "unlabelled")]
 
-def _draw(pool: NDArray[np.int64], count: int, rng: np.random.Generator) -> Iterator[NDArray[np.int64]]:
-    """Without end: ``count`` items of the pool, which is shuffled anew whenever it has been gone through."""
-    waiting = np.empty(0, dtype=np.int64)
+
+def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> Iterator[NDArray[np.int64]]:
+    """Without end: ``count`` items of the pools in turn; each is shuffled anew whenever it has been gone through."""
+    streams = [
+        _shuffled(pool, rng_for(seed, name, *([number] if len(pools) > 1 else []))) for number, pool in enumerate(pools)
+    ]
+    turn = 0
     while True:
-        while len(waiting) < count:
-            waiting = np.concatenate([waiting, rng.permutation(pool)])
-        yield waiting[:count]
-        waiting = waiting[count:]
+        drawn = np.array([next(streams[(turn + item) % len(streams)]) for item in range(count)], dtype=np.int64)
+        turn = (turn + count) % len(streams)
+        yield drawn
+
+
+def _shuffled(pool: NDArray[np.int64], rng: np.random.Generator) -> Iterator[np.int64]:
+    """Without end: the pool's items, shuffled anew whenever it has been gone through."""
+    while True:
+        yield from rng.permutation(pool)
+
+
+def grey_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Random rising maps of the shades 0..255 to 0..1, float32 (count, 256)."""
+    rises = rng.random((count, GREY_KNOTS)) ** 2 + 0.02  # squared: steep in places, nearly level in others
+    risen = np.concatenate([np.zeros((count, 1)), rises.cumsum(1)], axis=1) / rises.sum(1, keepdims=True)
+    darkest, brightest = rng.uniform(*GREY_DARKEST, (count, 1)), rng.uniform(*GREY_BRIGHTEST, (count, 1))
+    at = np.linspace(0, GREY_KNOTS, 256)
+    knot = np.minimum(at.astype(np.int64), GREY_KNOTS - 1)
+    between = at - knot
+    shades = risen[:, knot] * (1 - between) + risen[:, knot + 1] * between
+    return (darkest + (brightest - darkest) * shades).astype(np.float32)
+
+
+def _forward(network: nn.Sequential, inputs: Tensor, sizes: Sequence[int], counted: Sequence[bool]) -> Tensor:
+    """Logits of groups of inputs, one after the other; BatchNorm sees each on its own."""
+    for layer in network:
+        if isinstance(layer, nn.BatchNorm2d) and layer.training:
+            groups = zip(inputs.split(list(sizes)), counted or [True] * len(sizes), strict=True)
+            inputs = torch.cat([layer(group) if counts else _normed(layer, group) for group, counts in groups])
+        else:
+            inputs = layer(inputs)
+    return inputs
+
+
+def _normed(layer: nn.BatchNorm2d, inputs: Tensor) -> Tensor:
+    """BatchNorm by the batch's own statistics, the running ones left alone."""
+    return functional.batch_norm(inputs, None, None, layer.weight, layer.bias, training=True, eps=layer.eps)
+
+
+def _up_to_last_norm(network: nn.Sequential) -> nn.Sequential:
+    """The layers that BatchNorm's running statistics depend on."""
+    norms = [index for index, layer in enumerate(network) if isinstance(layer, nn.BatchNorm2d)]
+    return nn.Sequential(*list(network)[: norms[-1] + 1 if norms else 0])

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from hypogoal.core.config import setting
 
+BEYOND = "own: beyond the paper"
+
 
 @dataclass(frozen=True)
 class EnsembleConfig:
@@ -20,7 +22,9 @@ class EnsembleConfig:
         source="Eq. (1); sequential: D-BAT (arXiv:2202.04414)",
         choices=("simultaneous", "sequential"),
     )
-    network: str = setting("doorkey", "member network, by name: doorkey, montezuma", source="the paper's appendix")
+    network: str = setting(
+        "doorkey", "member network, by name: doorkey, montezuma, montezuma-crop", source="the paper's appendix"
+    )
     steps: int = setting(
         150,
         "gradient steps (of each member, where sequential)",
@@ -52,4 +56,36 @@ class EnsembleConfig:
         True,
         "unlabelled batches count in BatchNorm's running statistics too, so that these are of more than one layout",
         source="the authors' code",
+    )
+    view: str = setting(
+        "full",
+        "what members see: full, the whole observation; agent-crop, a window around the agent",
+        source=BEYOND,
+        choices=("full", "agent-crop"),
+    )
+    crop_height: int = setting(24, "height of the window of view=agent-crop", unit="pixels", source=BEYOND, low=1)
+    crop_width: int = setting(32, "width of the window of view=agent-crop", unit="pixels", source=BEYOND, low=1)
+    localiser: str = setting(
+        "learned",
+        "where the agent is (view=agent-crop): learned, from the observation; ram, from the game's memory (an oracle)",
+        source=BEYOND,
+        choices=("learned", "ram"),
+    )
+    augment: str = setting(
+        "none",
+        "what is done to each state of a training batch: none; grey, its shades are mapped by a random rising function",
+        source=BEYOND,
+        choices=("none", "grey"),
+    )
+    batch_kind: str = setting(
+        "plain",
+        "labelled batches: plain, as class_balance says; per-ladder, 3/8 positives, as many of each ladder",
+        source=BEYOND,
+        choices=("plain", "per-ladder"),
+    )
+    threshold: str = setting(
+        "0.5",
+        "a member says yes above 0.5, or above the 95th percentile of its probabilities on unlabelled states",
+        source=BEYOND,
+        choices=("0.5", "unlabelled-q95"),
     )

@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses import patches
-from hypogoal.hypotheses.networks import as_input, build_network, reordered
+from hypogoal.hypotheses.networks import as_input, build_network, folded, reordered
+from hypogoal.hypotheses.views import AgentView, FullView
 
+THRESHOLD = 0.5  # of the probability, where none was chosen
 CHUNK = 64  # images at once in a plain forward pass: what fits a CPU's cache; on a GPU 16 times as many
 PATCH_CHUNK = 4096  # images at once where few patches are distinct
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
@@ -26,19 +28,32 @@ class Ensemble(nn.Module):
         observation_shape: (H, W, C) of the uint8 observations.
         members: K, at least 1.
         generator: draws the initial weights.
+        view: what members see of an observation; all of it where None.
 
     Attributes:
-        members: K plain ``nn.Sequential``, float (N, C, H, W) in 0..1 (``networks.as_input``) -> logits (N,
-            2).
+        members: K plain ``nn.Sequential``, float (N, C, h, w) in 0..1 (``networks.as_input``) -> logits (N,
+            2), of what ``view`` shows, uint8 (N, h, w, C).
+        thresholds: float32 (K,), the probabilities above which the members' verdicts are yes.
 
     Raises:
         UserError: unknown network, or images too small for it.
     """
 
-    def __init__(self, network: str, observation_shape: tuple[int, ...], members: int, generator: torch.Generator):
+    thresholds: Tensor
+
+    def __init__(
+        self,
+        network: str,
+        observation_shape: tuple[int, ...],
+        members: int,
+        generator: torch.Generator,
+        view: FullView | AgentView | None = None,
+    ):
         super().__init__()
         self.network, self.observation_shape = network, tuple(int(size) for size in observation_shape)
-        self.members = nn.ModuleList(build_network(network, self.observation_shape, generator) for _ in range(members))
+        self.view = view or FullView(self.observation_shape)
+        self.members = nn.ModuleList(build_network(network, self.view.shape, generator) for _ in range(members))
+        self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self._networks = tuple(reordered(member) for member in self.members if isinstance(member, nn.Sequential))
 
     def __len__(self) -> int:
@@ -49,19 +64,43 @@ class Ensemble(nn.Module):
         """The members in the order of layers that is fastest; weights and BatchNorm statistics are shared."""
         return self._networks
 
-    def predict(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
+    @property
+    def needs_positions(self) -> bool:
+        """Whether predictions need the agent's positions (localiser=ram): an oracle, wherever it is shown."""
+        return self.view.needs_positions
+
+    def set_thresholds(self, thresholds: NDArray[np.float32]) -> None:
+        """The probabilities (K,) above which the members' verdicts are yes."""
+        self.thresholds.copy_(torch.from_numpy(thresholds))
+
+    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
+        """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`."""
+        self._check(observations, positions)
+        return self.view.see(observations, positions)
+
+    def verdicts(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.bool_]:
+        """Whether each member says that the sub-goal is reached: bool (N, K); see :meth:`predict`."""
+        says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
+        return says_yes
+
+    def predict(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float32]:
         """Every member's probability that the sub-goal is reached.
 
         Args:
             observations: uint8 (N, H, W, C).
+            positions: int64 (N, 3) of room, x, y; only where ``needs_positions``.
 
         Returns:
             float32 (N, K). Up to rounding a state's row does not depend on the others.
 
         Raises:
-            UserError: observations of another shape or type.
+            UserError: observations of another shape or type, or positions that are needed and not given.
         """
-        self._check(observations)
+        observations = self.see(observations, positions)
         was_training = self.training
         if was_training:
             self.eval()
@@ -80,10 +119,11 @@ class Ensemble(nn.Module):
         networks = self.networks()
         device = self._device()
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables(observations, patches.windows_of(networks[0]))
+            tables = patches.make_tables(observations, networks[0])
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
                 return torch.stack([patches.forward(network, batch) for network in networks])
+        networks = tuple(folded(network) for network in networks)
         chunk = CHUNK if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
@@ -97,14 +137,22 @@ class Ensemble(nn.Module):
 
     @classmethod
     def from_state(
-        cls, network: str, observation_shape: tuple[int, ...], members: int, state: Mapping[str, Tensor]
+        cls,
+        network: str,
+        observation_shape: tuple[int, ...],
+        members: int,
+        state: Mapping[str, Tensor],
+        view: FullView | AgentView | None = None,
     ) -> Ensemble:
         """The ensemble that ``state()`` was taken from, in evaluation mode.
+
+        A state without thresholds is of an ensemble from before there were any: 0.5.
 
         Raises:
             UserError: the state is not one of such an ensemble, or holds NaN or Inf.
         """
-        ensemble = cls(network, observation_shape, members, torch.Generator())
+        ensemble = cls(network, observation_shape, members, torch.Generator(), view)
+        state = {"thresholds": ensemble.thresholds, **state}
         wanted = ensemble.state_dict()
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
         for name in sorted({*wanted, *state}):
@@ -112,14 +160,18 @@ class Ensemble(nn.Module):
                 raise UserError(f"the weights do not fit the ensemble (at {name})", where, "Train it again.")
             if not torch.isfinite(state[name]).all():
                 raise UserError(f"the weights hold NaN or Inf (at {name})", where, "Train it again.")
-        ensemble.load_state_dict(dict(state))
+        ensemble.load_state_dict(state)
         return ensemble.eval()
 
     def _device(self) -> torch.device:
-        return next(self.parameters()).device
+        return self.thresholds.device
 
-    def _check(self, observations: NDArray[np.uint8]) -> None:
+    def _check(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None) -> None:
         if observations.dtype != np.uint8 or observations.shape[1:] != self.observation_shape:
             found = f"{observations.dtype} {observations.shape}"
             wanted = f"uint8 (N, {', '.join(map(str, self.observation_shape))})"
             raise UserError("these are not observations that the ensemble knows", found, f"Give {wanted}.")
+        if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
+            found = "none" if positions is None else f"{positions.dtype} {positions.shape}"
+            hint = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
+            raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", found, hint)

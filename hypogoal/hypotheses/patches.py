@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-WORTHWHILE = 0.1  # distinct patches per place, above which the plain network is about as fast
+WORTHWHILE = 0.5  # share of the plain network's work in convolutions, above which gathering patches eats up the gain
 SAMPLE = 64  # images from which that is judged
 LOOKUP_PER_VALUE = 4  # size of a table that ranks values; where it would be larger, sorting them is faster
 
@@ -26,14 +26,14 @@ class Level:
     """What one convolution or pooling looks at in N images, by patch ids.
 
     Attributes:
-        parts: int64 (U, k * k), each distinct patch as patch ids of the level below (colours for the first).
-        rows: int64 (R, W), distinct rows of places: the patch at each.
-        lines: int64 (N, H), each image as indices of rows.
+        parts: int32 (U, k * k), each distinct patch as patch ids of the level below (colours for the first).
+        rows: int32 (R, W), distinct rows of places: the patch at each.
+        lines: int32 (N, H), each image as indices of rows.
     """
 
-    parts: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    lines: NDArray[np.int64]
+    parts: NDArray[np.int32]
+    rows: NDArray[np.int32]
+    lines: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -46,20 +46,23 @@ class Tables:
 
 @dataclass(frozen=True)
 class Batch:
-    """The patches that occur in B images.
+    """The patches that occur in groups of images; those of a group follow those of the group before it.
+
+    BatchNorm sees each group on its own, everything else all of them at once.
 
     Attributes:
-        colours: float32 (U, C).
-        parts: for each level int64 (U * k * k,), indices of the level below.
-        shares: for each level float32 (1, U), the share of all places where each patch lies; sums to 1.
-        places: for each level, how many places there are.
-        last: int64 (B, H * W), the last level's patch at each place.
+        first: float32 (U, k * k, C), the patches of the first level.
+        parts: for each level above it int64 (U * k * k,), indices of the level below.
+        shares: for each level and group float32 (1, U), the share of the group's places where each patch lies; they sum
+            to 1.
+        places: for each level and group, how many places there are.
+        last: int64 (B, H * W), the last level's patch at each place of all images.
     """
 
-    colours: Tensor
+    first: Tensor
     parts: tuple[Tensor, ...]
-    shares: tuple[Tensor, ...]
-    places: tuple[int, ...]
+    shares: tuple[tuple[Tensor, ...], ...]
+    places: tuple[tuple[int, ...], ...]
     last: Tensor
 
 
@@ -85,15 +88,31 @@ def _side(size: object) -> int:
     return size[0] if isinstance(size, tuple) and size[0] == size[1] else -1
 
 
-def make_tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]] | None) -> Tables | None:
-    """The distinct patches of images uint8 (N, H, W, C); None where too few repeat to be worthwhile."""
+def make_tables(observations: NDArray[np.uint8], network: nn.Sequential) -> Tables | None:
+    """The distinct patches of images uint8 (N, H, W, C) as ``network`` looks at them.
+
+    None where too few repeat to be worthwhile, or where the network has layers that tables do not know.
+    """
+    windows = windows_of(network)
     if windows is None or len(observations) == 0:
         return None
     spread = np.linspace(0, len(observations) - 1, min(SAMPLE, len(observations))).astype(np.int64)
     sample = _tables(observations[spread], windows)
-    distinct = sum(len(level.parts) for level in sample.levels)
-    places = sum(level.rows.shape[1] * level.lines.size for level in sample.levels)
-    return _tables(observations, windows) if distinct < WORTHWHILE * places else None
+    work = _work_of(network)
+    tabled = sum(len(level.parts) * each for level, each in zip(sample.levels, work, strict=True))
+    plain = sum(level.rows.shape[1] * level.lines.size * each for level, each in zip(sample.levels, work, strict=True))
+    return _tables(observations, windows) if tabled < WORTHWHILE * plain else None
+
+
+def _work_of(network: nn.Sequential) -> list[int]:
+    """What each convolution or pooling does at one place: multiplications, or comparisons."""
+    work = []
+    for layer in network:
+        if isinstance(layer, nn.Conv2d):
+            work.append(layer.weight.numel())
+        elif isinstance(layer, nn.MaxPool2d):
+            work.append(_side(layer.kernel_size) ** 2)
+    return work
 
 
 def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]]) -> Tables:
@@ -109,85 +128,109 @@ def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]])
     return Tables(torch.from_numpy(colours.astype(np.float32)).div_(255.0), tuple(levels))
 
 
-def _level(rows: NDArray[np.int64], lines: NDArray[np.int64], distinct: int, kernel: int, stride: int) -> Level:
-    """Distinct kernel x kernel windows: first bands of ``kernel`` rows, then windows in distinct bands."""
-    lines, bands = _join(_strided(lines, kernel, stride), np.arange(len(rows))[:, None])
-    high = rows[bands]  # (R, kernel, W)
-    pieces = [piece for row in range(kernel) for piece in _strided(high[:, row], kernel, stride)]
-    ids, parts = _join(pieces, np.arange(distinct)[:, None])
-    return Level(parts, ids, lines)
+def _level(rows: NDArray[np.int32], lines: NDArray[np.int32], distinct: int, kernel: int, stride: int) -> Level:
+    """Distinct kernel x kernel windows: strips of ``kernel`` in distinct rows, bands of rows, then strips in bands."""
+    strip_rows, strips = _join(list(_strided(rows, kernel, stride)), np.arange(distinct, dtype=np.int32)[:, None])
+    lines, bands = _join(list(_strided(lines, kernel, stride)), np.arange(len(rows), dtype=np.int32)[:, None])
+    pieces = [strip_rows[bands[:, row]] for row in range(kernel)]
+    ids, stacks = _join(pieces, np.arange(len(strips), dtype=np.int32)[:, None])
+    return Level(strips[stacks].reshape(len(stacks), -1), ids, lines)
 
 
-def _strided(values: NDArray[np.int64], kernel: int, stride: int) -> Iterator[NDArray[np.int64]]:
+def _strided(values: NDArray[np.int32], kernel: int, stride: int) -> Iterator[NDArray[np.int32]]:
     """For each offset in a window, the values (..., W) there: ``kernel`` arrays (..., number of windows)."""
     count = (values.shape[-1] - kernel) // stride + 1
     for offset in range(kernel):
         yield values[..., offset : offset + stride * (count - 1) + 1 : stride]
 
 
-def _join(
-    pieces: Iterator[NDArray[np.int64]] | list[NDArray[np.int64]], parts: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _join(pieces: Sequence[NDArray[np.int32]], parts: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Ids of the distinct tuples that pieces (ids of ``parts``) form place by place, and the tuples."""
     first, *others = pieces
     ids, joined = first, parts
     for piece in others:
-        ids, distinct = _rank(ids * len(parts) + piece, len(joined) * len(parts))
+        pairs = ids.astype(np.int64) * len(parts) + piece
+        ids, distinct = _rank(pairs, len(joined) * len(parts))
         joined = np.concatenate([joined[distinct // len(parts)], parts[distinct % len(parts)]], axis=1)
     return ids, joined
 
 
-def _rank(values: NDArray[np.int64], bound: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _rank(values: NDArray[np.int64], bound: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Values in 0..bound-1 -> (each one's rank among the distinct ones, the distinct ones in order)."""
     if bound > LOOKUP_PER_VALUE * values.size:
         distinct, ranks = np.unique(values, return_inverse=True)
-        return ranks.reshape(values.shape), distinct
+        return ranks.reshape(values.shape).astype(np.int32), distinct
     occurs = np.zeros(bound, dtype=np.bool_)
     occurs[values] = True
-    return (np.cumsum(occurs) - 1)[values], np.flatnonzero(occurs)
+    return (np.cumsum(occurs, dtype=np.int32) - 1)[values], np.flatnonzero(occurs)
 
 
-def _distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+def _distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     """Items (N, bytes) -> (index among the distinct ones (N,), the distinct ones in order of appearance)."""
     whole: list[bytes] = np.ascontiguousarray(items).view(f"V{items.shape[1]}").ravel().tolist()
     index_of = {item: index for index, item in enumerate(dict.fromkeys(whole))}
-    index = np.fromiter(map(index_of.__getitem__, whole), np.int64, len(whole))
+    index = np.fromiter(map(index_of.__getitem__, whole), np.int32, len(whole))
     return index, np.frombuffer(b"".join(index_of), np.uint8).reshape(-1, items.shape[1])
 
 
-def take(tables: Tables, images: NDArray[np.int64]) -> Batch:
-    """The patches that occur in the images with indices (B,); an image that is given twice counts twice."""
-    parts, shares, places = [], [], []
-    position = np.arange(len(tables.colours))  # of each patch of the level below among those that occur
-    ids = np.zeros(0, dtype=np.int64)
-    for level in tables.levels:
-        ids = level.rows[level.lines[images]]
-        occurrences = np.bincount(ids.ravel(), minlength=len(level.parts))
-        used = np.flatnonzero(occurrences)
-        parts.append(torch.from_numpy(position[level.parts[used]].ravel()))
-        shares.append(torch.from_numpy((occurrences[used] / ids.size).astype(np.float32))[None])
-        places.append(ids.size)
-        position = np.zeros(len(level.parts), dtype=np.int64)
-        position[used] = np.arange(len(used))
-    last = torch.from_numpy(position[ids].reshape(len(images), -1))
-    return Batch(tables.colours, tuple(parts), tuple(shares), tuple(places), last)
+def take(tables: Tables, *groups: NDArray[np.int64]) -> Batch:
+    """The patches that occur in groups of images, given by index (B,); an image that is given twice counts twice."""
+    levels = len(tables.levels)
+    parts: list[list[NDArray[np.int64]]] = [[] for _ in range(levels)]
+    shares: list[list[Tensor]] = [[] for _ in range(levels)]
+    places: list[list[int]] = [[] for _ in range(levels)]
+    before = [0] * levels  # patches of the groups before, at each level
+    last = []
+    for images in groups:
+        used = np.arange(len(tables.colours))  # of the level below; all colours are there for all groups
+        offset = 0
+        for index, level in enumerate(tables.levels):
+            ids = level.rows[level.lines[images]]
+            ranks, occurring = _rank(ids.astype(np.int64), len(level.parts))
+            occurrences = np.bincount(ranks.ravel(), minlength=len(occurring))
+            parts[index].append(_positions(level.parts[occurring].ravel(), used) + offset)
+            shares[index].append(torch.from_numpy((occurrences / ids.size).astype(np.float32))[None])
+            places[index].append(ids.size)
+            used, offset = occurring, before[index]
+            before[index] += len(occurring)
+        last.append(ranks.reshape(len(images), -1).astype(np.int64) + offset)
+    colours, *above = (torch.from_numpy(np.concatenate(of_groups)) for of_groups in parts)
+    channels = tables.colours.shape[1]
+    return Batch(
+        tables.colours.index_select(0, colours).view(-1, tables.levels[0].parts.shape[1], channels),
+        tuple(above),
+        tuple(map(tuple, shares)),
+        tuple(map(tuple, places)),
+        torch.from_numpy(np.concatenate(last)),
+    )
 
 
-def forward(network: nn.Sequential, batch: Batch) -> Tensor:
-    """Logits (B, 2) that ``network`` gives the images of ``batch``, in its training or evaluation mode."""
-    rows, level = batch.colours, -1
+def _positions(values: NDArray[np.int32], among: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each value is in the sorted ``among``, which has them all."""
+    if among[-1] < LOOKUP_PER_VALUE * values.size:
+        position = np.empty(int(among[-1]) + 1, dtype=np.int64)
+        position[among] = np.arange(len(among))
+        return position[values]
+    return np.searchsorted(among, values)
+
+
+def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) -> Tensor:
+    """Logits (B, 2) that ``network`` gives the images of ``batch``, in its training or evaluation mode.
+
+    Args:
+        network: layers that ``windows_of`` knows.
+        batch: images, in groups.
+        counted: for each group whether BatchNorm's running statistics take it in (in training mode); all where empty.
+    """
+    rows, level = batch.first, -1
     for layer in network:
-        if isinstance(layer, nn.Conv2d):
-            level += 1
-            weight = layer.weight.permute(2, 3, 1, 0).reshape(-1, layer.out_channels)
-            seen = rows.index_select(0, batch.parts[level]).view(-1, len(weight))
-            rows = seen @ weight if layer.bias is None else torch.addmm(layer.bias, seen, weight)
-        elif isinstance(layer, nn.MaxPool2d):
+        if isinstance(layer, (nn.Conv2d, nn.MaxPool2d)):
             level += 1
             window = _side(layer.kernel_size) ** 2
-            rows = rows.index_select(0, batch.parts[level]).view(-1, window, rows.shape[1]).max(dim=1).values
+            seen = rows.index_select(0, batch.parts[level - 1]).view(-1, window, rows.shape[1]) if level else rows
+            rows = _convolved(layer, seen) if isinstance(layer, nn.Conv2d) else seen.max(dim=1).values
         elif isinstance(layer, nn.BatchNorm2d):
-            rows = _batch_norm(layer, rows, batch.shares[level], batch.places[level])
+            rows = _batch_norm(layer, rows, batch.shares[level], batch.places[level], counted)
         elif isinstance(layer, nn.Flatten):
             images, places = batch.last.shape
             grid = rows.index_select(0, batch.last.flatten()).view(images, places, rows.shape[1])
@@ -197,21 +240,43 @@ def forward(network: nn.Sequential, batch: Batch) -> Tensor:
     return rows
 
 
-def _batch_norm(layer: nn.BatchNorm2d, rows: Tensor, shares: Tensor, places: int) -> Tensor:
-    """BatchNorm of rows (U, C), each of which stands for its share (1, U) of all places."""
-    running_mean, running_var = layer.running_mean, layer.running_var
-    assert running_mean is not None
-    assert running_var is not None
+def _convolved(layer: nn.Conv2d, seen: Tensor) -> Tensor:
+    """A convolution of patches (U, k * k, C): (U, channels out)."""
+    weight = layer.weight.permute(2, 3, 1, 0).reshape(-1, layer.out_channels)
+    flat = seen.view(-1, len(weight))
+    return flat @ weight if layer.bias is None else torch.addmm(layer.bias, flat, weight)
+
+
+def _batch_norm(
+    layer: nn.BatchNorm2d, rows: Tensor, shares: Sequence[Tensor], places: Sequence[int], counted: Sequence[bool]
+) -> Tensor:
+    """BatchNorm of rows (U, C), group after group; each row stands for its share of its group's places."""
     if not layer.training:
+        running_mean, running_var = layer.running_mean, layer.running_var
+        assert running_mean is not None
+        assert running_var is not None
         scale = layer.weight * torch.rsqrt(running_var + layer.eps)
         return torch.addcmul(layer.bias - running_mean * scale, rows, scale)
+    groups = zip(
+        rows.split([share.shape[1] for share in shares]), shares, places, counted or [True] * len(shares), strict=True
+    )
+    normed = [_normed(layer, *group) for group in groups]
+    return normed[0] if len(normed) == 1 else torch.cat(normed)
+
+
+def _normed(layer: nn.BatchNorm2d, rows: Tensor, shares: Tensor, places: int, counted: bool) -> Tensor:
+    """One group's rows in training mode."""
     mean = shares @ rows
     centred = rows - mean
     variance = shares @ centred.square()
-    with torch.no_grad():
-        momentum = layer.momentum or 0.0
-        running_mean.lerp_(mean[0], momentum)
-        running_var.lerp_(variance[0] * (places / max(places - 1, 1)), momentum)
-        if layer.num_batches_tracked is not None:
-            layer.num_batches_tracked.add_(1)
+    if counted:
+        running_mean, running_var = layer.running_mean, layer.running_var
+        assert running_mean is not None
+        assert running_var is not None
+        with torch.no_grad():
+            momentum = layer.momentum or 0.0
+            running_mean.lerp_(mean[0], momentum)
+            running_var.lerp_(variance[0] * (places / max(places - 1, 1)), momentum)
+            if layer.num_batches_tracked is not None:
+                layer.num_batches_tracked.add_(1)
     return torch.addcmul(layer.bias, centred, layer.weight * torch.rsqrt(variance + layer.eps))

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import as_input
+from hypogoal.hypotheses.networks import as_input, folded
+from hypogoal.hypotheses.views import FullView
 
 CHUNK = 64  # images at once: what fits a CPU's cache
 
@@ -23,36 +24,56 @@ class StackedMembers:
     Up to rounding the same as each ensemble's ``predict`` (a test asserts it).
 
     Args:
-        ensembles: G ensembles of K members each, all with one network and observation shape.
+        ensembles: G ensembles of K members each, all with one network and observation shape, and views of one shape.
+
+    Attributes:
+        needs_positions: whether any of them does, see :attr:`Ensemble.needs_positions`.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble]):
-        networks = [network for ensemble in ensembles for network in ensemble.networks()]
+        self.ensembles = tuple(ensembles)
+        self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
+        self._one_view = all(isinstance(ensemble.view, FullView) for ensemble in ensembles)
+        self._thresholds = np.concatenate([ensemble.thresholds.cpu().numpy() for ensemble in ensembles])
+        networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
         self.count = len(networks)
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
         for layers in zip(*networks, strict=True):
             self._steps.append((layers[0], _stack(list(layers))))
 
-    def predict(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """P(sub-goal reached) from uint8 (N, H, W, C): float32 (N, G*K), ensemble by ensemble."""
+    def predict(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float32]:
+        """P(sub-goal reached): float32 (N, G*K), ensemble by ensemble; arguments as of :meth:`Ensemble.predict`."""
+        seen = self._see(observations, positions)
         rows = []
         with torch.inference_mode():
-            for start in range(0, len(observations), CHUNK):
-                images = as_input(torch.from_numpy(observations[start : start + CHUNK]))
+            for start in range(0, len(seen), CHUNK):
+                images = as_input(torch.from_numpy(seen[start : start + CHUNK]))
                 rows.append(self._logits(images).softmax(-1)[..., 1].T.numpy())
         return np.concatenate(rows) if rows else np.empty((0, self.count), dtype=np.float32)
 
+    def verdicts(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.bool_]:
+        """Whether each member says that its sub-goal is reached: bool (N, G*K)."""
+        says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self._thresholds
+        return says_yes
+
+    def _see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None) -> NDArray[np.uint8]:
+        """What the ensembles see, uint8 (N, h, w, C), or (N, h, w, G*C) where each sees with its own localiser."""
+        if self._one_view:
+            return self.ensembles[0].see(observations)
+        return np.concatenate([ensemble.see(observations, positions) for ensemble in self.ensembles], axis=-1)
+
     def _logits(self, x: Tensor) -> Tensor:
         """float32 (N, C, H, W) -> (members, N, 2)."""
-        groups = 1
+        groups = 1 if self._one_view else len(self.ensembles)
         for layer, weights in self._steps:
             if isinstance(layer, nn.Conv2d):
                 bias = weights[1] if len(weights) > 1 else None
                 x = functional.conv2d(x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups)
                 groups = self.count
-            elif isinstance(layer, nn.BatchNorm2d):
-                mean, variance, scale, shift = weights
-                x = functional.batch_norm(x, mean, variance, scale, shift, training=False, eps=layer.eps)
             elif isinstance(layer, nn.Flatten):
                 x = x.reshape(len(x), self.count, -1).transpose(0, 1)
             elif isinstance(layer, nn.Linear):
@@ -72,8 +93,6 @@ def _stack(layers: list[nn.Module]) -> list[Tensor]:
 
     if isinstance(first, nn.Conv2d):
         return [joined(name) for name in ("weight", "bias") if name in state[0]]
-    if isinstance(first, nn.BatchNorm2d):
-        return [joined(name) for name in ("running_mean", "running_var", "weight", "bias")]
     if isinstance(first, nn.Linear):
         weight = torch.stack([values["weight"].T for values in state]).contiguous()
         return [weight, torch.stack([values["bias"] for values in state])[:, None]]

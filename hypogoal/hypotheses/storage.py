@@ -8,6 +8,8 @@ from typing import Any
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import LOCALISERS
+from hypogoal.hypotheses.views import AgentView, FullView
 
 
 def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:
@@ -31,6 +33,15 @@ def read_ensemble(folder: Path, config: dict[str, Any], sub_goal: str) -> Ensemb
     path = folder / f"{sub_goal}.safetensors"
     state = load_tensors(path)
     try:
-        return Ensemble.from_state(config["network"], tuple(config["observation_shape"]), config["members"], state)
+        shape = tuple(config["observation_shape"])
+        return Ensemble.from_state(config["network"], shape, config["members"], state, _view(shape, config))
     except (RuntimeError, KeyError):
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
+
+
+def _view(observation_shape: tuple[int, ...], config: dict[str, Any]) -> FullView | AgentView:
+    """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
+    if config.get("view", "full") == "full":
+        return FullView(observation_shape)
+    localiser = LOCALISERS[config["localiser"]](observation_shape)
+    return AgentView(observation_shape, config["crop_height"], config["crop_width"], localiser)

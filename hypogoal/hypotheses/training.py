@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.seeding import seed_for, torch_generator
+from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import (
+    LearnedLocaliser,
+    Localiser,
+    RamLocaliser,
+    fit_localiser,
+    montezuma_only,
+    pixels_of,
+)
+from hypogoal.hypotheses.views import POSITION, AgentView, FullView, needed, positions_of
 
 __all__ = ["EnsembleConfig", "fit", "total_steps"]
 
 OnStep = Callable[[int, dict[str, float]], None]
+Origins = Mapping[str, NDArray[np.int64]]
+QUANTILE, QUANTILE_LEVEL = "unlabelled-q95", 0.95
 REPORT_EVERY = 10  # steps between reports, and between looks for NaN: a look makes a GPU wait
 
 
@@ -37,6 +48,8 @@ def fit(
     seed: int,
     on_step: OnStep | None = None,
     *,
+    origins: Origins | None = None,
+    unlabelled_origins: Origins | None = None,
     device: torch.device | str = "cpu",
 ) -> Ensemble:
     """Eq. (1): the trained members of one sub-goal. On one CPU the same arguments give the same bytes.
@@ -50,25 +63,94 @@ def fit(
         on_step: called every ``REPORT_EVERY`` steps and at the last one with the number of steps done, of
             ``total_steps(config)``, and with that step's ``loss``, ``labelled`` (mean over the members in
             training) and ``diversity`` (the inner sums of Eq. (1), before their weight).
+        origins: int64 (N,) by name, where each labelled state comes from: ``ladder`` for batch_kind=per-ladder;
+            ``room``, ``x``, ``y`` (and ``dying``) for view=agent-crop.
+        unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram.
         device: where to train; the ensemble stays there.
 
     Returns:
         The ensemble, in evaluation mode.
 
     Raises:
-        UserError: labels of one class only, or no unlabelled states though members are to differ.
+        UserError: labels of one class only, no unlabelled states though members are to differ or thresholds to be set
+            on them, or data that do not say what the settings need to know of them.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
-    ensemble = Ensemble(config.network, observations.shape[1:], config.members, torch_generator(seed, "weights"))
+    if len(unlabelled) == 0:
+        if _diverse(config):
+            raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
+        if config.threshold == QUANTILE:
+            raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
+    view = _view(observations, unlabelled, config, seed_for(seed, "localiser"), origins, unlabelled_origins)
+    generator = torch_generator(seed, "weights")
+    ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)
     ensemble.to(device)
     networks = ensemble.networks()
-    states = TrainingStates(observations, labels, unlabelled, networks[0], torch.device(device))
-    if _diverse(config) and len(unlabelled) == 0:
-        raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
+    states = TrainingStates(
+        view.see(observations, positions_of(origins)),
+        labels,
+        view.see(unlabelled, positions_of(unlabelled_origins)),
+        networks[0],
+        torch.device(device),
+        ladders=_ladders(config, origins),
+        tables=config.augment == "none",
+    )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
     for done, members in enumerate(rounds):
         _fit_members(networks, members, states, config, seed_for(seed, "batches", done), done * config.steps, on_step)
-    return ensemble.eval()
+    ensemble.eval()
+    if config.threshold == QUANTILE:
+        probabilities = ensemble.predict(unlabelled, positions_of(unlabelled_origins))
+        ensemble.set_thresholds(quantile_thresholds(probabilities))
+    return ensemble
+
+
+def quantile_thresholds(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Thresholds float32 (K,) above which each member says yes to 5 % of states, from its probabilities (M, K) of them.
+
+    Members of a crop are sure of what is no base and unsure of what is one in a room they do not know; the quantile
+    needs no labels. It stays below 1: a member that is certain of more than 5 % goes on saying yes to those.
+    """
+    quantiles = np.quantile(probabilities, QUANTILE_LEVEL, axis=0, method="higher").astype(np.float32)
+    return np.minimum(quantiles, np.nextafter(np.float32(1), np.float32(0)))
+
+
+def _view(
+    observations: NDArray[np.uint8],
+    unlabelled: NDArray[np.uint8],
+    config: EnsembleConfig,
+    seed: int,
+    origins: Origins | None,
+    unlabelled_origins: Origins | None,
+) -> FullView | AgentView:
+    """What the members are to see; a localiser that learns is trained here."""
+    if config.view == "full":
+        return FullView(observations.shape[1:])
+    montezuma_only(observations.shape[1:], "view=agent-crop")
+    needed(origins, POSITION, "view=agent-crop")
+    if config.localiser == "ram":
+        if len(unlabelled):
+            needed(unlabelled_origins, POSITION, "localiser=ram")
+        localiser: Localiser = RamLocaliser(observations.shape[1:])
+    else:
+        localiser = _learned(observations, origins or {}, seed)
+    return AgentView(observations.shape[1:], config.crop_height, config.crop_width, localiser)
+
+
+def _learned(observations: NDArray[np.uint8], origins: Origins, seed: int) -> LearnedLocaliser:
+    """A localiser learned from the labelled states in which the agent lives: dying it is nowhere, or elsewhere."""
+    positions = positions_of(origins)
+    assert positions is not None
+    alive = np.flatnonzero(origins.get("dying", np.zeros(len(positions))) == 0)
+    return fit_localiser(observations[alive], pixels_of(positions[alive]), seed)
+
+
+def _ladders(config: EnsembleConfig, origins: Origins | None) -> NDArray[np.int64] | None:
+    if config.batch_kind == "plain":
+        return None
+    needed(origins, ("ladder",), "batch_kind=per-ladder")
+    assert origins is not None
+    return origins["ladder"]
 
 
 def _diverse(config: EnsembleConfig) -> bool:
@@ -102,21 +184,19 @@ def _fit_members(
         fused=True,
     )
     watch = _Watch(members, len(frozen) if diverse else 0, config, steps_before, on_step)
+    greys = rng_for(seed, "greys") if config.augment == "grey" else None
     for labelled, unlabelled in states.batches(config, seed):
+        if diverse:
+            both = states.forward(trained, labelled, unlabelled, counted=(True, config.unlabelled_bn), greys=greys)
+            rows = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
+            pair_losses = _pair_losses(objective, [other for _, other in both], [other[rows] for other in frozen])
+        else:
+            both = states.forward(trained, labelled, greys=greys)
+            pair_losses = torch.zeros(0, device=states.device)
+            if config.unlabelled_bn and len(unlabelled):
+                states.count_in(trained, unlabelled, greys)
         targets = states.targets(labelled)
-        label_losses = torch.stack(
-            [
-                nn.functional.cross_entropy(logits, targets, class_weights)
-                for logits in states.forward(trained, labelled)
-            ]
-        )
-        pair_losses = label_losses.new_zeros(0)
-        if diverse or (config.unlabelled_bn and len(unlabelled)):
-            with torch.set_grad_enabled(diverse), _running_statistics(trained, config.unlabelled_bn):
-                logits = states.forward(trained, unlabelled)
-            if diverse:
-                rows = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
-                pair_losses = _pair_losses(objective, logits, [other[rows] for other in frozen])
+        label_losses = torch.stack([functional.cross_entropy(own[0], targets, class_weights) for own in both])
         loss = label_losses.sum() + config.diversity_weight * pair_losses.sum()
         optimiser.zero_grad()
         loss.backward()
@@ -136,21 +216,6 @@ def _pair_losses(
     losses = [2.0 * objective(one, other) for one, other in combinations(logits, 2)]
     losses += [objective(old, one) for one in logits for old in frozen]
     return torch.stack(losses) if losses else torch.zeros(0, device=logits[0].device)
-
-
-@contextmanager
-def _running_statistics(networks: Sequence[nn.Sequential], update: bool) -> Iterator[None]:
-    """Inside, BatchNorm still normalises by the batch, but its running statistics move only if ``update``."""
-    norms = [layer for network in networks for layer in network if isinstance(layer, nn.BatchNorm2d)]
-    momenta = [norm.momentum for norm in norms]
-    try:
-        if not update:
-            for norm in norms:
-                norm.momentum = 0.0
-        yield
-    finally:
-        for norm, momentum in zip(norms, momenta, strict=True):
-            norm.momentum = momentum
 
 
 class _Watch:

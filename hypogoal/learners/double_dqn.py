@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 
 def double_q_targets(
-    rewards: Tensor, terminal: Tensor, next_online: Tensor, next_target: Tensor, gamma: float
+    rewards: Tensor, terminal: Tensor, next_online: Tensor, next_target: Tensor, gamma: float | Tensor
 ) -> Tensor:
     """Spec D2: r + gamma (1 - terminal) Q_target(s', argmax_a Q_online(s', a)).
 
@@ -20,7 +20,7 @@ def double_q_targets(
         terminal: bool (...,), True where nothing follows s'.
         next_online: float (..., A), the online network at s'.
         next_target: float (..., A), the target network at s'.
-        gamma: discount per step.
+        gamma: discount of s', float or (...,): per step, or to the power n where s' is n steps on.
 
     Returns:
         float (...,).

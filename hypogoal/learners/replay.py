@@ -70,6 +70,8 @@ class PrioritisedReplay:
     def add(self, **columns: NDArray[Any]) -> NDArray[np.int64]:
         """Append n transitions with the largest priority seen; returns their indices, int64 (n,)."""
         count = len(next(iter(columns.values())))
+        if not count:
+            return np.empty(0, dtype=np.int64)
         indices = (self._next + np.arange(count)) % self.capacity
         for name, values in columns.items():
             self.data[name][indices] = values

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, Engine
@@ -16,6 +17,7 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
 from hypogoal.options.recurrent import RecurrentLearner
+from hypogoal.options.running import MemberVerdicts
 from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
 
 LOG_INTERVAL = 2_000  # environment steps
@@ -26,6 +28,14 @@ LEARNERS: dict[str, type[LightLearner] | type[RecurrentLearner]] = {"light": Lig
 class PlayConfig(OptionConfig):
     """Where options are played, and for how long."""
 
+    start: str = setting("", "where episodes begin, in a domain that names several such places", source="Spec D4")
+    along: float = setting(
+        0.0,
+        "share of episodes that begin somewhere on the way from 'start'",
+        source="a curriculum, ours",
+        low=0.0,
+        high=1.0,
+    )
     layout_seed: int = setting(100, "the layout the agent lives on", source="Spec E4", low=0)
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", source="B1", low=1)
     termination: str = setting(
@@ -47,18 +57,46 @@ def build(
         ensemble_folder: an ensemble artefact's folder.
         about: its manifest's configuration.
         config: see :class:`PlayConfig`.
-        seed: of weights and exploration.
+        seed: of weights, exploration and, where there are several, start states.
+
+    Raises:
+        UserError: the domain has no such start.
     """
     extra = {key: about["domain_config"][key] for key in ("keyring", "door_label") if key in about["domain_config"]}
+    oracle = config.termination == "oracle"
+    options = len(domain.sub_goals) if oracle else len(about["sub_goals"]) * about["members"]
+    extra |= start_arguments(domain, config, options, seed)
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **extra)
-    if config.termination == "oracle":
-        verdicts = Verdicts(oracle_terminations(engine), len(domain.sub_goals))
+    if oracle:
+        verdicts = Verdicts(oracle_terminations(engine), options)
     else:
         ensembles = [read_ensemble(ensemble_folder, dict(about), sub_goal) for sub_goal in about["sub_goals"]]
-        verdicts = Verdicts(learned_terminations(engine, ensembles), len(ensembles) * about["members"])
+        if config.experience == "own" and not config.mask_reached:
+            verdicts = MemberVerdicts(engine, ensembles)
+        else:
+            verdicts = Verdicts(learned_terminations(engine, ensembles), options)
         if hasattr(engine, "reachable"):
             verdicts.of(engine.reachable())  # most of what will be visited, judged at once
     return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed)
+
+
+def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
+    """Spec D4: what an engine of a domain with named starts is told; nothing where there is one place only.
+
+    Raises:
+        UserError: the domain has no such start, or it has several and none is given.
+    """
+    starts: tuple[str, ...] = tuple(getattr(domain, "starts", ()))
+    if not starts:
+        if config.start or config.along:
+            given = f"start={config.start}" if config.start else f"along={config.along}"
+            raise UserError(f"{domain.name} has no named starts", given, "Leave it out.")
+        return {}
+    if config.start not in starts:
+        what = "unknown start" if config.start else "where are episodes to begin?"
+        raise UserError(what, config.start or "start", f"Give --set start=X, X one of {', '.join(starts)}.")
+    memory = LEARNERS[config.network].reach(config, options)
+    return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
 
 def play(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress) -> None:
@@ -71,8 +109,7 @@ def play(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress) -> N
         numbers |= loop.step()
         if recorder.steps - logged >= LOG_INTERVAL or recorder.steps >= end:
             logged = recorder.steps
-            success, length = recorder.success(), recorder.length()
-            shown = {"success": success, "length": length} if recorder.episodes else {}
+            shown = recorder.recent(restarted=loop.config.restart_options)
             log.write(
                 step=recorder.steps,
                 episodes=len(recorder.episodes),
@@ -89,6 +126,7 @@ def layout_facts(engine: Any, config: PlayConfig, seed: int) -> dict[str, Any]:
     episodes = config.random_episodes
     playable = episodes and hasattr(engine, "random_success")
     return {
+        **({"start": config.start} if config.start else {}),
         "layout_seed": config.layout_seed,
         "shortest_path": engine.shortest_path() if hasattr(engine, "shortest_path") else None,
         "random_success": engine.random_success(episodes, rng) if playable else None,

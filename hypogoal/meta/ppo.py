@@ -176,8 +176,8 @@ class MetaPolicy:
 def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
     """Advantages (n,) less their mean, in units of their standard deviation, or of ``floor`` where that is larger.
 
-    Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts until it
-    is sure of something arbitrary.
+    Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts
+    until it is sure of something arbitrary.
     """
     return (advantages - advantages.mean()) / max(float(advantages.std()), floor, 1e-8)
 

@@ -24,6 +24,7 @@ class OptionConfig:
         choices=("own", "shared"),
     )
     option_timeout: int = setting(10, "an option ends after this many steps", unit="steps", source="paper", low=1)
+    restart_options: bool = setting(False, "every option begins a new episode, at a start state", source="Spec D4")
     mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="Spec D6")
     bootstrap_timeout: bool = setting(True, "an option's timeout is not a terminal state", source="Spec D2")
     option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
@@ -36,6 +37,28 @@ class OptionConfig:
     option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
     target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
     target_tau: float = setting(0.01, "share of the online network a target update takes", low=0.0, high=1.0)
+    n_step: int = setting(
+        1,
+        "steps of an execution between a value and the one it is learned from (light, experience=own)",
+        unit="steps",
+        source="paper: 1; Hessel et al. 2018",
+        low=1,
+        high=1_000,
+    )
+    exploration: str = setting(
+        "independent",
+        "a random action for one step, or kept for some",
+        source="persistent: Dabney et al. 2020",
+        choices=("independent", "persistent"),
+    )
+    persistence: float = setting(
+        2.0,
+        "exponent of how long a random action is kept, P(n) ~ n^-x (exploration=persistent)",
+        source="Dabney et al. 2020",
+        low=1.1,
+        high=10.0,
+    )
+    actions: str = setting("all", "the primitive actions: all, or a set that the domain's engine names", source="B4")
     epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
     epsilon_final: float = setting(0.05, "exploration in the end", source="paper: 0.01", low=0.0, high=1.0)
     epsilon_from: str = setting(

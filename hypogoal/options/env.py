@@ -15,8 +15,8 @@ from torch import Tensor
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.execution import offered_options
+from hypogoal.options.exploration import actions_of
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork
-from hypogoal.options.verdicts import THRESHOLD
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
 Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
@@ -51,12 +51,12 @@ class Options:
 
     def verdicts(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which options' sub-goals hold in one observation (*obs): bool (G*K,)."""
-        return np.concatenate([ensemble.predict(observation[None])[0] > THRESHOLD for ensemble in self.ensembles])
+        return np.concatenate([ensemble.verdicts(observation[None])[0] for ensemble in self.ensembles])
 
     def holds(self, option: int, observation: NDArray[np.uint8]) -> bool:
         """Whether one option's own sub-goal holds in an observation (*obs)."""
         ensemble = self.ensembles[option // self.members]
-        return bool(ensemble.predict(observation[None])[0, option % self.members] > THRESHOLD)
+        return bool(ensemble.verdicts(observation[None])[0, option % self.members])
 
 
 def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any]) -> Policies:
@@ -80,14 +80,15 @@ def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: 
 
 
 def _light_policies(weights: dict[str, Tensor], shape: tuple[int, ...], options: int) -> Policies:
-    actions = weights["online.heads.weight"].shape[0] // options
-    network = LightQNetwork(shape, options, actions)
+    outputs = weights["online.heads.weight"].shape[0] // options
+    actions = actions_of(weights, outputs)
+    network = LightQNetwork(shape, options, outputs)
     network.load_state_dict({name[7:]: value for name, value in weights.items() if name.startswith("online.")})
 
     def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
         @torch.no_grad()
         def act(observation: NDArray[np.uint8]) -> int:
-            return int(network(torch.from_numpy(observation[None]))[0, option].argmax())
+            return int(actions[int(network(torch.from_numpy(observation[None]))[0, option].argmax())])
 
         return act
 
@@ -96,12 +97,14 @@ def _light_policies(weights: dict[str, Tensor], shape: tuple[int, ...], options:
 
 def _paper_policies(weights: dict[str, Tensor], shape: tuple[int, ...]) -> Policies:
     networks: dict[int, PaperQNetwork] = {}
+    outputs = len(weights["0.values.2.bias"])
+    actions = actions_of(weights, outputs)
 
     def network_of(option: int) -> PaperQNetwork:
         if option not in networks:
             prefix = f"{option}."
             state = {name[len(prefix) :]: value for name, value in weights.items() if name.startswith(prefix)}
-            networks[option] = PaperQNetwork(shape, len(state["values.2.bias"])).eval()
+            networks[option] = PaperQNetwork(shape, outputs).eval()
             networks[option].load_state_dict(state)
         return networks[option]
 
@@ -113,7 +116,7 @@ def _paper_policies(weights: dict[str, Tensor], shape: tuple[int, ...]) -> Polic
         def act(observation: NDArray[np.uint8]) -> int:
             nonlocal hidden
             values, hidden = network(network.embed(torch.from_numpy(observation[None]))[:, None], hidden)
-            return int(values[0, 0].argmax())
+            return int(actions[int(values[0, 0].argmax())])
 
         return act
 

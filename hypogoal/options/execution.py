@@ -2,7 +2,8 @@
 
 The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. An option runs at least
 one step and its termination is tested on the state it arrives at; it ends when its own classifier says yes, when its
-time is up, or when the episode ends.
+time is up, or when the episode ends. Where every option begins at a start state (Spec D4), the end of an option is
+also that of its episode.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Step
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.recording import Recorder
+from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 NONE = -1
@@ -28,15 +31,17 @@ class Outcome:
     Attributes:
         environments: which environments they ran in.
         returns: the environment's rewards inside the option, discounted from its start.
-        discounts: gamma ** tau with tau the option's duration, for the state reached.
+        durations: tau, the options' steps.
+        discounts: gamma ** tau, for the state reached.
         next_ids: the states reached.
         next_offered: bool (n, O), the options that may start there.
         terminated: the task is over, nothing follows.
-        truncated: the episode was cut at its step limit.
+        truncated: the episode was cut, at its step limit or because the next option begins at a start state.
     """
 
     environments: NDArray[np.int64]
     returns: NDArray[np.float64]
+    durations: NDArray[np.int64]
     discounts: NDArray[np.float64]
     next_ids: NDArray[np.int64]
     next_offered: NDArray[np.bool_]
@@ -103,6 +108,39 @@ class RandomChooser:
         return {}
 
 
+class EvenChooser(RandomChooser):
+    """Spec D4: the offered option that has had the fewest steps so far, so that each gets as many as another.
+
+    Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
+
+    Args:
+        options: O.
+        rng: breaks ties.
+    """
+
+    def __init__(self, options: int, rng: np.random.Generator):
+        super().__init__(rng)
+        self.steps = np.zeros(options, dtype=np.int64)
+        self._running: dict[int, int] = {}
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """For each environment in turn, int64 (n,); an option that runs counts as one step more."""
+        chosen = np.empty(len(environments), dtype=np.int64)
+        for row, environment in enumerate(environments):
+            tied = self.steps + self.rng.random(len(self.steps))
+            chosen[row] = np.where(offered[row], tied, np.inf).argmin()
+            self.steps[chosen[row]] += 1
+            self._running[int(environment)] = int(chosen[row])
+        return chosen
+
+    def record(self, outcome: Outcome) -> None:
+        """The steps that the options took."""
+        for environment, duration in zip(outcome.environments, outcome.durations, strict=True):
+            self.steps[self._running.pop(int(environment))] += int(duration) - 1
+
+
 def offered_options(verdicts: NDArray[np.bool_], mask_reached: bool) -> NDArray[np.bool_]:
     """Spec D6: options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
     if not mask_reached:
@@ -121,8 +159,11 @@ class OptionLoop:
         learner: the intra-option policies.
         chooser: the policy over options.
         recorder: episodes and choices are told to it.
-        config: timeouts, masks.
+        config: timeouts, masks, whether options begin at start states.
         gamma: the meta-level's discount per environment step (E1).
+
+    Raises:
+        UserError: options are to begin at start states, and the engine cannot begin an episode when asked.
     """
 
     def __init__(
@@ -137,12 +178,23 @@ class OptionLoop:
     ):
         self.engine, self.verdicts, self.learner, self.chooser = engine, verdicts, learner, chooser
         self.recorder, self.config, self.gamma = recorder, config, gamma
+        if config.restart_options and not hasattr(engine, "restart"):
+            raise UserError(
+                "this domain's engine cannot begin an episode when asked",
+                "restart_options=true",
+                "Give --set restart_options=false.",
+            )
         count = engine.count
         self.option = np.full(count, NONE, dtype=np.int64)
         self.age = np.zeros(count, dtype=np.int64)
+        self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
         self.episode_reward = np.zeros(count)
         self.episode_length = np.zeros(count, dtype=np.int64)
+        # Spec D4: executions are counted that begin at the start proper, not on the way from there.
+        self.on_the_way = np.array([start.on_the_way for start in getattr(engine, "starts", ())], dtype=np.bool_)
+        self.counts = np.ones(count, dtype=np.bool_)
+        recorder.watch(engine)
         engine.reset()
 
     def step(self, *, explore: bool = True, learn: bool = True) -> dict[str, float]:
@@ -151,7 +203,7 @@ class OptionLoop:
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=explore)
         step = self.engine.step(actions)
-        reached = self.verdicts.of(step.next_ids)[np.arange(len(ids)), option]
+        reached = self._reached(step.next_ids, option)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
@@ -160,6 +212,10 @@ class OptionLoop:
         self.learner.observe(
             ids, actions, step.next_ids, option, terminated=step.terminated, timed_out=timed_out, ended=ended
         )
+        if self.config.restart_options:
+            step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
+            self.engine.restart(ended & ~over)  # type: ignore[attr-defined]
+        self.recorder.steps += len(ids)
         self._finish_options(step, reached, ended)
         self._finish_episodes(step)
         numbers: dict[str, float] = {}
@@ -168,14 +224,24 @@ class OptionLoop:
             numbers |= self.chooser.learn()
         return numbers
 
+    def _reached(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether each option's own sub-goal holds in the state it arrived at, bool (E,)."""
+        if self.config.experience == "own" and not self.config.mask_reached:
+            return running_verdicts(self.verdicts, ids, options)  # nobody asks for the other members'
+        return self.verdicts.of(ids)[np.arange(len(ids)), options]
+
     def _choose(self) -> None:
         free = np.flatnonzero(self.option == NONE)
         if not len(free):
             return
         ids = self.engine.ids[free]
-        offered = offered_options(self.verdicts.of(ids), self.config.mask_reached)
+        verdicts = self.verdicts.of(ids)
+        offered = offered_options(verdicts, self.config.mask_reached)
         chosen = self.chooser.choose(free, ids, offered)
         self.option[free] = chosen
+        if self.config.restart_options and len(self.on_the_way):
+            self.counts[free] = ~self.on_the_way[ids]
+        self.inside[free] = verdicts[np.arange(len(free)), chosen]
         self.age[free] = 0
         self.returns[free] = 0.0
         self.recorder.chose(chosen, offered)
@@ -185,22 +251,36 @@ class OptionLoop:
         if not len(done):
             return
         next_ids = step.next_ids[done]
-        self.recorder.finished(self.option[done], self.age[done], reached[done], next_ids)
+        self.recorder.finished(
+            self.option[done],
+            self.age[done],
+            reached[done],
+            next_ids,
+            inside=self.inside[done],
+            terminated=step.terminated[done],
+            counts=self.counts[done],
+        )
         self.chooser.record(
             Outcome(
                 environments=done,
                 returns=self.returns[done],
+                durations=self.age[done],
                 discounts=np.power(self.gamma, self.age[done], dtype=np.float64),
                 next_ids=next_ids,
-                next_offered=offered_options(self.verdicts.of(next_ids), self.config.mask_reached),
+                next_offered=self._offered(next_ids),
                 terminated=step.terminated[done],
                 truncated=step.truncated[done],
             )
         )
         self.option[done] = NONE
 
+    def _offered(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which options may start in states (n,), bool (n, O)."""
+        if not self.config.mask_reached:
+            return np.ones((len(ids), self.verdicts.options), dtype=np.bool_)
+        return offered_options(self.verdicts.of(ids), mask_reached=True)
+
     def _finish_episodes(self, step: Step) -> None:
-        self.recorder.steps += len(self.option)
         self.episode_reward += step.rewards
         self.episode_length += 1
         over = step.terminated | step.truncated

@@ -2,12 +2,14 @@
 
 Double DQN with prioritised replay over state ids. With ``experience=shared`` each stored transition carries each
 member's own reward, by that member's verdict on s'; a member's loss leaves out transitions that start inside its
-sub-goal. With ``experience=own`` (the paper) only the member whose option was running learns from a transition.
+sub-goal. With ``experience=own`` (the paper) only the member whose option was running learns from a transition, and
+only its verdicts are asked for; then a transition may reach several steps ahead within its execution.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,13 +17,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.errors import NumericalError
+from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow_tensors, linear_epsilon
+from hypogoal.learners.n_step import StepsAhead
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.networks import LightQNetwork, apply_to_states
+from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.memory import STACK, remembered, require_memory
+from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_to_states
+from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 POSITIVES_KEPT = 512  # per member
@@ -36,22 +42,41 @@ class LightLearner:
         verdicts: each option's termination classifier on states.
         config: see :class:`OptionConfig`.
         seed: of weights, exploration and sampling.
+
+    Raises:
+        UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
     def __init__(self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int):
         self.engine, self.verdicts, self.config = engine, verdicts, config
+        self.own = config.experience == "own"
+        if config.n_step > 1 and not self.own:
+            raise UserError(
+                "others' sub-goals may lie within an execution, so a step of several is for its own member only",
+                f"n_step={config.n_step}, experience={config.experience}",
+                "Give --set experience=own or --set n_step=1.",
+            )
+        require_memory(engine, self.reach(config, verdicts.options), config.replay)
         self.options = verdicts.options
+        self.actions = action_set(engine, config.actions)
+        self._index = np.zeros(engine.n_actions, dtype=np.int64)
+        self._index[self.actions] = np.arange(len(self.actions))
         self.rng = rng_for(seed, "options")
+        self.exploration = Exploration(config, engine.count, len(self.actions), self.rng)
+        self.ahead = StepsAhead(engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
-            self.online = LightQNetwork(engine.observation_shape, self.options, engine.n_actions)
+            self.online = LightQNetwork(engine.observation_shape, self.options, len(self.actions))
         self.target = copy.deepcopy(self.online).requires_grad_(False)
+        pictures = isinstance(self.online.cells, PictureEmbedding)
+        self.pixels = Pixels(engine, 2 * config.option_batch) if pictures else None
         self._copied = list(self.target.state_dict().values()), list(self.online.state_dict().values())
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         fields = {
             "s": np.int32,
             "a": np.int8,
             "next": np.int32,
+            "steps": np.int16,
             "option": np.int16,
             "end": np.bool_,
             "timeout": np.bool_,
@@ -65,6 +90,11 @@ class LightLearner:
         self.steps_since_positive = np.zeros(self.options, dtype=np.int64)
         self.steps = self.updates = 0
         self._due = 0
+
+    @staticmethod
+    def reach(config: OptionConfig, options: int) -> int:
+        """How many states back the replay may hold: a transition waits n steps, and its turn in the ring n more."""
+        return config.replay + (2 * config.n_step + STACK) * config.environments
 
     def epsilon(self) -> NDArray[np.float64]:
         """Every option's exploration, float (O,)."""
@@ -83,11 +113,10 @@ class LightLearner:
         """Actions int64 (E,) of the running options (E,) in states (E,)."""
         with torch.no_grad():
             values = apply_to_states(self.online, self.engine, ids).numpy()
-        actions = values[np.arange(len(ids)), options].argmax(1)
+        chosen = values[np.arange(len(ids)), options].argmax(1)
         if explore:
-            random = self.rng.random(len(ids)) < self.epsilon()[options]
-            actions = np.where(random, self.rng.integers(self.engine.n_actions, size=len(ids)), actions)
-        return actions
+            chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
+        return self.actions[chosen]
 
     def observe(
         self,
@@ -109,22 +138,33 @@ class LightLearner:
             timed_out: the option's time was up without reaching its sub-goal.
             ended: the option stopped here for whatever reason.
         """
-        row = {
-            "s": ids, "a": actions, "next": next_ids, "option": options, "end": terminated, "timeout": timed_out,
-        }  # fmt: skip
-        self.replay.add(**row)
-        hits = self.verdicts.of(next_ids) & ~self.verdicts.of(ids)
-        if self.config.experience == "own":
-            hits &= options[:, None] == np.arange(self.options)
-        for place, option in zip(*np.nonzero(hits), strict=True):
+        rows = self.ahead.add(
+            ids, self._index[actions], next_ids, ended, option=options, end=terminated, timeout=timed_out
+        )
+        self.replay.add(**rows)
+        here, reached = self._verdicts(rows)
+        for place, option in zip(*np.nonzero(reached & ~here), strict=True):
             slot = self.positives[option] % POSITIVES_KEPT
-            for name, values in row.items():
+            for name, values in rows.items():
                 self.positive[name][option, slot] = values[place]
             self.positives[option] += 1
         np.add.at(self.option_steps, options, 1)
         np.add.at(self.steps_since_positive, options, self.positives[options] > 0)
         self.steps += len(ids)
         self._due += len(ids)
+
+    def _verdicts(self, rows: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which options' sub-goals hold in ``s`` and in ``next`` of transitions, bool (m, O) each.
+
+        With own experience those of other members than the one that was running are not looked at: False.
+        """
+        s, following = rows["s"].astype(np.int64), rows["next"].astype(np.int64)
+        if not self.own:
+            return self.verdicts.of(s), self.verdicts.of(following)
+        option = rows["option"].astype(np.int64)
+        owner = option[:, None] == np.arange(self.options)
+        here, reached = (running_verdicts(self.verdicts, ids, option) for ids in (s, following))
+        return owner & here[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
         """As many updates as are due; returns the last one's numbers, empty when none was due."""
@@ -138,14 +178,16 @@ class LightLearner:
         return numbers
 
     def _batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64], NDArray[np.float32]]:
-        have = np.flatnonzero(self.positives)
+        kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
+        kept &= remembered(self.engine, self.positive["s"]) & remembered(self.engine, self.positive["next"])
+        have = np.flatnonzero(kept.any(1))
         extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
         indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
         batch = {name: values[indices] for name, values in self.replay.data.items()}
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
-            kept = np.minimum(self.positives[options], POSITIVES_KEPT)
-            slots = (self.rng.random(extra) * kept).astype(np.int64)
+            nth = (self.rng.random(extra) * kept.sum(1)[options]).astype(np.int64)
+            slots = (np.cumsum(kept, axis=1)[options] <= nth[:, None]).sum(1)
             batch = {name: np.concatenate([batch[name], self.positive[name][options, slots]]) for name in batch}
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
         return batch, indices, weights
@@ -153,23 +195,22 @@ class LightLearner:
     def _update(self) -> dict[str, float]:
         batch, indices, weights = self._batch()
         s, following = batch["s"].astype(np.int64), batch["next"].astype(np.int64)
-        here, reached = self.verdicts.of(s), self.verdicts.of(following)
+        here, reached = self._verdicts(batch)
         owner = batch["option"][:, None] == np.arange(self.options)
         terminal = reached | batch["end"][:, None]
         if not self.config.bootstrap_timeout:
             terminal = terminal | (owner & batch["timeout"][:, None])
-        learns = ~here & owner if self.config.experience == "own" else ~here
+        learns = ~here & owner if self.own else ~here
+        ahead = torch.from_numpy(batch["steps"]).float()[:, None]
 
-        values = apply_to_states(self.online, self.engine, s)
+        values, next_online, next_target = self._values(s, following)
         with torch.no_grad():
-            next_online = apply_to_states(self.online, self.engine, following)
-            next_target = apply_to_states(self.target, self.engine, following)
             goal = double_q_targets(
-                torch.from_numpy(reached).float(),
+                torch.from_numpy(reached) * self.config.option_gamma ** (ahead - 1),
                 torch.from_numpy(terminal),
                 next_online,
                 next_target,
-                self.config.option_gamma,
+                self.config.option_gamma**ahead,
             )
         actions = torch.from_numpy(batch["a"].astype(np.int64))[:, None, None].expand(-1, self.options, 1)
         error = values.gather(2, actions).squeeze(2) - goal
@@ -180,6 +221,20 @@ class LightLearner:
         largest = error.detach().abs().amax(1).numpy()
         self.replay.set_priorities(indices, largest[: len(indices)])
         return {"option_loss": float(loss.detach())}
+
+    def _values(self, s: NDArray[np.int64], following: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+        """The online network in ``s`` (with gradients) and in ``following``, the target there; (n, O, A) each."""
+        if self.pixels:
+            both = self.pixels.of(np.concatenate([s, following]))
+            here, there = both[: len(s)], both[len(s) :]
+            with torch.no_grad():
+                ahead = self.online(there), self.target(there)
+            return self.online(here), *ahead
+        values = apply_to_states(self.online, self.engine, s)
+        with torch.no_grad():
+            next_online = apply_to_states(self.online, self.engine, following)
+            next_target = apply_to_states(self.target, self.engine, following)
+        return values, next_online, next_target
 
     def _step(self, loss: Tensor) -> None:
         if not torch.isfinite(loss):
@@ -197,12 +252,15 @@ class LightLearner:
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""
         state = {f"online.{name}": value.contiguous() for name, value in self.online.state_dict().items()}
+        if len(self.actions) < self.engine.n_actions:
+            state["actions"] = torch.from_numpy(self.actions.copy())
         state["option_steps"] = torch.from_numpy(self.option_steps.copy())
         state["steps_since_positive"] = torch.from_numpy(self.steps_since_positive.copy())
         return state
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Continue from the weights and counters of an artefact; the replay starts empty."""
+        check_actions(state, self.actions, self.config.actions)
         weights = {name[7:]: value for name, value in state.items() if name.startswith("online.")}
         self.online.load_state_dict(weights)
         self.target.load_state_dict(weights)

@@ -1,4 +1,4 @@
-"""What happened while options were played: episodes, choices and where options stopped (Spec E5, F5, F6)."""
+"""What happened while options were played: episodes, choices, where options stopped (Spec E5, F3, F4, F5, F6)."""
 
 from __future__ import annotations
 
@@ -6,17 +6,46 @@ import csv
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.domains.base import Engine
+
 STOPS_KEPT = 128  # per option
+EXECUTIONS_KEPT = 100  # per option: Spec F3
 EPISODE_COLUMNS = ("step", "length", "reward", "terminated")
 CHOICE_COLUMNS = ("step", "option", "offered", "chosen", "expected", "reached", "duration")
 
 
+class Execution(NamedTuple):
+    """One option from its beginning to its end.
+
+    Attributes:
+        step: when it ended.
+        option: g*K + k.
+        duration: its steps.
+        reached: its own classifier ended it.
+        inside_at_start: its own classifier said yes where it began.
+        terminated: it ended in a terminal state of the episode.
+        state: the id of the state it ended in.
+    """
+
+    step: int
+    option: int
+    duration: int
+    reached: bool
+    inside_at_start: bool
+    terminated: bool
+    state: int
+
+
+EXECUTION_COLUMNS = (*Execution._fields[:-1], "room", "x", "y", "distance")
+
+
 class Recorder:
-    """Counts choices per window of steps, lists episodes, keeps the last stops of each option.
+    """Counts choices per window of steps, lists episodes, keeps the last executions and stops of each option.
 
     Args:
         options: the number of options, O.
@@ -29,7 +58,14 @@ class Recorder:
         self.episodes: list[tuple[int, int, float, int]] = []
         self.choices: list[tuple[int, int, int, int, float, int, int]] = []
         self.stops: list[deque[int]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
+        self.executions: list[deque[Execution]] = [deque(maxlen=EXECUTIONS_KEPT) for _ in range(options)]
+        self._pictures: list[deque[NDArray[np.uint8]]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
+        self._forgetful: Engine | None = None
         self._clear()
+
+    def watch(self, engine: Engine) -> None:
+        """Where it is played: of an engine that forgets states, stops are kept as pictures."""
+        self._forgetful = engine if hasattr(engine, "oldest") else None
 
     def start_at(self, steps: int) -> None:
         """Environment steps spent before (those of ``train-options``) count in every curve."""
@@ -56,12 +92,31 @@ class Recorder:
         durations: NDArray[np.int64],
         reached: NDArray[np.bool_],
         ids: NDArray[np.int64],
+        *,
+        inside: NDArray[np.bool_],
+        terminated: NDArray[np.bool_],
+        counts: NDArray[np.bool_],
     ) -> None:
-        """Executions that ended, in states ``ids``; arrays (n,)."""
+        """Executions that ended; arrays (n,).
+
+        Args:
+            options, durations, reached: see :class:`Execution`.
+            ids: the states they ended in.
+            inside: their own sub-goal held where they began.
+            terminated: the episode ended in a terminal state.
+            counts: they belong to ``executions``, because they began where the domain says they should.
+        """
         np.add.at(self._duration, options, durations)
         np.add.at(self._reached, options, reached)
+        columns = (options, durations, reached, inside, terminated, ids)
+        for row in zip(*(values[counts].tolist() for values in columns), strict=True):
+            self.executions[row[0]].append(Execution(self.steps, *row))
         for option, identity in zip(options[reached], ids[reached], strict=True):
             self.stops[option].append(int(identity))
+        if self._forgetful and reached.any():
+            pictures = self._forgetful.images(ids[reached])
+            for option, picture in zip(options[reached], pictures, strict=True):
+                self._pictures[option].append(picture)
 
     def episode(self, length: int, reward: float, terminated: bool) -> None:
         """An episode ended now."""
@@ -76,6 +131,23 @@ class Recorder:
         """Mean steps of the last episodes; NaN before the first."""
         tail = self.episodes[-last:]
         return sum(row[1] for row in tail) / len(tail) if tail else float("nan")
+
+    def reached(self) -> list[float]:
+        """By option, the share of its last executions that its own classifier ended; NaN before the first."""
+        return [sum(row.reached for row in rows) / len(rows) if rows else float("nan") for rows in self.executions]
+
+    def recent(self, *, restarted: bool) -> dict[str, float]:
+        """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
+        if not restarted:
+            return {"success": self.success(), "length": self.length()} if self.episodes else {}
+        rows = [row for option in self.executions for row in option]
+        if not rows:
+            return {}
+        return {
+            "reached": sum(row.reached for row in rows) / len(rows),
+            "terminated": sum(row.terminated for row in rows) / len(rows),
+            "duration": sum(row.duration for row in rows) / len(rows),
+        }
 
     def flush(self) -> None:
         """Close the current window of choices."""
@@ -104,8 +176,31 @@ class Recorder:
         with h5py.File(folder / "terminations.h5", "w") as file:
             for option, stops in enumerate(self.stops):
                 if stops:
-                    states = images(np.array(stops, dtype=np.int64))
+                    kept = self._pictures[option]
+                    states = np.stack(kept) if kept else images(np.array(stops, dtype=np.int64))
                     file.create_dataset(str(option), data=states, compression="gzip", compression_opts=1)
+
+    def write_executions(
+        self,
+        folder: Path,
+        positions: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+        distance: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+    ) -> None:
+        """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
+
+        Args:
+            folder: where.
+            positions: of states (n,), int (n, 3).
+            distance: of positions (n, 3) from where the sub-goal truly holds, int (n,).
+        """
+        rows = [row for option in self.executions for row in option]
+        at = positions(np.array([row.state for row in rows], dtype=np.int64).reshape(-1))
+        away = distance(at)
+        write_table(
+            folder / "executions.csv",
+            EXECUTION_COLUMNS,
+            [(*map(int, row[:-1]), *map(int, at[n]), int(away[n])) for n, row in enumerate(rows)],
+        )
 
 
 def write_table(path: Path, columns: tuple[str, ...], rows: Sequence[tuple[int | float, ...]]) -> None:

@@ -19,7 +19,10 @@ from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import PaperQNetwork
+from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 FIELDS = {
@@ -32,10 +35,10 @@ FIELDS = {
 class Member:
     """One member's policy: networks, optimiser, replay of whole executions, counters."""
 
-    def __init__(self, engine: Engine, config: OptionConfig, seed: int, option: int):
+    def __init__(self, engine: Engine, config: OptionConfig, seed: int, option: int, actions: int):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights", option))
-            self.online = PaperQNetwork(engine.observation_shape, engine.n_actions)
+            self.online = PaperQNetwork(engine.observation_shape, actions)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
@@ -56,12 +59,30 @@ class RecurrentLearner:
                 f"experience={config.experience}",
                 "Give --set experience=own.",
             )
+        if config.n_step > 1:
+            raise UserError(
+                "the paper's network learns one step ahead only", f"n_step={config.n_step}", "Give --set n_step=1."
+            )
+        require_memory(engine, self.reach(config, verdicts.options), config.replay)
         self.engine, self.verdicts, self.config = engine, verdicts, config
         self.options = verdicts.options
+        self.actions = action_set(engine, config.actions)
+        self._index = np.zeros(engine.n_actions, dtype=np.int64)
+        self._index[self.actions] = np.arange(len(self.actions))
         self.rng = rng_for(seed, "options")
-        self.members = [Member(engine, config, seed, option) for option in range(self.options)]
+        self.exploration = Exploration(config, engine.count, len(self.actions), self.rng)
+        self.members = [Member(engine, config, seed, option, len(self.actions)) for option in range(self.options)]
         self.hidden = torch.zeros(engine.count, PaperQNetwork.HIDDEN)
         self.running: list[list[tuple[int, int, int, bool, bool]]] = [[] for _ in range(engine.count)]
+
+    @staticmethod
+    def reach(config: OptionConfig, options: int) -> int:
+        """How many states back the replays hold when each has had as many steps as another.
+
+        A running execution is stored when it ends. Of what a member that had fewer has stored, the oldest may be
+        forgotten nevertheless; it is left out of its batches.
+        """
+        return options * config.replay + (config.option_timeout + STACK) * config.environments
 
     def epsilon(self) -> NDArray[np.float64]:
         """Every option's exploration, float (O,)."""
@@ -79,7 +100,7 @@ class RecurrentLearner:
         explore: bool = True,
     ) -> NDArray[np.int64]:
         """Actions int64 (E,); moves each environment's hidden state one step on (BatchNorm in eval mode)."""
-        actions = np.empty(len(ids), dtype=np.int64)
+        chosen = np.empty(len(ids), dtype=np.int64)
         self.hidden[torch.from_numpy(age == 0)] = 0.0
         images = torch.from_numpy(self.engine.images(ids))
         for option in np.unique(options):
@@ -87,11 +108,10 @@ class RecurrentLearner:
             network = self.members[option].online.eval()
             values, hidden = network(network.embed(images[rows])[:, None], self.hidden[rows][None])
             self.hidden[rows] = hidden[0]
-            actions[rows.numpy()] = values[:, 0].argmax(1).numpy()
+            chosen[rows.numpy()] = values[:, 0].argmax(1).numpy()
         if explore:
-            random = self.rng.random(len(ids)) < self.epsilon()[options]
-            actions = np.where(random, self.rng.integers(self.engine.n_actions, size=len(ids)), actions)
-        return actions
+            chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
+        return self.actions[chosen]
 
     def observe(
         self,
@@ -105,9 +125,10 @@ class RecurrentLearner:
         ended: NDArray[np.bool_],
     ) -> None:
         """Collect each execution; store it in its member's replay when it ends. Arrays (E,)."""
+        chosen = self._index[actions]
         for e in range(len(ids)):
             steps = self.running[e]
-            steps.append((int(ids[e]), int(actions[e]), int(next_ids[e]), bool(terminated[e]), bool(timed_out[e])))
+            steps.append((int(ids[e]), int(chosen[e]), int(next_ids[e]), bool(terminated[e]), bool(timed_out[e])))
             if ended[e]:
                 self._store(int(options[e]), steps)
                 self.running[e] = []
@@ -115,7 +136,7 @@ class RecurrentLearner:
     def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool]]) -> None:
         member = self.members[option]
         s, a, following, end, timeout = (np.array(column) for column in zip(*steps, strict=True))
-        reached = self.verdicts.of(following)[:, option]
+        reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
         member.replay.add(
             s=s, a=a, next=following, terminal=reached | end, timeout=timeout,
             place=np.arange(len(s)), execution=np.full(len(s), member.executions),
@@ -145,6 +166,8 @@ class RecurrentLearner:
         kept = np.arange(int(place.max()) + 1)
         prefix = (indices[:, None] - place[:, None] + kept) % config.replay
         whole = data["execution"][prefix[:, 0]] == data["execution"][indices]
+        whole &= (remembered(self.engine, data["s"][prefix]) | (kept > place[:, None])).all(1)
+        whole &= remembered(self.engine, data["next"][indices])
         if not whole.any():
             return 0.0
         indices, weights, place, prefix = indices[whole], weights[whole], place[whole], prefix[whole]
@@ -167,7 +190,8 @@ class RecurrentLearner:
         terminal = data["terminal"][indices]
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]
-        reached = self.verdicts.of(data["next"][indices].astype(np.int64))[:, option]
+        following = data["next"][indices].astype(np.int64)
+        reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
         goal = double_q_targets(
             torch.from_numpy(reached).float(),
             torch.from_numpy(terminal),
@@ -196,12 +220,15 @@ class RecurrentLearner:
         for option, member in enumerate(self.members):
             for name, value in member.online.state_dict().items():
                 state[f"{option}.{name}"] = value.contiguous()
+        if len(self.actions) < self.engine.n_actions:
+            state["actions"] = torch.from_numpy(self.actions.copy())
         state["option_steps"] = torch.tensor([member.steps for member in self.members])
         state["steps_since_positive"] = torch.tensor([member.steps_since_positive for member in self.members])
         return state
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Continue from the weights and counters of an artefact; the replays start empty."""
+        check_actions(state, self.actions, self.config.actions)
         for option, member in enumerate(self.members):
             prefix = f"{option}."
             weights = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}

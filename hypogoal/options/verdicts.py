@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import THRESHOLD as THRESHOLD  # for those who import it from here
 from hypogoal.hypotheses.stacked import StackedMembers
 
 if TYPE_CHECKING:
     from hypogoal.hypotheses.ensemble import Ensemble
 
 Classifier = Callable[[NDArray[np.int64]], NDArray[np.bool_]]
-THRESHOLD = 0.5
 MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
 
 
@@ -30,11 +31,22 @@ def learned_terminations(engine: Engine, ensembles: Sequence[Ensemble]) -> Class
 
     def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         images = engine.images(ids)
+        positions = _positions(engine, ids) if stacked.needs_positions else None
         if len(ids) < MANY:
-            return stacked.predict(images) > THRESHOLD
-        return np.concatenate([ensemble.predict(images) > THRESHOLD for ensemble in ensembles], axis=1)
+            return stacked.verdicts(images, positions)
+        return np.concatenate([ensemble.verdicts(images, positions) for ensemble in ensembles], axis=1)
 
     return classify
+
+
+def _positions(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    positions = getattr(engine, "positions", None)
+    if positions is None:
+        raise UserError(
+            "the ensemble needs the agent's positions (localiser=ram)", None, "Train it with localiser=learned."
+        )
+    found: NDArray[np.int64] = positions(ids)
+    return found
 
 
 def oracle_terminations(engine: Engine) -> Classifier:

@@ -103,6 +103,8 @@ def _train_one(data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int
             config,
             seed_for(seed, "ensemble", sub_goal),
             on_step,
+            origins=split.origins,
+            unlabelled_origins=dataset.unlabelled_origins(),
         )
     write_ensemble(folder, sub_goal, ensemble)
     return {"sub_goal": sub_goal, **numbers}

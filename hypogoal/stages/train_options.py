@@ -15,7 +15,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
-from hypogoal.options.execution import OptionLoop, RandomChooser
+from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
 from hypogoal.options.recording import Recorder
 
 
@@ -23,7 +23,21 @@ from hypogoal.options.recording import Recorder
 class TrainOptionsConfig(PlayConfig):
     """How the options are learned, and for how long."""
 
-    steps: int = setting(60_000, "environment steps, all environments together", unit="steps", low=1)
+    steps: int = setting(
+        60_000, "environment steps, all environments together", unit="steps", source="D4: 3e5 for each option", low=1
+    )
+    steps_for: str = setting(
+        "all",
+        "'steps' are those of all options together, or of each of them",
+        source="Spec D4",
+        choices=("all", "each"),
+    )
+    chooser: str = setting(
+        "random",
+        "uniform choice among the options offered, or the one with the fewest steps so far",
+        source="Spec D4",
+        choices=("random", "even"),
+    )
 
 
 def train_options(
@@ -39,7 +53,8 @@ def train_options(
     """Train the options of an ensemble artefact and write the artefact ``out``.
 
     Returns:
-        Steps, episodes, and success and length over the last 100 episodes of random choice.
+        Steps, episodes, and success and length over the last 100 episodes of random choice; where each option begins
+        an episode, instead of these two the shares of ``recorder.recent``.
     """
     prepare(device)
     source = open_artefact(ensemble, "ensemble")
@@ -47,28 +62,30 @@ def train_options(
     domain = load_domain(source.config["domain"])
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     members = verdicts.options // len(source.config["sub_goals"])
+    steps = config.steps * (verdicts.options if config.steps_for == "each" else 1)
     about = as_dict(config) | {
+        "steps": steps,
         "sub_goals": source.config["sub_goals"],
         "members": members,
         "domain": domain.name,
         "domain_config": source.config["domain_config"],
-        "chooser": "random",
         "setting": config.network,
     }
     with create_artefact(out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force) as folder:
         recorder = Recorder(verdicts.options)
-        chooser = RandomChooser(rng_for(seed, "random-choice"))
+        rng = rng_for(seed, "random-choice")
+        chooser = RandomChooser(rng) if config.chooser == "random" else EvenChooser(verdicts.options, rng)
         loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0)
         log = MetricsLog(folder / "metrics.jsonl")
-        with Progress("train-options", total=config.steps, quiet=quiet) as progress:
-            play(loop, config.steps, log, progress)
+        with Progress("train-options", total=steps, quiet=quiet) as progress:
+            play(loop, steps, log, progress)
         log.close()
         recorder.write(folder, engine.images)
+        if hasattr(engine, "positions") and hasattr(domain, "distance"):
+            recorder.write_executions(folder, engine.positions, domain.distance)
         save_tensors(folder / "options.safetensors", learner.state())
         (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
-    return {
-        "steps": recorder.steps,
-        "episodes": len(recorder.episodes),
-        "success": recorder.success(),
-        "length": recorder.length(),
-    }
+    counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
+    if config.restart_options:
+        return counted | recorder.recent(restarted=True)
+    return counted | {"success": recorder.success(), "length": recorder.length()}

@@ -12,8 +12,13 @@ from safetensors.torch import load_file, save_file
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
+from hypogoal.core.tensors import save_tensors
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble
+from hypogoal.hypotheses.localisers import LOCALISERS
 from hypogoal.hypotheses.networks import as_input
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.storage import read_ensemble, write_ensemble
+from hypogoal.hypotheses.views import AgentView
 
 SHAPE = (48, 48, 3)
 
@@ -103,3 +108,57 @@ def test_foreign_observations_are_one_clear_line() -> None:
         ensemble_of(1).predict(np.zeros((2, *SHAPE)))  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"uint8 \(48, 48, 3\)"):
         ensemble_of(1).predict(np.zeros(SHAPE, dtype=np.uint8))
+
+
+def test_verdicts_are_above_each_members_threshold() -> None:
+    """Spec D1: 0.5 where none was chosen; each member has its own."""
+    ensemble = ensemble_of()
+    observations = images_of("noise", 20)
+    probabilities = ensemble.predict(observations)
+    np.testing.assert_array_equal(ensemble.verdicts(observations), probabilities > 0.5)
+    chosen = np.median(probabilities, axis=0)
+    ensemble.set_thresholds(chosen)
+    np.testing.assert_array_equal(ensemble.verdicts(observations), probabilities > chosen)
+    assert (ensemble.verdicts(observations).sum(axis=0) == 10).all()
+    stacked = StackedMembers([ensemble, ensemble_of(1)])
+    expected = np.concatenate([probabilities > chosen, ensemble_of(1).predict(observations) > 0.5], axis=1)
+    assert (stacked.verdicts(observations) == expected).mean() > 0.95  # up to rounding, at the median itself
+
+
+def test_ensembles_from_before_thresholds_and_views_still_load(tmp_path: Path) -> None:
+    """Spec A8: an artefact whose settings and weights say nothing of them: all of the observation, 0.5."""
+    ensemble = ensemble_of(2)
+    state = {name: value for name, value in ensemble.state().items() if name != "thresholds"}
+    save_tensors(tmp_path / "goal.safetensors", state)
+    config = {"network": "doorkey", "observation_shape": list(SHAPE), "members": 2, "sub_goals": ["goal"]}
+    old = read_ensemble(tmp_path, config, "goal")
+    observations = images_of("noise", 6)
+    np.testing.assert_array_equal(old.verdicts(observations), ensemble.predict(observations) > 0.5)
+
+
+@pytest.mark.parametrize("localiser", ["ram", "learned"])
+def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path) -> None:
+    """Spec A8, G2: a localiser's weights and the thresholds lie beside the members' weights, no pickle."""
+    shape = (84, 84, 4)
+    torch.manual_seed(0)  # for the localiser's weights
+    view = AgentView(shape, 24, 32, LOCALISERS[localiser](shape))
+    ensemble = Ensemble("montezuma-crop", shape, 2, torch_generator(1, "weights"), view).eval()
+    ensemble.set_thresholds(np.array([0.25, 0.75], dtype=np.float32))
+    write_ensemble(tmp_path, "goal", ensemble)
+    config = {
+        "network": "montezuma-crop",
+        "observation_shape": list(shape),
+        "members": 2,
+        "sub_goals": ["goal"],
+        "view": "agent-crop",
+        "localiser": localiser,
+        "crop_height": 24,
+        "crop_width": 32,
+    }
+    back = read_ensemble(tmp_path, config, "goal")
+    observations = np.random.default_rng(0).integers(256, size=(5, *shape), dtype=np.uint8)
+    positions = np.array([[1, 20 * x, 235] for x in range(1, 6)])
+    np.testing.assert_array_equal(back.predict(observations, positions), ensemble.predict(observations, positions))
+    np.testing.assert_array_equal(back.verdicts(observations, positions), ensemble.verdicts(observations, positions))
+    with pytest.raises(UserError, match="the weights do not fit the ensemble"):
+        read_ensemble(tmp_path, config | {"crop_width": 40}, "goal")

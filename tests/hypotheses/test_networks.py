@@ -9,9 +9,9 @@ import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.networks import ENTRY_POINTS, NETWORKS, as_input, build_network, reordered
+from hypogoal.hypotheses.networks import ENTRY_POINTS, NETWORKS, as_input, build_network, folded, reordered
 
-SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4)}
+SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "montezuma-crop": (24, 32, 4)}
 
 
 def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -> nn.Sequential:
@@ -33,6 +33,8 @@ def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -
         ("doorkey", 2, 3, 2400 + 64 + 18432 + 128 + 192750 + 75100 + 202),
         # 32x4x64 + 64 + 64x32x16 + 128 + 64x64x9 + 128, 64 x 7 x 7 features: 3136x512 + 512 + 512x2 + 2
         ("montezuma", 3, 2, 8192 + 64 + 32768 + 128 + 36864 + 128 + 1606144 + 1026),
+        # 16x4x25 + 32 + 32x16x25 + 64, 32 x 3 x 5 features: 480x64 + 64 + 64x2 + 2
+        ("montezuma-crop", 2, 2, 1600 + 32 + 12800 + 64 + 30784 + 130),
     ],
 )
 def test_the_layers_are_the_papers(name: str, convolutions: int, dense: int, parameters: int) -> None:
@@ -56,7 +58,7 @@ def test_logits_of_each_state(name: str) -> None:
     torch.testing.assert_close(network(images[3:4]), logits[3:4])
 
 
-@pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36)])
+@pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36), ("montezuma-crop", 13)])
 def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     """Spec C5, G2: dense layers take what the convolutions leave; too small an image is one clear line."""
     shape = (smallest, smallest + 9, 1)
@@ -113,6 +115,27 @@ def test_the_faster_order_is_the_same_function() -> None:
         logits.square().sum().backward()
         gradients.append([logits.detach(), *(weight.grad.clone() for weight in network.parameters())])  # type: ignore[union-attr]
     torch.testing.assert_close(gradients[0], gradients[1])
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_batchnorm_folds_into_the_convolutions(name: str) -> None:
+    """Spec C5: in evaluation mode the same function, without BatchNorm; the network itself stays as it was."""
+    network = network_of(name).double().eval()
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    height, width, channels = SHAPES[name]
+    images = torch.rand(3, channels, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    plain = folded(network)
+    assert not any(isinstance(layer, nn.BatchNorm2d) for layer in plain)
+    torch.testing.assert_close(plain(images), network(images))
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
+
+
+def test_batchnorm_hidden_in_a_layer_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5, G2: labelled and unlabelled states pass together, and BatchNorm has to see them apart."""
+    hidden = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4))
+    monkeypatch.setitem(NETWORKS, "hidden", lambda _: ([hidden], (5,)))
+    with pytest.raises(UserError, match=r"BatchNorm inside another layer: hidden\. Make it a layer of its own"):
+        network_of("hidden", (8, 8, 3))
 
 
 def test_as_input_scales_and_turns() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -29,14 +30,49 @@ def test_it_is_the_plain_network(name: str, training: bool) -> None:
     images = grid_world(40, 6 if name == "doorkey" else 5, channels=3)
     plain = build_network(name, images.shape[1:], torch.Generator().manual_seed(1)).double().train(training)
     tabled = copy.deepcopy(plain)
-    tables = patches._tables(images, patches.windows_of(plain) or [])
     chosen = np.array([3, 17, 3, 29, 0])
-    batch = patches.take(tables, chosen)
-    wide = patches.Batch(
-        batch.colours.double(), batch.parts, tuple(s.double() for s in batch.shares), batch.places, batch.last
-    )
     inputs = as_input(torch.from_numpy(images[chosen]))
-    expected, found = plain(inputs.double()), patches.forward(tabled, wide)
+    expected, found = plain(inputs.double()), patches.forward(tabled, double_batch(images, plain, chosen))
+    compare(plain, expected, tabled, found)
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+@pytest.mark.parametrize("counted", [True, False])
+def test_groups_pass_together_and_batchnorm_sees_them_apart(name: str, counted: bool) -> None:
+    """Spec C5: labelled and unlabelled states at once are two passes of the plain network."""
+    images = grid_world(40, 6 if name == "doorkey" else 5, channels=3)
+    plain = build_network(name, images.shape[1:], torch.Generator().manual_seed(1)).double().train()
+    tabled = copy.deepcopy(plain)
+    groups = np.array([3, 17, 3, 29, 0]), np.array([31, 2, 8])
+    found = patches.forward(tabled, double_batch(images, plain, *groups), (True, counted))
+    first, second = (
+        plain_or_not(plain, images[group], counts) for group, counts in zip(groups, (True, counted), strict=True)
+    )
+    compare(plain, torch.cat([first, second]), tabled, found)
+
+
+def double_batch(images: NDArray[np.uint8], network: nn.Sequential, *groups: NDArray[np.int64]) -> patches.Batch:
+    """A batch in double precision."""
+    batch = patches.take(patches._tables(images, patches.windows_of(network) or []), *groups)
+    shares = tuple(tuple(share.double() for share in level) for level in batch.shares)
+    return dataclasses.replace(batch, first=batch.first.double(), shares=shares)
+
+
+def plain_or_not(network: nn.Sequential, images: NDArray[np.uint8], counted: bool) -> torch.Tensor:
+    """The plain network's logits; its running statistics do not move where the images are not to count."""
+    norms = [layer for layer in network if isinstance(layer, nn.BatchNorm2d)]
+    for norm in norms:
+        norm.momentum = 0.1 if counted else 0.0
+    logits: torch.Tensor = network(as_input(torch.from_numpy(images)).double())
+    if not counted:
+        for norm in norms:
+            assert norm.num_batches_tracked is not None
+            norm.num_batches_tracked -= 1
+    return logits
+
+
+def compare(plain: nn.Sequential, expected: torch.Tensor, tabled: nn.Sequential, found: torch.Tensor) -> None:
+    """Logits, gradients and running statistics of two networks."""
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7)  # shares were rounded to float32
     expected.square().sum().backward()
     found.square().sum().backward()
@@ -60,8 +96,8 @@ def test_tables_by_hand() -> None:
     assert windows == [[1.0] * 4] * 3 + [[1.0, 1.0, 1.0, 0.0]] + [[1.0] * 4] * 4
     assert len(level.parts) == 2
     batch = patches.take(tables, np.array([0]))
-    assert sorted(batch.shares[0][0].tolist()) == [0.25, 0.75]
-    assert batch.places == (4,)
+    assert sorted(batch.shares[0][0][0].tolist()) == [0.25, 0.75]
+    assert batch.places == ((4,),)
 
 
 def test_only_what_repeats_is_tabled() -> None:
@@ -70,10 +106,10 @@ def test_only_what_repeats_is_tabled() -> None:
     windows = patches.windows_of(network)
     assert windows == [(5, 2), (3, 2), (3, 2), (4, 2)]
     noise = np.random.default_rng(0).integers(256, size=(8, 48, 48, 3), dtype=np.uint8)
-    assert patches.make_tables(noise, windows) is None
-    assert patches.make_tables(grid_world(80, 6), windows) is not None
-    assert patches.make_tables(grid_world(80, 6)[:0], windows) is None
-    assert patches.make_tables(grid_world(80, 6), None) is None
+    assert patches.make_tables(noise, network) is None
+    assert patches.make_tables(grid_world(80, 6), network) is not None
+    assert patches.make_tables(grid_world(80, 6)[:0], network) is None
+    assert patches.make_tables(grid_world(80, 6), nn.Sequential(nn.Dropout())) is None
     for layer in (
         nn.Conv2d(3, 4, 3, padding=1),
         nn.Conv2d(3, 3, 3, groups=3),

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import cross_entropy
 
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.seeding import torch_generator
-from hypogoal.diversity import OBJECTIVES
+from hypogoal.core.seeding import seed_for, torch_generator
+from hypogoal.diversity import OBJECTIVES, dbat
 from hypogoal.hypotheses import batches, training
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.training import EnsembleConfig, fit, total_steps
+from hypogoal.hypotheses.training import EnsembleConfig, fit, quantile_thresholds, total_steps
 
 TOY = EnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, diversity_weight=0.03)
 
@@ -140,7 +141,7 @@ def test_sequential_members_do_not_move_once_trained() -> None:
     steps: list[int] = []
     one = fit(observations, labels, unlabelled, dataclasses.replace(config, members=1), seed=0).state()
     two = fit(observations, labels, unlabelled, config, 0, lambda step, _: steps.append(step)).state()
-    weights = [name for name in one if "running" not in name and "num_batches" not in name]
+    weights = [name for name in one if name.endswith((".weight", ".bias"))]
     assert all(torch.equal(one[name], two[name]) for name in weights)
     assert steps == [5, 10]
     assert total_steps(config) == 10
@@ -156,6 +157,143 @@ def test_which_batches_count_in_running_statistics(unlabelled_bn: bool) -> None:
         state = fit(observations, labels, others, dataclasses.replace(config, members=1), seed=0).state()
         means.append(state["members.0.1.running_mean"])
     assert torch.equal(means[0], means[1]) != unlabelled_bn
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5])
+@pytest.mark.parametrize("diversity", ["dbat", "none"])
+@pytest.mark.parametrize("unlabelled_bn", [True, False])
+@pytest.mark.parametrize("tables", [True, False])
+def test_batchnorm_sees_unlabelled_states_whatever_the_diversity(
+    weight: float, diversity: str, unlabelled_bn: bool, tables: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec C1, C6: the switch decides alone; at learning rate 0 nothing else could move running statistics."""
+    if not tables:
+        monkeypatch.setattr(batches.patches, "make_tables", lambda *_: None)
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(
+        TOY, steps=2, learning_rate=0.0, diversity=diversity, diversity_weight=weight, unlabelled_bn=unlabelled_bn
+    )
+    states = [fit(observations, labels, others, config, seed=0).state() for others in (unlabelled, 255 - unlabelled)]
+    for name in ("members.0.1", "members.1.5"):
+        assert torch.equal(*(state[f"{name}.running_mean"] for state in states)) != unlabelled_bn
+        assert states[0][f"{name}.num_batches_tracked"] == (4 if unlabelled_bn else 2)
+
+
+@pytest.mark.parametrize("unlabelled_bn", [True, False])
+def test_a_step_is_that_of_the_plain_loop(unlabelled_bn: bool) -> None:
+    """Eq. (1), Spec C3, C6: a loop over members in NCHW, labelled and unlabelled apart, ends with the same weights."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, members=3, steps=5, diversity_weight=0.5, unlabelled_bn=unlabelled_bn)
+    found = fit(observations, labels, unlabelled, config, seed=0)
+    plain = Ensemble("doorkey", observations.shape[1:], 3, torch_generator(0, "weights"))
+    networks = [member for member in plain.members if isinstance(member, torch.nn.Sequential)]
+    optimiser = torch.optim.Adam(plain.parameters(), lr=config.learning_rate, weight_decay=config.l2_weight)
+    states = TrainingStates(observations, labels, unlabelled, networks[0], torch.device("cpu"))
+    images = torch.from_numpy(np.concatenate([observations, unlabelled])).permute(0, 3, 1, 2).contiguous() / 255
+    for mine, others in states.batches(config, seed_for(0, "batches", 0)):
+        logits = [network(images[torch.from_numpy(mine)]) for network in networks]
+        loss = sum(cross_entropy(one, states.targets(mine), torch.tensor([0.5, 0.5])) for one in logits)
+        for network in networks:
+            for layer in network:
+                if isinstance(layer, torch.nn.BatchNorm2d):
+                    layer.momentum = 0.1 if unlabelled_bn else 0.0
+        logits = [network(images[torch.from_numpy(others)]) for network in networks]
+        for layer in (layer for network in networks for layer in network):
+            if isinstance(layer, torch.nn.BatchNorm2d):
+                layer.momentum = 0.1
+        loss = loss + 0.5 * sum(dbat.pair_loss(one, other) for one in logits for other in logits if one is not other)
+        optimiser.zero_grad()
+        torch.as_tensor(loss).backward()
+        optimiser.step()
+    untrained = Ensemble("doorkey", observations.shape[1:], 3, torch_generator(0, "weights"))
+    expected = plain.predict(unlabelled)
+    np.testing.assert_allclose(found.predict(unlabelled), expected, atol=2e-3)
+    assert np.abs(untrained.predict(unlabelled) - expected).max() > 0.02
+
+
+def ladders_of(labels: NDArray[np.bool_], ladders: list[int]) -> NDArray[np.int64]:
+    """A ladder for each positive, in turn."""
+    return np.where(labels, np.resize(ladders, len(labels)), -1)
+
+
+@pytest.mark.parametrize(("ladders", "each"), [([0, 1, 2], (8, 8)), ([4], (24, 24)), ([0, 1, 2, 4, 8], (4, 5))])
+def test_batches_have_as_many_positives_of_each_ladder(ladders: list[int], each: tuple[int, int]) -> None:
+    """Beyond the paper: 8 positives of each of three ladders and 40 negatives in 64; other numbers spread evenly."""
+    labels = np.arange(400) < 100
+    of = ladders_of(labels, ladders)
+    of[:50] = ladders[0]  # more of the first ladder than of the others
+    images = np.zeros((400, 8, 8, 3), dtype=np.uint8)
+    network = torch.nn.Sequential(torch.nn.Flatten())
+    states = TrainingStates(images, labels, images[:100], network, torch.device("cpu"), ladders=of)
+    config = EnsembleConfig(batch_size=64, batch_kind="per-ladder", steps=20)
+    total = np.zeros(len(ladders), dtype=int)
+    for labelled, unlabelled in states.batches(config, 0):
+        assert len(labelled) == len(unlabelled) == 64
+        assert labels[labelled].sum() == 24
+        counts = np.array([(of[labelled] == ladder).sum() for ladder in ladders])
+        assert (counts.min(), counts.max()) == each
+        assert len(set(labelled.tolist())) > 50
+        total += counts
+    assert np.ptp(total) <= 1
+
+
+def test_thresholds_are_the_unlabelled_quantile() -> None:
+    """Beyond the paper: each member says yes to at most 5 % of the unlabelled states."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=20, threshold="unlabelled-q95")
+    ensemble = fit(observations, labels, unlabelled, config, seed=0)
+    says_yes = ensemble.verdicts(unlabelled).mean(axis=0)
+    assert (says_yes <= 0.05).all()
+    assert (says_yes > 0).all()
+    half = fit(observations, labels, unlabelled, dataclasses.replace(config, threshold="0.5"), seed=0)
+    np.testing.assert_array_equal(half.verdicts(unlabelled), half.predict(unlabelled) > 0.5)
+    np.testing.assert_array_equal(half.predict(unlabelled), ensemble.predict(unlabelled))
+    with pytest.raises(UserError, match="unlabelled states are needed to set thresholds on"):
+        fit(observations, labels, unlabelled[:0], dataclasses.replace(config, members=1), seed=0)
+
+
+def test_quantiles_by_hand() -> None:
+    """The 96th of 100 probabilities, above which four are left; a member that is certain goes on saying yes."""
+    probabilities = np.stack([np.arange(100) / 100, np.full(100, 0.25), np.ones(100)], axis=1).astype(np.float32)
+    thresholds = quantile_thresholds(np.random.default_rng(0).permutation(probabilities))
+    np.testing.assert_allclose(thresholds, [0.95, 0.25, 1.0])
+    assert (probabilities > thresholds).sum(axis=0).tolist() == [4, 0, 100]
+
+
+def test_grey_maps_rise() -> None:
+    """Beyond the paper: 256 shades to 0..1, each brighter than the one before, every map another."""
+    maps = batches.grey_maps(50, np.random.default_rng(0))
+    assert maps.shape == (50, 256)
+    assert maps.dtype == np.float32
+    assert (np.diff(maps, axis=1) > 0).all()
+    assert maps.min() >= 0
+    assert maps.max() <= 1
+    assert (np.ptp(maps[:, [0, 128, 255]], axis=0) > (0.1, 0.3, 0.1)).all()
+
+
+def test_all_of_a_state_is_mapped_alike() -> None:
+    """Beyond the paper: equal shades stay equal in all frames of a stack, order is kept, states differ."""
+    images = np.random.default_rng(0).integers(256, size=(6, 8, 8, 4), dtype=np.uint8)
+    network = torch.nn.Sequential(torch.nn.Flatten())
+    labels = np.arange(6) < 3
+    states = TrainingStates(images, labels, images, network, torch.device("cpu"), tables=False)
+    mapped = states.forward([network], np.arange(6), greys=np.random.default_rng(1))[0][0].numpy()
+    plain = states.forward([network], np.arange(6))[0][0].numpy()
+    for shades, shown in zip(plain, mapped, strict=True):
+        order = np.argsort(shades, kind="stable")
+        assert (np.diff(shown[order]) >= 0).all()
+        assert len(np.unique(shown)) == len(np.unique(shades))
+    assert np.abs(mapped - plain).max() > 0.1
+
+
+def test_grey_maps_change_what_is_learned_from() -> None:
+    """Beyond the paper: another ensemble, the same one again with the same seed."""
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=3, augment="grey")
+    first, second = (fit(observations, labels, unlabelled, config, seed=0).state() for _ in range(2))
+    plain = fit(observations, labels, unlabelled, dataclasses.replace(config, augment="none"), seed=0).state()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["members.0.0.weight"], plain["members.0.0.weight"])
 
 
 @pytest.mark.parametrize("balance", ["batch", "none"])

@@ -1,0 +1,255 @@
+"""Where the agent is in an observation: from the game's memory (an oracle), or learned (beyond the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, SCREEN
+from hypogoal.domains.montezuma_pictures import pixel
+from hypogoal.hypotheses.batches import grey_maps
+from hypogoal.hypotheses.networks import folded
+
+CELL = 4  # pixels: the side of a heat-map's cell
+CHUNK = 64  # states at once where no gradient is kept
+STEPS, BATCH, LEARNING_RATE, L2_WEIGHT = 600, 24, 2e-3, 1e-4
+FARTHEST_SHIFT = 20  # pixels
+NEAREST, FARTHEST = (
+    (6, 4),
+    (13, 11),
+)  # from the agent, rows and columns: where clutter begins; the agent is 8 x 4 pixels
+PATTERNS, PATTERN_SHARE = 3, 0.7  # at most so many, in this share of the states
+BLOBS = 2  # at most
+GREY_SHARE = 0.5  # of the states get their shades changed
+
+
+class RamLocaliser(nn.Module):
+    """The agent's pixel from its position in the memory of Montezuma's Revenge; what is seen is not looked at.
+
+    An oracle, to be called one wherever its results are shown.
+    """
+
+    needs_positions = True
+
+    def __init__(self, observation_shape: tuple[int, ...]):
+        super().__init__()
+        montezuma_only(observation_shape, "localiser=ram")
+
+    def locate(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Row and column (N, 2) of the agent's middle in observations; from positions (N, 3) of room, x, y."""
+        assert positions is not None
+        return pixels_of(positions)
+
+
+class LearnedLocaliser(nn.Module):
+    """The agent's pixel from what is seen: the peak of a heat-map.
+
+    A fully convolutional network looks at the last frame, where the agent has its looks, and at the differences between
+    the frames, where all that moves stands out.
+
+    Args:
+        observation_shape: (H, W, C) with C at least 2, the last channel the latest frame.
+        network: (N, C, H, W) -> (N, 1, rows, columns), logits of cells of 4 x 4 pixels; one to be loaded where None.
+    """
+
+    needs_positions = False
+
+    def __init__(self, observation_shape: tuple[int, ...], network: nn.Sequential | None = None):
+        super().__init__()
+        self.network = network or folded(_heat_network(observation_shape[2]).eval())
+
+    def locate(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Row and column (N, 2) of the agent's middle in observations uint8 (N, H, W, C)."""
+        found = np.empty((len(observations), 2))
+        device = next(self.network.parameters()).device
+        with torch.inference_mode():
+            for start in range(0, len(observations), CHUNK):
+                chunk = slice(start, start + CHUNK)
+                images = torch.from_numpy(observations[chunk]).to(device, torch.float32)
+                found[chunk] = _peaks(self.network(_as_heat_input(images))[:, 0]).cpu().numpy()
+        return found
+
+
+Localiser = RamLocaliser | LearnedLocaliser
+LOCALISERS: dict[str, Callable[[tuple[int, ...]], Localiser]] = {"ram": RamLocaliser, "learned": LearnedLocaliser}
+
+
+def pixels_of(positions: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Row and column (N, 2) of the agent's middle in an 84x84 observation, of positions (N, 3) of room, x, y.
+
+    The observation is the console's picture made smaller; where the agent is in that, a test reads off the emulator.
+    """
+    return (pixel(positions)[:, ::-1] + 0.5) * (np.array(OBSERVATION_SHAPE[:2]) / SCREEN) - 0.5
+
+
+def montezuma_only(observation_shape: tuple[int, ...], why: str) -> None:
+    """Check that positions can be turned into pixels.
+
+    Raises:
+        UserError: observations of another game.
+    """
+    if tuple(observation_shape) != OBSERVATION_SHAPE:
+        found = f"observation shape {tuple(observation_shape)}"
+        raise UserError(f"{why} knows Montezuma's Revenge only", found, "Set view=full.")
+
+
+def fit_localiser(
+    observations: NDArray[np.uint8], pixels: NDArray[np.float64], seed: int, *, steps: int = STEPS
+) -> LearnedLocaliser:
+    """A localiser from states of which the agent's place is known; nothing else is needed, in training or later.
+
+    It has to find the agent in rooms that it never saw. So each state is mirrored, shifted, filled with made-up
+    patterns and moving things around the agent, and its shades are changed: what stays is the agent and how it moves.
+
+    Args:
+        observations: uint8 (N, H, W, C).
+        pixels: row and column (N, 2) of the agent in the last frame.
+        seed: of the initial weights and all that is drawn.
+        steps: gradient steps.
+
+    Returns:
+        The localiser; the same bytes for the same arguments on one CPU.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_for(seed, "weights"))
+        network = _heat_network(observations.shape[3])
+    optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE, weight_decay=L2_WEIGHT)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, steps)
+    rng = rng_for(seed, "states")
+    for _ in range(steps):
+        drawn = rng.integers(len(observations), size=BATCH)
+        images, places = _changed(observations[drawn], pixels[drawn], rng)
+        heat = network(_as_heat_input(torch.from_numpy(images)))[:, 0]
+        cells = np.floor((places + 0.5) / CELL).astype(np.int64)
+        seen = ((cells >= 0) & (cells < heat.shape[1:])).all(1)
+        cell = torch.from_numpy((cells[:, 0] * heat.shape[2] + cells[:, 1])[seen])
+        loss = functional.cross_entropy(heat.flatten(start_dim=1)[torch.from_numpy(seen)], cell)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return LearnedLocaliser(observations.shape[1:], folded(network.eval()).requires_grad_(False))
+
+
+def _heat_network(channels: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(channels, 16, kernel_size=5, stride=2, padding=2),
+        nn.BatchNorm2d(16),
+        nn.ReLU(),
+        nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1),
+        nn.BatchNorm2d(32),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, kernel_size=3, padding=1),
+        nn.BatchNorm2d(32),
+        nn.ReLU(),
+        nn.Conv2d(32, 1, kernel_size=1),
+    )
+
+
+def _as_heat_input(images: Tensor) -> Tensor:
+    """Float (N, H, W, C) in 0..255 -> (N, C, H, W): the last frame in 0..1, and the differences between frames."""
+    frames = images.permute(0, 3, 1, 2) / 255.0
+    return torch.cat([frames[:, -1:], frames[:, 1:] - frames[:, :-1]], dim=1)
+
+
+def _peaks(heat: Tensor) -> Tensor:
+    """Row and column (N, 2), in pixels, of the peaks of heat-maps (N, rows, columns), refined by the cells around."""
+    count, _, columns = heat.shape
+    peak = heat.flatten(start_dim=1).argmax(dim=1)
+    around = functional.pad(heat, (1, 1, 1, 1), value=-torch.inf).unfold(1, 3, 1).unfold(2, 3, 1)
+    cell = torch.stack([peak // columns, peak % columns], dim=1)
+    shares = around[torch.arange(count), cell[:, 0], cell[:, 1]].flatten(start_dim=1).softmax(dim=1).view(count, 3, 3)
+    offsets = torch.tensor([-1.0, 0.0, 1.0], device=heat.device)
+    refined = cell + torch.stack([shares.sum(dim=2) @ offsets, shares.sum(dim=1) @ offsets], dim=1)
+    return (refined + 0.5) * CELL - 0.5
+
+
+def _changed(
+    observations: NDArray[np.uint8], pixels: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """States float32 (B, H, W, C) in 0..255 of which only the agent is as it was, and where it is now (B, 2)."""
+    images, places = observations.astype(np.float32), pixels.copy()
+    height, width = images.shape[1:3]
+    for image, place in zip(images, places, strict=True):
+        if rng.random() < 0.5:
+            image[:] = image[:, ::-1].copy()
+            place[1] = width - 1 - place[1]
+        shift = rng.integers(-FARTHEST_SHIFT, FARTHEST_SHIFT, size=2, endpoint=True)
+        image[:] = _shifted(image, *shift.tolist())
+        place += shift
+        free = np.ones((height, width, 1), dtype=np.bool_)
+        before, after = rng.integers(NEAREST, FARTHEST, size=(2, 2), endpoint=True)
+        free[_box(place - before, place + after)] = False
+        if rng.random() < PATTERN_SHARE:
+            for _ in range(rng.integers(1, PATTERNS, endpoint=True)):
+                corner = rng.integers(-height // 4, height, size=2)
+                box = _box(corner, corner + rng.integers(8, height, size=2))
+                image[box] = np.where(free[box], _pattern(height, width, rng)[box], image[box])
+        for _ in range(rng.integers(BLOBS, endpoint=True)):
+            _add_blob(image, free, rng)
+        if rng.random() < GREY_SHARE:
+            image[:] = 255.0 * grey_maps(1, rng)[0][image.astype(np.uint8)]
+    return images, places
+
+
+def _shifted(image: NDArray[np.float32], down: int, right: int) -> NDArray[np.float32]:
+    """An image (H, W, C) moved over black."""
+    moved = np.zeros_like(image)
+    height, width = image.shape[:2]
+    moved[max(down, 0) : height + down, max(right, 0) : width + right] = image[
+        max(-down, 0) : height - down, max(-right, 0) : width - right
+    ]
+    return moved
+
+
+def _box(first: NDArray[np.floating | np.integer], last: NDArray[np.floating | np.integer]) -> tuple[slice, slice]:
+    """From the first row and column to before the last, as far as they are not negative."""
+    top, left = np.maximum(first, 0).astype(np.int64).tolist()
+    bottom, right = np.maximum(last, 0).astype(np.int64).tolist()
+    return slice(top, bottom), slice(left, right)
+
+
+def _pattern(height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """A pattern (height, width, 1) in 0..255, of two shades or of many: a few pixels repeated like bricks, or blocks."""
+    dark, bright = np.sort(rng.uniform(0, 255, size=2))
+    bricks = rng.random() < 0.6
+    cell = np.array((1, 1)) if bricks else rng.integers(1, (5, 8))
+    shape = rng.integers(2, 8, size=2) if bricks else -(-np.array((height, width)) // cell)
+    shades = rng.random(shape)
+    if rng.random() < 0.6:
+        shades = (shades < (0.5 if bricks else rng.uniform(0.1, 0.9))).astype(np.float64)
+    blocks = shades.repeat(cell[0], axis=0).repeat(cell[1], axis=1)
+    pattern = np.tile(blocks, -(-np.array((height, width)) // blocks.shape))[:height, :width]
+    return (dark + (bright - dark) * pattern)[:, :, None]
+
+
+def _add_blob(image: NDArray[np.float32], free: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    """A spotted or striped thing that moves from frame to frame through an image (H, W, C), where that is free."""
+    height, width, frames = image.shape
+    striped = rng.random() < 0.3
+    size = rng.integers((8, 3), (20, 12)) if striped else rng.integers(3, 12, size=2)
+    spots = rng.random((size[0], 1)) < 0.5 if striped else rng.random(size) < 0.7
+    shown = (spots * np.ones(size)) * rng.uniform(60, 255)
+    at, speed = rng.uniform(0, (height, width)), rng.normal(0.0, 1.5, size=2)
+    for frame in range(frames):
+        if striped:
+            shown = np.roll(shown, 1, axis=0)
+        elif rng.random() < 0.2:
+            shown = shown[:, ::-1]
+        corner = np.floor(at + speed * frame).astype(np.int64)
+        box = _box(corner, corner + size)
+        under = image[box][:, :, frame]
+        top, left = np.maximum(-corner, 0)
+        over = shown[top:, left:][: under.shape[0], : under.shape[1]]
+        image[box][:, :, frame] = np.where(free[box][:, :, 0] & (over > 0), over, under)

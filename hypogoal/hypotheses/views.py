@@ -1,0 +1,109 @@
+"""What members see of an observation: all of it, or the neighbourhood of the agent (beyond the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.localisers import Localiser
+
+POSITION = ("room", "x", "y")
+CHUNK = 1024  # states at once: so many crops are gathered from whole images at a time
+
+
+class FullView(nn.Module):
+    """All of an observation, as it is: the paper's view."""
+
+    needs_positions = False
+
+    def __init__(self, observation_shape: tuple[int, ...]):
+        super().__init__()
+        self.shape = observation_shape
+
+    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
+        """The observations."""
+        return observations
+
+
+class AgentView(nn.Module):
+    """A window around the agent; what is outside the image is 0.
+
+    The same window for every frame of a stack, around where the agent is in the last.
+
+    Args:
+        observation_shape: (H, W, C).
+        height, width: of the window, in pixels.
+        localiser: where the agent is.
+
+    Attributes:
+        shape: (height, width, C).
+        needs_positions: whether the localiser reads positions, which no policy may see: an oracle.
+    """
+
+    def __init__(self, observation_shape: tuple[int, ...], height: int, width: int, localiser: Localiser):
+        super().__init__()
+        self.shape = (height, width, *observation_shape[2:])
+        self.localiser = localiser
+        self.needs_positions = localiser.needs_positions
+
+    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
+        """Windows uint8 (N, height, width, C).
+
+        Args:
+            observations: uint8 (N, H, W, C).
+            positions: int64 (N, 3) of room, x, y, where the localiser reads them.
+        """
+        seen = np.empty((len(observations), *self.shape), dtype=np.uint8)
+        for start in range(0, len(observations), CHUNK):
+            chunk = slice(start, start + CHUNK)
+            centres = self.localiser.locate(observations[chunk], None if positions is None else positions[chunk])
+            seen[chunk] = windows(observations[chunk], centres, *self.shape[:2])
+        return seen
+
+
+def windows(
+    observations: NDArray[np.uint8], centres: NDArray[np.floating], height: int, width: int
+) -> NDArray[np.uint8]:
+    """Windows uint8 (N, height, width, C) of images uint8 (N, H, W, C); 0 outside them.
+
+    Args:
+        observations: the images.
+        centres: (N, 2), row and column of the pixel in the middle; of an even number of pixels it is the one after.
+        height, width: in pixels.
+    """
+    corner = np.floor(centres + 0.5).astype(np.int64) - (height // 2, width // 2)
+    rows, rows_inside = _indices(corner[:, 0], height, observations.shape[1])
+    columns, columns_inside = _indices(corner[:, 1], width, observations.shape[2])
+    found = observations[np.arange(len(observations))[:, None, None], rows[:, :, None], columns[:, None, :]]
+    found[~(rows_inside[:, :, None] & columns_inside[:, None, :])] = 0
+    return found
+
+
+def _indices(first: NDArray[np.int64], count: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """``count`` indices from each first on (N, count), clipped to 0..size-1, and which were inside."""
+    indices = first[:, None] + np.arange(count)
+    return indices.clip(0, size - 1), (indices >= 0) & (indices < size)
+
+
+def positions_of(origins: Mapping[str, NDArray[np.int64]] | None) -> NDArray[np.int64] | None:
+    """Positions int64 (N, 3) of room, x, y from origins; None where these do not say them."""
+    if origins is None or not all(name in origins for name in POSITION):
+        return None
+    return np.stack([origins[name] for name in POSITION], axis=1).astype(np.int64)
+
+
+def needed(origins: Mapping[str, NDArray[np.int64]] | None, names: tuple[str, ...], why: str) -> None:
+    """Check that states say where they come from.
+
+    Raises:
+        UserError: an origin is missing.
+    """
+    missing = [name for name in names if name not in (origins or {})]
+    if missing:
+        raise UserError(
+            f"the data do not say {', '.join(missing)} of each state", why, "Collect data that do, or set it otherwise."
+        )

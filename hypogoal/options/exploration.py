@@ -1,0 +1,89 @@
+"""How the intra-option policies explore: which primitive actions there are, and when a random one is played."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine
+from hypogoal.options.config import OptionConfig
+
+ALL = "all"
+LONGEST = 10_000  # steps that a random action is kept at most: Dabney et al. 2020
+
+
+def action_set(engine: Engine, name: str) -> NDArray[np.int64]:
+    """The engine's actions that a policy chooses among, int64 (A,): all, or those of ``engine.action_sets[name]``.
+
+    Raises:
+        UserError: the engine has no set of that name.
+    """
+    if name == ALL:
+        return np.arange(engine.n_actions)
+    sets = getattr(engine, "action_sets", {})
+    if name not in sets:
+        raise UserError("unknown set of actions", f"actions={name}", f"Choose one of {', '.join((ALL, *sets))}.")
+    return np.array(sets[name], dtype=np.int64)
+
+
+def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:
+    """The engine's actions that a saved policy's ``outputs`` stand for, int64 (A,)."""
+    return state["actions"].numpy() if "actions" in state else np.arange(outputs)
+
+
+def check_actions(state: Mapping[str, Tensor], actions: NDArray[np.int64], name: str) -> None:
+    """Refuse to continue policies that chose among other actions.
+
+    Raises:
+        UserError: they did.
+    """
+    if not np.array_equal(actions_of(state, len(actions)), actions):
+        raise UserError("these options were trained with other actions", f"actions={name}", "Give the same --set.")
+
+
+class Exploration:
+    """Random actions in place of a policy's own, for every environment.
+
+    ``independent``: at each step with chance epsilon, one action for one step. ``persistent``: epsilon-z-greedy
+    exploration; with chance epsilon a random action is begun and kept for n steps, P(n) proportional to
+    n ** -persistence, but not beyond its execution's end.
+
+    Args:
+        config: see :class:`OptionConfig`.
+        environments: E.
+        actions: A, how many actions there are.
+        rng: where chance comes from.
+
+    Source: Dabney, Ostrovski and Barreto 2020, Temporally-Extended epsilon-Greedy Exploration.
+    """
+
+    def __init__(self, config: OptionConfig, environments: int, actions: int, rng: np.random.Generator):
+        self.actions, self.rng = actions, rng
+        self.persistent, self.exponent = config.exploration == "persistent", config.persistence
+        self._kept = np.zeros(environments, dtype=np.int64)
+        self._left = np.zeros(environments, dtype=np.int64)
+
+    def mix(self, policy: NDArray[np.int64], epsilon: NDArray[np.float64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Actions int64 (E,): the policy's (E,), or random ones.
+
+        Args:
+            policy: what the policies would play.
+            epsilon: of each environment's policy, (E,).
+            age: steps since each environment's execution began, (E,).
+        """
+        count = len(policy)
+        begins = self.rng.random(count) < epsilon
+        drawn = self.rng.integers(self.actions, size=count)
+        if not self.persistent:
+            return np.where(begins, drawn, policy)
+        self._left[age == 0] = 0
+        begins &= self._left == 0
+        self._kept[begins] = drawn[begins]
+        self._left[begins] = np.minimum(self.rng.zipf(self.exponent, size=count), LONGEST)[begins]
+        random = self._left > 0
+        self._left[random] -= 1
+        return np.where(random, self._kept, policy)

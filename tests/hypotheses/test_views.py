@@ -1,0 +1,229 @@
+"""What members see: windows around the agent, and where a localiser says that it is (beyond the paper; Spec B4, C5)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import torch_generator
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import (
+    LearnedLocaliser,
+    RamLocaliser,
+    _changed,
+    fit_localiser,
+    pixels_of,
+)
+from hypogoal.hypotheses.networks import as_input
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.views import AgentView, FullView, windows
+
+SHAPE = (84, 84, 4)
+
+
+def numbered(count: int = 1) -> NDArray[np.uint8]:
+    """Images 6x7 of two frames whose pixels say row and column in the first, and their sum in the second."""
+    rows, columns = np.mgrid[:6, :7]
+    return np.repeat(np.stack([10 * rows + columns, rows + columns], axis=-1)[None], count, axis=0).astype(np.uint8)
+
+
+def test_a_window_by_hand() -> None:
+    """The pixel in the middle of an odd window is the agent's; of an even one it is the one after the middle."""
+    odd = windows(numbered(), np.array([[2.0, 3.0]]), 3, 3)
+    np.testing.assert_array_equal(odd[0, :, :, 0], [[12, 13, 14], [22, 23, 24], [32, 33, 34]])
+    even = windows(numbered(), np.array([[2.4, 3.4]]), 2, 4)
+    np.testing.assert_array_equal(even[0, :, :, 0], [[11, 12, 13, 14], [21, 22, 23, 24]])
+    np.testing.assert_array_equal(even[0, :, :, 1], [[2, 3, 4, 5], [3, 4, 5, 6]])
+
+
+def test_outside_the_image_is_black() -> None:
+    """At two corners, and somewhere else altogether; each state has its own window."""
+    found = windows(numbered(3), np.array([[0.0, 0.0], [5.0, 6.0], [-90.0, 400.0]]), 3, 3)[..., 1]
+    np.testing.assert_array_equal(found[0], [[0, 0, 0], [0, 0, 1], [0, 1, 2]])
+    np.testing.assert_array_equal(found[1], [[9, 10, 0], [10, 11, 0], [0, 0, 0]])
+    assert not found[2].any()
+
+
+def ensemble_of(view: FullView | AgentView, members: int = 2, seed: int = 0) -> Ensemble:
+    """Fresh members of a crop network."""
+    return Ensemble("montezuma-crop", SHAPE, members, torch_generator(seed, "weights"), view).eval()
+
+
+def observations_of(count: int, seed: int = 0) -> NDArray[np.uint8]:
+    """Noise."""
+    return np.random.default_rng(seed).integers(256, size=(count, *SHAPE), dtype=np.uint8)
+
+
+def test_members_see_the_window() -> None:
+    """Spec C5: predictions are those of the members on windows cut out by hand, in chunks as in one."""
+    ensemble = ensemble_of(AgentView(SHAPE, 24, 32, RamLocaliser(SHAPE)))
+    observations = observations_of(70)
+    positions = np.tile([[1, 77, 235]], (70, 1))
+    row, column = np.floor(pixels_of(positions[:1])[0] + 0.5).astype(int)
+    cut = observations[:, row - 12 : row + 12, column - 16 : column + 16]
+    assert cut.shape[1:] == (24, 32, 4)
+    np.testing.assert_array_equal(ensemble.see(observations, positions), cut)
+    with torch.no_grad():
+        inputs = as_input(torch.from_numpy(cut))
+        expected = [member(inputs).softmax(dim=-1)[:, 1].numpy() for member in ensemble.members]
+    np.testing.assert_allclose(ensemble.predict(observations, positions), np.stack(expected, axis=1), atol=2e-6)
+
+
+def test_an_oracle_asks_for_positions() -> None:
+    """Spec G2: of a localiser that reads the game's memory nobody gets a prediction without it, or for another game."""
+    ensemble = ensemble_of(AgentView(SHAPE, 24, 32, RamLocaliser(SHAPE)))
+    assert ensemble.needs_positions
+    with pytest.raises(UserError, match="localiser=ram: it needs the agent's positions: none"):
+        ensemble.predict(observations_of(2))
+    with pytest.raises(UserError, match=r"int64 \(3, 3\)"):
+        ensemble.predict(observations_of(2), np.zeros((3, 3), dtype=np.int64))
+    with pytest.raises(UserError, match="knows Montezuma's Revenge only"):
+        RamLocaliser((64, 64, 3))
+
+
+@pytest.mark.parametrize("localisers", ["ram", "learned"])
+def test_stacked_members_of_several_views(localisers: str) -> None:
+    """Spec D1: each ensemble sees with its own localiser, also where all members are one network."""
+    ensembles = []
+    for seed in range(2):
+        torch.manual_seed(seed)  # for the localiser's weights
+        localiser = RamLocaliser(SHAPE) if localisers == "ram" else LearnedLocaliser(SHAPE)
+        ensembles.append(ensemble_of(AgentView(SHAPE, 24, 32, localiser), seed=seed))
+    observations, positions = observations_of(5), np.array([[1, 20 * x, 235] for x in range(1, 6)])
+    stacked = StackedMembers(ensembles)
+    assert stacked.needs_positions == (localisers == "ram")
+    expected = np.concatenate([ensemble.predict(observations, positions) for ensemble in ensembles], axis=1)
+    np.testing.assert_allclose(stacked.predict(observations, positions), expected, atol=1e-5)
+    assert np.ptp(expected) > 1e-3
+
+
+def square_states(count: int, seed: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """48x48: an agent of two shades moves about; others of the same size, of one shade each, move or stand; a wall."""
+    rng = np.random.default_rng(seed)
+    states = np.zeros((count, 48, 48, 4), dtype=np.uint8)
+    states[:, 40:] = rng.integers(20, 120, size=(count, 1, 1, 1))
+    places = np.empty((count, 2))
+    for state, place in zip(states, places, strict=True):
+        for thing in range(4):
+            at, speed = rng.integers(6, 36, size=2), rng.integers(-2, 3, size=2)
+            for frame in range(4):
+                top, left = at + speed * (frame - 3)
+                top, left = max(top, 0), max(left, 0)
+                state[top : top + 6, left : left + 4, frame] = 90 + 50 * thing if thing < 3 else 120
+                if thing == 3:
+                    state[top + 2 : top + 4, left : left + 4, frame] = 250
+            place[:] = at + np.array([2.5, 1.5])
+    return states, places
+
+
+def test_a_localiser_learns_a_toy() -> None:
+    """Beyond the paper: the agent among things that move as it does, in states never seen; the same bytes again."""
+    states, places = square_states(200, seed=0)
+    others, wanted = square_states(100, seed=1)
+    first = fit_localiser(states, places, seed=3, steps=120)
+    away = np.abs(first.locate(others) - wanted).max(axis=1)
+    untrained = np.abs(fit_localiser(states, places, seed=3, steps=1).locate(others) - wanted).max(axis=1)
+    assert (away <= 4).mean() > 0.9
+    assert (untrained <= 4).mean() < 0.3
+    assert not first.needs_positions
+    again = fit_localiser(states, places, seed=3, steps=3).state_dict()
+    second = fit_localiser(states, places, seed=3, steps=3).state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in second.items())
+
+
+def test_what_is_made_up_leaves_the_agent_alone() -> None:
+    """Of changed states the agent's pixels are as they were, mirrored perhaps, where the changed place says."""
+    states, places = square_states(40, seed=0)
+    changed, moved = _changed(states, places, np.random.default_rng(0))
+    inside = ((moved > 4) & (moved < 43)).all(axis=1)
+    assert inside.sum() > 5
+    for image, place in zip(changed[inside], moved[inside], strict=True):
+        top, left = np.round(place - (2.5, 1.5)).astype(int)
+        bright, dark = image[top + 2 : top + 4, left : left + 4, 3], image[top : top + 2, left : left + 4, 3]
+        assert np.ptp(bright) == np.ptp(dark) == 0
+        assert bright[0, 0] > dark[0, 0]
+    assert ((changed > 0).mean(axis=(1, 2, 3)) > 0.5).any()
+
+
+@pytest.mark.atari
+def test_positions_are_where_the_emulator_draws_the_agent() -> None:
+    """Spec B4: two observations that differ by where the agent stands differ around both places that its RAM says."""
+    from hypogoal.domains.montezuma_emulator import Emulator
+
+    emulator = Emulator()
+    for room, y, places in ((1, 235, (60, 90)), (1, 192, (60, 90)), (1, 148, (21, 133)), (9, 235, (60, 90))):
+        frames, positions = [], []
+        for x in places:
+            assert emulator.place(room, x, y) is not None
+            frames.append(emulator.stack[:, :, 3].astype(int))
+            positions.append(emulator.position())
+        differ = np.abs(frames[0] - frames[1]) > 15
+        for where in pixels_of(np.array(positions)):
+            top, left = np.floor(where - (8, 6)).astype(int)
+            rows, columns = np.nonzero(differ[top : top + 17, left : left + 13])
+            middle = np.array([rows.min() + rows.max(), columns.min() + columns.max()]) / 2 + (top, left)
+            assert np.abs(middle - where).max() <= 1.5
+
+
+def montezuma_states(
+    count: int, seed: int
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], dict[str, NDArray[np.int64]]]:
+    """Made-up states of which the agent's surroundings say the label, with the origins that Montezuma's have."""
+    rng = np.random.default_rng(seed)
+    labels = np.arange(count) % 3 == 0
+    origins = {
+        "room": np.ones(count, dtype=np.int64),
+        "x": rng.integers(40, 110, size=count),
+        "y": rng.integers(160, 220, size=count),
+        "ladder": np.where(labels, np.arange(count) // 3 % 2, -1),
+    }
+    observations = rng.integers(60, size=(count, *SHAPE), dtype=np.uint8)
+    middles = np.round(pixels_of(np.stack([origins[name] for name in ("room", "x", "y")], axis=1))).astype(int)
+    for observation, (row, column), label in zip(observations, middles, labels, strict=True):
+        observation[row - 4 : row + 4, column - 2 : column + 2] = 200
+        observation[row + 6 : row + 9, column - 8 : column + 8] = 250 if label else 100
+    return observations, labels, origins
+
+
+CROP = EnsembleConfig(
+    members=2,
+    network="montezuma-crop",
+    view="agent-crop",
+    localiser="ram",
+    batch_size=16,
+    steps=25,
+    learning_rate=2e-3,
+    batch_kind="per-ladder",
+)
+
+
+def test_an_ensemble_learns_from_windows() -> None:
+    """Beyond the paper: what surrounds the agent decides, wherever it is."""
+    observations, labels, origins = montezuma_states(60, seed=0)
+    others, truth, there = montezuma_states(60, seed=1)
+    ensemble = fit(observations, labels, others, CROP, 0, origins=origins, unlabelled_origins=there)
+    positions = np.stack([there[name] for name in ("room", "x", "y")], axis=1)
+    assert (ensemble.verdicts(others, positions) == truth[:, None]).mean() > 0.95
+
+
+def test_data_that_do_not_say_enough_are_one_clear_line() -> None:
+    """Spec G2: what a setting needs to know of the states and the data do not say."""
+    observations, labels, origins = montezuma_states(12, seed=0)
+    some = {name: origins[name] for name in ("room", "x", "ladder")}
+    with pytest.raises(UserError, match=r"do not say y of each state: view=agent-crop"):
+        fit(observations, labels, observations, CROP, 0, origins=some, unlabelled_origins=origins)
+    with pytest.raises(UserError, match=r"do not say room, x, y of each state: localiser=ram"):
+        fit(observations, labels, observations, CROP, 0, origins=origins)
+    plain = dataclasses.replace(CROP, view="full")
+    with pytest.raises(UserError, match=r"do not say ladder of each state: batch_kind=per-ladder"):
+        fit(observations, labels, observations, plain, 0)
+    small = observations[:, :40, :40]
+    with pytest.raises(UserError, match="view=agent-crop knows Montezuma's Revenge only"):
+        fit(small, labels, small, CROP, 0, origins=origins, unlabelled_origins=origins)

@@ -1,0 +1,159 @@
+"""``train-options`` on a domain with named starts, through the stage (Spec A3, B4, D4, F3)."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from corridor import LongCorridor
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.config import describe
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.storage import write_ensemble
+from hypogoal.options.recording import EXECUTION_COLUMNS
+from hypogoal.stages.train_options import TrainOptionsConfig, train_options
+
+BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "environments": 4, "warm_up": 60}
+
+
+class LongCorridorDomain:
+    """The long corridor's two named cells."""
+
+    name = "test_named_starts:DOMAIN"
+    sub_goals = ("left-end", "right-end")
+    observation_shape = LongCorridor.observation_shape
+    config_class = type(None)
+    env_id = ""
+    starts = tuple(LongCorridor.cells)
+
+    def collect(self, config, seed, progress):
+        raise NotImplementedError
+
+    def make_engine(self, layout_seed, count, max_steps, **arguments):
+        return LongCorridor(count, max_steps, **arguments)
+
+    def distance(self, positions):
+        return np.minimum(positions[:, 1], 5 - positions[:, 1])
+
+
+DOMAIN = LongCorridorDomain()
+
+
+def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") -> Path:
+    """An ensemble artefact with random weights."""
+    shape = domain.observation_shape
+    config = {
+        "domain": domain.name, "domain_config": {}, "sub_goals": list(domain.sub_goals), "members": members,
+        "network": network, "observation_shape": list(shape),
+    }  # fmt: skip
+    with create_artefact(folder, kind="ensemble", config=config, seed=0, inputs=[]) as place:
+        for number, sub_goal in enumerate(domain.sub_goals):
+            write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ensemble_of(tmp_path_factory.mktemp("run") / "ensemble", TallDomain, members=1)
+
+
+class TallDomain:
+    """Only for the ensemble's manifest: oracle terminations read no weights."""
+
+    name, sub_goals, observation_shape = DOMAIN.name, DOMAIN.sub_goals, (84, 84, 4)
+
+
+def rows_of(folder: Path) -> list[dict[str, int]]:
+    with (folder / "executions.csv").open(newline="") as file:
+        reader = csv.DictReader(file)
+        assert tuple(reader.fieldnames) == EXECUTION_COLUMNS
+        return [{name: int(value) for name, value in row.items()} for row in reader]
+
+
+def train(ensemble: Path, out: Path, seed: int = 0, **changes):
+    config = TrainOptionsConfig(**(BEGIN | {"termination": "oracle", "option_timeout": 8, "steps": 400} | changes))
+    return train_options(ensemble, config, out, seed=seed, quiet=True)
+
+
+def test_options_from_a_named_start(corridor: Path, tmp_path: Path) -> None:
+    """Spec A3, D4, F3: the stage writes the last executions with their distance, and says where they began."""
+    numbers = train(corridor, tmp_path / "options", start="middle", n_step=3, chooser="even", steps_for="each")
+    assert numbers["steps"] == 800 and 0.0 <= numbers["reached"] <= 1.0
+    artefact = open_artefact(tmp_path / "options", "options")
+    assert artefact.config["steps"] == 800 and artefact.config["start"] == "middle"
+    assert json.loads((tmp_path / "options" / "layout.json").read_text())["start"] == "middle"
+    rows = rows_of(tmp_path / "options")
+    assert {row["option"] for row in rows} == {0, 1}
+    assert all(row["distance"] == min(row["x"], 5 - row["x"]) for row in rows)
+    assert all((row["distance"] == 0) >= row["reached"] for row in rows)
+    assert all(row["duration"] == 8 for row in rows if not row["reached"] and not row["terminated"])
+    assert not any(row["inside_at_start"] for row in rows)
+    last = json.loads((tmp_path / "options" / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 800 and {"reached", "terminated", "duration", "option_loss"} <= set(last)
+
+
+def test_same_seed_same_files(corridor: Path, tmp_path: Path) -> None:
+    """The project's rule: randomness is passed in; a curriculum's start states and kept actions are among it."""
+    every = {"start": "middle", "along": 0.3, "exploration": "persistent", "n_step": 3, "steps": 240}
+    for name, seed in (("one", 1), ("two", 1), ("other", 2)):
+        train(corridor, tmp_path / name, seed=seed, **every)
+    for path in (tmp_path / "one").iterdir():
+        if path.name != "manifest.json":
+            assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
+    assert (tmp_path / "one/executions.csv").read_bytes() != (tmp_path / "other/executions.csv").read_bytes()
+
+
+def test_a_start_must_be_one_of_the_domains(corridor: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Spec D4, G2: one line that names those there are; nothing is left behind."""
+    for changes, line in (
+        ({"start": "top"}, "unknown start: top. Give --set start=X, X one of middle, left."),
+        ({}, "where are episodes to begin?: start. Give --set start=X, X one of middle, left."),
+    ):
+        with pytest.raises(UserError) as caught:
+            train(corridor, tmp_path / "options", **changes)
+        assert str(caught.value) == line
+    assert not (tmp_path / "options").exists()
+    command = ["train-options", str(corridor), "--out", str(tmp_path / "options"), "--set", "start=top"]
+    assert main([*command, "--set", "termination=oracle"]) == 2
+    assert capsys.readouterr().err.strip().splitlines() == [
+        "hypogoal: unknown start: top. Give --set start=X, X one of middle, left."
+    ]
+
+
+def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
+    """Spec D4, G2: DoorKey's layouts begin where they begin."""
+    from hypogoal.domains.doorkey import DOMAIN as doorkey
+
+    ensemble = ensemble_of(tmp_path / "ensemble", doorkey, 1, "doorkey")
+    for changes in ({"start": "1L"}, {"along": 0.5}):
+        with pytest.raises(UserError, match="doorkey has no named starts"):
+            train_options(ensemble, TrainOptionsConfig(steps=10, **changes), tmp_path / "options", quiet=True)
+
+
+def test_the_papers_number_of_steps_is_told() -> None:
+    """Spec D4: ``hypogoal config train-options`` says that the paper's 3e5 steps are those of each option."""
+    (steps,) = [row for row in describe(TrainOptionsConfig) if row["name"] == "steps"]
+    assert "3e5 for each option" in steps["source"]
+
+
+@pytest.mark.atari
+def test_options_on_a_ladder(tmp_path: Path) -> None:
+    """Spec A3, B4, D4, F3: learned members and the oracle on the emulator, from an ensemble to executions and stops."""
+    from hypogoal.domains.montezuma import DOMAIN as montezuma
+
+    ensemble = ensemble_of(tmp_path / "ensemble", montezuma, members=2)
+    few = {"start": "1L", "option_timeout": 25, "steps": 320, "n_step": 3, "exploration": "persistent", "replay": 500}
+    for name, options in (("learned", 2), ("oracle", 1)):
+        train(ensemble, tmp_path / name, termination=name, **few)
+        rows = rows_of(tmp_path / name)
+        assert {row["option"] for row in rows} == set(range(options))
+        positions = np.array([(row["room"], row["x"], row["y"]) for row in rows])
+        np.testing.assert_array_equal(montezuma.distance(positions), [row["distance"] for row in rows])
+        assert all(row["duration"] <= 25 for row in rows)
+    reached = [row["distance"] <= 4 for row in rows if row["reached"]]  # the oracle's: two units in x and two in y
+    assert all(reached)

@@ -1,0 +1,376 @@
+"""Options that each begin at a start state, on engines that forget (Spec D1-D4, D6, E6, F3)."""
+
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from corridor import Corridor, LongCorridor
+
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.env import make_policies
+from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
+from hypogoal.options.light import LightLearner
+from hypogoal.options.memory import remembered
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels
+from hypogoal.options.recording import EXECUTION_COLUMNS, EXECUTIONS_KEPT, Recorder
+from hypogoal.options.recurrent import RecurrentLearner
+from hypogoal.options.running import MemberVerdicts, running_verdicts
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+LEFT, RIGHT, STAY = 2, 3, 0
+QUICK = {"environments": 4, "warm_up": 50, "update_interval": 4, "option_batch": 32, "epsilon_steps": 300}
+BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own"}
+
+
+class Script:
+    """A learner that plays a list of actions, the same in every environment."""
+
+    def __init__(self, actions):
+        self.actions = list(actions)
+
+    def act(self, ids, options, age, *, explore=True):
+        return np.full(len(ids), self.actions.pop(0))
+
+    def observe(self, ids, actions, next_ids, options, **ends):
+        pass
+
+    def learn(self):
+        return {}
+
+
+class Chosen:
+    """A chooser that takes the options of a list; keeps where they began and what came of them."""
+
+    def __init__(self, options):
+        self.options, self.began, self.outcomes = list(options), [], []
+
+    def choose(self, environments, ids, offered):
+        assert offered.all()
+        self.began.extend(ids.tolist())
+        return np.array([self.options.pop(0) for _ in ids])
+
+    def record(self, outcome):
+        self.outcomes.append(outcome)
+
+    def learn(self):
+        return {}
+
+
+def play(engine, actions, options, **changes):
+    chooser, recorder = Chosen(options), Recorder(2)
+    config = OptionConfig(**(BEGIN | {"option_timeout": 4} | changes))
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    loop = OptionLoop(engine, verdicts, Script(actions), chooser, recorder, config, gamma=1.0)
+    for _ in range(len(actions)):
+        loop.step()
+    return chooser, recorder
+
+
+def columns(folder: Path) -> list[dict[str, int]]:
+    with (folder / "executions.csv").open(newline="") as file:
+        reader = csv.DictReader(file)
+        assert tuple(reader.fieldnames) == EXECUTION_COLUMNS
+        return [{name: int(value) for name, value in row.items()} for row in reader]
+
+
+def test_every_option_begins_at_a_start_state(tmp_path: Path) -> None:
+    """Spec D4, F3: one reaches its end, one runs out of time, one dies, and each next one begins at the start.
+
+    From cell 2: option 0 (left end) goes left twice; then it waits out its four steps in cell 2; then option 0 again,
+    pushed right three times, dies in cell 5.
+    """
+    engine = LongCorridor(1)
+    actions = [LEFT, LEFT, STAY, STAY, STAY, STAY, RIGHT, RIGHT, RIGHT, STAY]
+    chooser, recorder = play(engine, actions, [0, 0, 0, 1])
+    assert chooser.began == [0, 0, 0, 0]  # the id of the one start state
+    assert [outcome.durations[0] for outcome in chooser.outcomes] == [2, 4, 3]
+    assert [bool(outcome.truncated[0]) for outcome in chooser.outcomes] == [True, True, False]
+    assert [bool(outcome.terminated[0]) for outcome in chooser.outcomes] == [False, False, True]
+    assert recorder.episodes == [(2, 2, 0.0, 0), (6, 4, 0.0, 0), (9, 3, 0.0, 1)]
+    assert engine.elapsed[0] == 1, "the fourth runs"
+
+    recorder.write_executions(tmp_path, engine.positions, lambda positions: 10 * positions[:, 1])
+    rows = columns(tmp_path)
+    assert [(row["step"], row["option"], row["duration"]) for row in rows] == [(2, 0, 2), (6, 0, 4), (9, 0, 3)]
+    assert [row["reached"] for row in rows] == [1, 0, 0]
+    assert [row["terminated"] for row in rows] == [0, 0, 1]
+    assert [row["inside_at_start"] for row in rows] == [0, 0, 0]
+    assert [(row["room"], row["x"], row["y"], row["distance"]) for row in rows] == [
+        (0, 0, 0, 0), (0, 2, 0, 20), (0, 5, 0, 50),
+    ]  # fmt: skip
+    assert recorder.recent(restarted=True) == pytest.approx({"reached": 1 / 3, "terminated": 1 / 3, "duration": 3.0})
+    assert recorder.reached()[0] == pytest.approx(1 / 3) and math.isnan(recorder.reached()[1])
+
+
+def test_an_option_that_begins_inside_its_sub_goal_runs_and_says_so(tmp_path: Path) -> None:
+    """Spec D4, F3: nothing is masked; it runs one step at least, and its row says inside_at_start."""
+    engine = LongCorridor(1, start="left")
+    _, recorder = play(engine, [LEFT, RIGHT, RIGHT, RIGHT, RIGHT, STAY], [0, 0, 1])
+    recorder.write_executions(tmp_path, engine.positions, lambda positions: positions[:, 1])
+    rows = columns(tmp_path)
+    assert [(row["duration"], row["reached"], row["inside_at_start"], row["x"]) for row in rows] == [
+        (1, 1, 1, 0),
+        (4, 0, 1, 4),
+    ]
+
+
+def test_executions_that_begin_on_the_way_are_no_executions_of_figure_4(tmp_path: Path) -> None:
+    """Spec D4, F3: of a curriculum's executions those from the start proper count, and the last 100 of them."""
+    engine = LongCorridor(1, along=0.5)
+    steps = 900
+    chooser, recorder = play(engine, [LEFT] * steps, [0] * steps)
+    proper = sum(begin == 0 for begin in chooser.began)
+    assert 0.4 < proper / len(chooser.began) < 0.6
+    recorder.write_executions(tmp_path, engine.positions, lambda positions: positions[:, 1])
+    rows = columns(tmp_path)
+    assert len(rows) == EXECUTIONS_KEPT < proper
+    assert {row["duration"] for row in rows} == {2}, "from the cell on the way it takes one"
+    assert [row["step"] for row in rows] == sorted(row["step"] for row in rows)
+    assert rows[-1]["step"] > steps - 20
+
+
+def test_no_executions_no_rows(tmp_path: Path) -> None:
+    """Spec F3: an option that was never chosen has no rows, and nothing breaks."""
+    engine = LongCorridor(1)
+    Recorder(2).write_executions(tmp_path, engine.positions, lambda positions: positions[:, 1])
+    assert columns(tmp_path) == []
+
+
+def test_an_engine_that_cannot_restart_is_refused() -> None:
+    """Spec D4: a clear line, not options that go on where others stopped."""
+    with pytest.raises(UserError, match="restart_options=true"):
+        play(Corridor(1), [0], [0])
+
+
+def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) -> None:
+    """Spec F6: the last stops can be drawn although their states are forgotten."""
+    engine = LongCorridor(1, memory=5)
+    _, recorder = play(engine, [LEFT, LEFT, *[STAY] * 40], [0] * 12)
+    (stop,) = recorder.stops[0]
+    assert not remembered(engine, np.array([stop])).any()
+    with pytest.raises(ValueError, match="forgotten"):
+        engine.images(np.array([stop]))
+    recorder.write(tmp_path, engine.images)
+    with h5py.File(tmp_path / "terminations.h5") as file:
+        (picture,) = file["0"][()]
+    assert (picture[:, :14] == 255).all() and not picture[:, 14:].any(), "cell 0"
+
+
+def learned(learner_class: type, steps: int, seed: int = 0, memory: int = 200_000, count: int = 4, **changes):
+    config = OptionConfig(**(QUICK | BEGIN | {"option_timeout": 10} | changes))
+    engine = LongCorridor(count, memory=memory, seed=seed)
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner = learner_class(engine, verdicts, config, seed)
+    recorder = Recorder(2)
+    loop = OptionLoop(engine, verdicts, learner, RandomChooser(np.random.default_rng(seed)), recorder, config, 1.0)
+    for _ in range(steps // count):
+        loop.step()
+    return learner, recorder
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"n_step": 3}, {"n_step": 3, "exploration": "persistent", "actions": "moves"}],
+    ids=["one-step", "three-step", "three-step persistent moves"],
+)
+def test_the_light_learner_learns_from_pictures(changes: dict) -> None:
+    """Spec D2, D4: own experience, one step and several: both options go straight to their ends."""
+    learner, recorder = learned(LightLearner, 1600, epsilon_final=0.02, **changes)
+    assert isinstance(learner.online.cells, PictureEmbedding)
+    for option, shortest in ((0, 2), (1, 3)):
+        last = list(recorder.executions[option])[-20:]
+        assert np.mean([row.reached for row in last]) >= 0.9
+        assert np.median([row.duration for row in last]) == shortest
+
+
+def test_values_over_several_steps_are_the_discounted_ones() -> None:
+    """Spec D2: in cell 1 the left end is one step away, in cell 2 two: values near 1 and gamma."""
+    learner, _ = learned(LightLearner, 2000, n_step=3, option_gamma=0.5, epsilon_final=0.3, option_learning_rate=2e-3)
+    engine = learner.engine
+    at = {cell: engine.cell.index(cell, engine.n_states - 1000) for cell in (1, 2)}
+    with torch.no_grad():
+        values = learner.online(torch.from_numpy(engine.images(np.array(list(at.values())))))[:, 0]
+    np.testing.assert_allclose(values[:, LEFT], [1.0, 0.5], atol=0.12)
+
+
+def test_a_step_of_several_needs_own_experience() -> None:
+    """Spec D2: others' sub-goals may lie in between; the paper's network learns one step ahead."""
+    with pytest.raises(UserError, match="experience=own"):
+        learned(LightLearner, 4, n_step=3, experience="shared")
+    with pytest.raises(UserError, match="n_step=1"):
+        learned(RecurrentLearner, 4, n_step=3, network="paper")
+
+
+@pytest.mark.parametrize("learner_class", [LightLearner, RecurrentLearner])
+def test_a_replay_longer_than_the_memory_is_refused(learner_class: type) -> None:
+    """Spec D3: before it begins, with the number that fits; with that number it begins."""
+    with pytest.raises(UserError, match=r"replay=1000\. Give --set replay=") as caught:
+        learned(learner_class, 4, memory=900, replay=1000)
+    fits = int(caught.value.do.split("replay=")[1].split()[0])
+    if learner_class is LightLearner:
+        learned(learner_class, 4, memory=900, replay=fits)
+
+
+def test_forgotten_states_are_not_learned_from() -> None:
+    """Spec D3: positives from long ago are kept by id; once their pictures are gone they are not drawn again."""
+    engine = LongCorridor(4, memory=400)
+    config = OptionConfig(**(QUICK | BEGIN | {"replay": 200, "n_step": 3, "positives": 0.5}))
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner = LightLearner(engine, verdicts, config, 0)
+    recorder, chooser = Recorder(2), RandomChooser(np.random.default_rng(0))
+    loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, 1.0)
+    while not learner.positives.all():
+        loop.step()
+    learner.act = lambda ids, options, age, **_: np.zeros(len(ids), np.int64)  # from now on nothing is reached
+    for _ in range(150):
+        loop.step()
+    assert not remembered(engine, learner.positive["next"][learner.positive["next"] > 0]).any()
+    batch, indices, weights = learner._batch()
+    assert remembered(engine, batch["s"]).all() and remembered(engine, batch["next"]).all()
+    assert len(indices) == len(weights) == config.option_batch, "all of it from the replay"
+
+
+def test_the_replay_never_outlives_the_memory() -> None:
+    """Spec D3: with the smallest memory that is accepted, thousands of steps ask for no forgotten state."""
+    config = OptionConfig(**(QUICK | BEGIN | {"replay": 300, "n_step": 7}))
+    smallest = LightLearner.reach(config, 2)
+    slow = {"update_interval": 32, "option_batch": 300}  # few updates, each with most of the replay
+    learned(LightLearner, 2000, memory=smallest, replay=300, n_step=7, option_timeout=9, **slow)
+
+
+def test_the_paper_network_learns_from_pictures() -> None:
+    """Spec D2, D3: conv-GRU on (84, 84, 4), unrolled over each execution."""
+    torch.manual_seed(0)
+    network = PaperQNetwork((84, 84, 4), 18)
+    values, hidden = network(network.embed(torch.zeros(3, 84, 84, 4, dtype=torch.uint8))[None])
+    assert values.shape == (1, 3, 18) and hidden.shape == (1, 1, 512)
+    paper = {"network": "paper", "option_batch": 4, "update_interval": 16, "replay": 100, "option_timeout": 4}
+    learner, _ = learned(RecurrentLearner, 240, memory=256, **paper)
+    assert all(member.updates >= 2 for member in learner.members)
+    state = learner.state()
+    assert state["0.values.2.bias"].shape == (4,) and "actions" not in state
+
+
+def test_what_a_seldom_chosen_member_stored_may_be_forgotten() -> None:
+    """Spec D3: members of the paper's kind share the engine's memory; executions that are gone are not replayed."""
+    config = OptionConfig(**(QUICK | BEGIN | {"network": "paper", "replay": 100, "option_timeout": 4}))
+    config = replace(config, warm_up=100_000, option_batch=4)
+    engine = LongCorridor(4, memory=240)
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner, chooser = RecurrentLearner(engine, verdicts, config, 0), Chosen([0] * 8 + [1] * 400)
+    loop = OptionLoop(engine, verdicts, learner, chooser, Recorder(2), config, 1.0)
+    while learner.members[1].steps < 20:
+        loop.step()
+    assert learner._update(0, learner.members[0]) > 0.0
+    while learner.members[1].steps < 260:
+        loop.step()
+    assert learner._update(0, learner.members[0]) == 0.0
+    assert learner._update(1, learner.members[1]) > 0.0
+
+
+def test_same_seed_same_bytes_with_every_switch() -> None:
+    """The project's rule: randomness is passed in."""
+    every = {"n_step": 4, "exploration": "persistent", "actions": "moves"}
+    one, two, other = (learned(LightLearner, 240, seed=seed, **every)[0] for seed in (1, 1, 2))
+    for name, value in one.state().items():
+        assert torch.equal(value, two.state()[name]), name
+    assert any(not torch.equal(value, other.state()[name]) for name, value in one.state().items())
+
+
+def test_pixels_are_the_images() -> None:
+    """Spec D2 (light): converted once, into memory in use, the network sees what it sees in the images."""
+    engine = LongCorridor(3)
+    for _ in range(4):
+        engine.step(np.array([LEFT, RIGHT, STAY]))
+    ids = np.arange(1, engine.n_states)
+    torch.manual_seed(0)
+    network, pixels = LightQNetwork(engine.observation_shape, 2, 4), Pixels(engine, 50)
+    expected = network(torch.from_numpy(engine.images(ids)))
+    torch.testing.assert_close(network(pixels.of(ids)), expected)
+    # Scaled weights are the same function as scaled pixels.
+    cells = network.cells
+    scaled = torch.from_numpy(engine.images(ids)).permute(0, 3, 1, 2).float() / 255.0
+    plain = torch.relu(cells.second(torch.relu(cells.first(scaled)))).flatten(1)
+    torch.testing.assert_close(cells(torch.from_numpy(engine.images(ids))), plain)
+
+
+def test_saved_policies_play_the_actions_they_chose_among() -> None:
+    """Spec D2: a policy over a set of actions is saved with it, plays those, and is not continued with others."""
+    learner, _ = learned(LightLearner, 200, actions="moves")
+    played = {int(a) for _ in range(50) for a in learner.act(np.zeros(4, np.int64), np.zeros(4, np.int64), np.ones(4))}
+    assert played <= {LEFT, RIGHT}
+    state = learner.state()
+    assert state["actions"].tolist() == [LEFT, RIGHT]
+    config = {"termination": "learned", "network": "light", "sub_goals": ["a", "b"], "members": 1}
+    act = make_policies(config, state, {"observation_shape": LongCorridor.observation_shape})(1)
+    image = learner.engine.images(np.array([0]))[0]
+    greedy = learner.act(np.zeros(1, np.int64), np.ones(1, np.int64), np.ones(1), explore=False)
+    assert act(image) == greedy[0] and act(image) in (LEFT, RIGHT)
+    learner.load(state)
+    other, _ = learned(LightLearner, 4)
+    with pytest.raises(UserError, match="other actions"):
+        other.load(state)
+
+
+def test_even_choice_gives_every_option_as_many_steps() -> None:
+    """Spec D4: option 0 takes 2 steps each time, option 1 its full 10; uniform choice would give it 5 of 6 steps."""
+    engine = LongCorridor(4)
+    recorder = Recorder(2)
+    config = OptionConfig(**(BEGIN | {"option_timeout": 10}))
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    chooser = EvenChooser(2, np.random.default_rng(0))
+    loop = OptionLoop(engine, verdicts, Script([LEFT] * 1000), chooser, recorder, config, 1.0)
+    for _ in range(1000):
+        loop.step()
+    recorder.flush()
+    steps = [sum(row[6] for row in recorder.choices if row[1] == option) for option in (0, 1)]
+    assert abs(steps[0] - steps[1]) <= 4 * 10 and sum(steps) > 3900
+    masked = np.array([[True, False]])
+    assert [chooser.choose(np.array([9]), np.zeros(1, np.int64), masked)[0] for _ in range(5)] == [0] * 5
+
+
+class TallCorridor(LongCorridor):
+    """In pictures that the member network takes."""
+
+    observation_shape = (84, 84, 4)
+
+
+def test_running_members_are_judged_alone_and_once() -> None:
+    """Spec D1: the verdicts of each ensemble's own, its thresholds included, member by member, each state once."""
+    engine = TallCorridor(3)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        engine.step(rng.integers(4, size=3))
+    everything = np.arange(engine.n_states)
+    ensembles = [
+        Ensemble("montezuma", engine.observation_shape, 2, torch.Generator().manual_seed(g)).eval() for g in range(2)
+    ]
+    for ensemble in ensembles:  # so that each member says yes in some of the states
+        ensemble.set_thresholds(np.quantile(ensemble.predict(engine.images(everything)), 0.6, axis=0))
+    wanted = np.concatenate([ensemble.verdicts(engine.images(everything)) for ensemble in ensembles], axis=1)
+    assert (wanted.any(0) & ~wanted.all(0)).all()
+    verdicts = MemberVerdicts(engine, ensembles)
+    asked: list[tuple[int, int]] = []
+    ask = verdicts._ask
+
+    def counted(ids, option):
+        asked.extend((int(identity), option) for identity in ids)
+        return ask(ids, option)
+
+    verdicts._ask = counted
+    for _ in range(30):
+        ids, options = rng.integers(engine.n_states, size=9), rng.integers(4, size=9)
+        np.testing.assert_array_equal(running_verdicts(verdicts, ids, options), wanted[ids, options])
+    assert len(set(asked)) == len(asked) > 100
+    np.testing.assert_array_equal(running_verdicts(verdicts, everything[:0], everything[:0]), [])
+    plain = Verdicts(oracle_terminations(engine), 2)
+    options = rng.integers(2, size=len(everything))
+    truth = engine.labels(everything)[everything, options]
+    np.testing.assert_array_equal(running_verdicts(plain, everything, options), truth)
