@@ -221,7 +221,7 @@ def _box(first: NDArray[np.floating | np.integer], last: NDArray[np.floating | n
 
 
 def _pattern(height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A pattern (height, width, 1) in 0..255, of two shades or of many: a few pixels repeated like bricks, or blocks."""
+    """A pattern (height, width, 1) in 0..255, of two shades or of many: pixels repeated like bricks, or blocks."""
     dark, bright = np.sort(rng.uniform(0, 255, size=2))
     bricks = rng.random() < 0.6
     cell = np.array((1, 1)) if bricks else rng.integers(1, (5, 8))
