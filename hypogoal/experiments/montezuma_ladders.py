@@ -19,7 +19,7 @@ STAGES = ("collect", "train-ensemble", "train-options")
 # member, per environment step of an option, per member that is evaluated.
 PER_COLLECTION = 30.0
 PER_MEMBER_STEP = 0.11
-PER_STEP = {"light": 2.5e-3, "paper": 0.1}
+PER_STEP = {"light": 2.5e-3, "paper": 4.0}
 PER_EVALUATED_MEMBER = 4.0
 
 METHODS: dict[str, tuple[str, ...]] = {
