@@ -38,7 +38,7 @@ from hypogoal.domains.montezuma_states import (
     origins_of,
 )
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.options.config import OptionConfig
+from hypogoal.stages.train_options import TrainOptionsConfig
 
 pytestmark = pytest.mark.atari
 
@@ -340,7 +340,7 @@ def test_the_domain_interface() -> None:
     assert DOMAIN.distance(bases).tolist() == [0] * 12
     assert DOMAIN.distance(bases[:1] + np.array([0, 5, 0])).tolist() == [5]
     assert DOMAIN.pixel(bases).shape == (12, 2)
-    for stage, config_class in (("train-ensemble", EnsembleConfig), ("train-options", OptionConfig)):
+    for stage, config_class in (("train-ensemble", EnsembleConfig), ("train-options", TrainOptionsConfig)):
         own = defaults_of("montezuma", stage)
         config = from_values(config_class, own, stage)
         assert all(getattr(config, key) == value != getattr(config_class(), key) for key, value in own.items())
