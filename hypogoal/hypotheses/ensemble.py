@@ -17,6 +17,7 @@ from hypogoal.hypotheses.views import AgentView, FullView
 THRESHOLD = 0.5  # of the probability, where none was chosen
 CHUNK = 64  # images at once in a plain forward pass: what fits a CPU's cache; on a GPU 16 times as many
 PATCH_CHUNK = 4096  # images at once where few patches are distinct
+FOLD_FROM = 32  # images from which making BatchNorm part of the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
 
 
@@ -123,7 +124,8 @@ class Ensemble(nn.Module):
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
                 return torch.stack([patches.forward(network, batch) for network in networks])
-        networks = tuple(folded(network) for network in networks)
+        if len(observations) >= FOLD_FROM:
+            networks = tuple(folded(network) for network in networks)
         chunk = CHUNK if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):

@@ -18,6 +18,7 @@ from hypogoal.hypotheses.batches import grey_maps
 from hypogoal.hypotheses.networks import folded
 
 CELL = 4  # pixels: the side of a heat-map's cell
+FEATURES = 32  # of a cell
 CHUNK = 64  # states at once where no gradient is kept
 STEPS, BATCH, LEARNING_RATE, L2_WEIGHT = 600, 24, 2e-3, 1e-4
 FARTHEST_SHIFT = 20  # pixels
@@ -105,41 +106,75 @@ def montezuma_only(observation_shape: tuple[int, ...], why: str) -> None:
 
 
 def fit_localiser(
-    observations: NDArray[np.uint8], pixels: NDArray[np.float64], seed: int, *, steps: int = STEPS
+    observations: NDArray[np.uint8],
+    pixels: NDArray[np.float64],
+    unlabelled: NDArray[np.uint8],
+    actions: NDArray[np.int64],
+    seed: int,
+    *,
+    steps: int = STEPS,
 ) -> LearnedLocaliser:
-    """A localiser from states of which the agent's place is known; nothing else is needed, in training or later.
+    """A localiser from states of which the agent's place is known, and from others of which its actions are.
 
-    It has to find the agent in rooms that it never saw. So each state is mirrored, shifted, filled with made-up
-    patterns and moving things around the agent, and its shades are changed: what stays is the agent and how it moves.
+    It has to find the agent in rooms that it never saw. So each labelled state is mirrored, shifted, filled with
+    made-up patterns and moving things around the agent, and its shades are changed: what stays is the agent and how it
+    moves.
+    In unlabelled states the agent is what tells which actions were taken: each cell of the heat-map guesses them, and
+    the heat-map, a distribution over cells, says which guess counts (inverse dynamics with attention). So it learns
+    that enemies are not the agent.
 
     Args:
         observations: uint8 (N, H, W, C).
         pixels: row and column (N, 2) of the agent in the last frame.
+        unlabelled: uint8 (M, H, W, C); may be empty.
+        actions: int64 (M, 2), the actions, 0 or more, that led to the last frame and to the one before it.
         seed: of the initial weights and all that is drawn.
         steps: gradient steps.
 
     Returns:
         The localiser; the same bytes for the same arguments on one CPU.
     """
+    n_actions = int(actions.max(initial=0)) + 1
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_for(seed, "weights"))
         network = _heat_network(observations.shape[3])
-    optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE, weight_decay=L2_WEIGHT)
+        guesses = nn.Conv2d(FEATURES, 2 * n_actions, kernel_size=1)
+    weights = [*network.parameters(), *guesses.parameters()]
+    optimiser = torch.optim.Adam(weights, LEARNING_RATE, weight_decay=L2_WEIGHT)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, steps)
     rng = rng_for(seed, "states")
     for _ in range(steps):
         drawn = rng.integers(len(observations), size=BATCH)
         images, places = _changed(observations[drawn], pixels[drawn], rng)
-        heat = network(_as_heat_input(torch.from_numpy(images)))[:, 0]
-        cells = np.floor((places + 0.5) / CELL).astype(np.int64)
-        seen = ((cells >= 0) & (cells < heat.shape[1:])).all(1)
-        cell = torch.from_numpy((cells[:, 0] * heat.shape[2] + cells[:, 1])[seen])
-        loss = functional.cross_entropy(heat.flatten(start_dim=1)[torch.from_numpy(seen)], cell)
+        others = rng.integers(max(len(unlabelled), 1), size=BATCH if len(unlabelled) else 0)
+        images = np.concatenate([images, _moved(unlabelled[others], rng)])
+        features = network[:-1](_as_heat_input(torch.from_numpy(images)))
+        heat = network[-1](features)[:, 0]
+        loss = _heat_loss(heat[:BATCH], places)
+        if len(others):
+            loss = loss + _action_loss(heat[BATCH:], guesses(features[BATCH:]), torch.from_numpy(actions[others]))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
     return LearnedLocaliser(observations.shape[1:], folded(network.eval()).requires_grad_(False))
+
+
+def _heat_loss(heat: Tensor, places: NDArray[np.float64]) -> Tensor:
+    """Cross entropy of heat-maps (B, rows, columns) as distributions over cells; agents out of sight do not count."""
+    cells = np.floor((places + 0.5) / CELL).astype(np.int64)
+    seen = ((cells >= 0) & (cells < heat.shape[1:])).all(1)
+    cell = torch.from_numpy((cells[:, 0] * heat.shape[2] + cells[:, 1])[seen])
+    return functional.cross_entropy(heat.flatten(start_dim=1)[torch.from_numpy(seen)], cell)
+
+
+def _action_loss(heat: Tensor, guesses: Tensor, actions: Tensor) -> Tensor:
+    """-log of the probability of both actions (B, 2), cells guessing them (B, 2 * n_actions, rows, columns)."""
+    count = len(heat)
+    shares = heat.flatten(start_dim=1).log_softmax(dim=1)
+    each = guesses.view(count, 2, -1, shares.shape[1]).log_softmax(dim=2)
+    both = each[torch.arange(count)[:, None], torch.arange(2), actions].sum(dim=1)
+    return -torch.logsumexp(shares + both, dim=1).mean()
 
 
 def _heat_network(channels: int) -> nn.Sequential:
@@ -150,10 +185,10 @@ def _heat_network(channels: int) -> nn.Sequential:
         nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1),
         nn.BatchNorm2d(32),
         nn.ReLU(),
-        nn.Conv2d(32, 32, kernel_size=3, padding=1),
-        nn.BatchNorm2d(32),
+        nn.Conv2d(32, FEATURES, kernel_size=3, padding=1),
+        nn.BatchNorm2d(FEATURES),
         nn.ReLU(),
-        nn.Conv2d(32, 1, kernel_size=1),
+        nn.Conv2d(FEATURES, 1, kernel_size=1),
     )
 
 
@@ -185,9 +220,7 @@ def _changed(
         if rng.random() < 0.5:
             image[:] = image[:, ::-1].copy()
             place[1] = width - 1 - place[1]
-        shift = rng.integers(-FARTHEST_SHIFT, FARTHEST_SHIFT, size=2, endpoint=True)
-        image[:] = _shifted(image, *shift.tolist())
-        place += shift
+        place += _shift(image, rng)
         free = np.ones((height, width, 1), dtype=np.bool_)
         before, after = rng.integers(NEAREST, FARTHEST, size=(2, 2), endpoint=True)
         free[_box(place - before, place + after)] = False
@@ -198,19 +231,33 @@ def _changed(
                 image[box] = np.where(free[box], _pattern(height, width, rng)[box], image[box])
         for _ in range(rng.integers(BLOBS, endpoint=True)):
             _add_blob(image, free, rng)
-        if rng.random() < GREY_SHARE:
-            image[:] = 255.0 * grey_maps(1, rng)[0][image.astype(np.uint8)]
+        _change_shades(image, rng)
     return images, places
 
 
-def _shifted(image: NDArray[np.float32], down: int, right: int) -> NDArray[np.float32]:
-    """An image (H, W, C) moved over black."""
-    moved = np.zeros_like(image)
+def _moved(observations: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
+    """States float32 (B, H, W, C) in 0..255, shifted and some of their shades changed."""
+    images = observations.astype(np.float32)
+    for image in images:
+        _shift(image, rng)
+        _change_shades(image, rng)
+    return images
+
+
+def _change_shades(image: NDArray[np.float32], rng: np.random.Generator) -> None:
+    if rng.random() < GREY_SHARE:
+        image[:] = 255.0 * grey_maps(1, rng)[0][image.astype(np.uint8)]
+
+
+def _shift(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.int64]:
+    """Move an image (H, W, C) over black; by how much down and to the right (2,)."""
+    shift = rng.integers(-FARTHEST_SHIFT, FARTHEST_SHIFT, size=2, endpoint=True)
+    down, right = shift.tolist()
     height, width = image.shape[:2]
-    moved[max(down, 0) : height + down, max(right, 0) : width + right] = image[
-        max(-down, 0) : height - down, max(-right, 0) : width - right
-    ]
-    return moved
+    moved = image[max(-down, 0) : height - down, max(-right, 0) : width - right].copy()
+    image[:] = 0.0
+    image[max(down, 0) : height + down, max(right, 0) : width + right] = moved
+    return shift
 
 
 def _box(first: NDArray[np.floating | np.integer], last: NDArray[np.floating | np.integer]) -> tuple[slice, slice]:

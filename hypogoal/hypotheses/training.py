@@ -25,7 +25,7 @@ from hypogoal.hypotheses.localisers import (
     montezuma_only,
     pixels_of,
 )
-from hypogoal.hypotheses.views import POSITION, AgentView, FullView, needed, positions_of
+from hypogoal.hypotheses.views import ACTIONS, POSITION, AgentView, FullView, needed, positions_of
 
 __all__ = ["EnsembleConfig", "fit", "total_steps"]
 
@@ -65,7 +65,8 @@ def fit(
             training) and ``diversity`` (the inner sums of Eq. (1), before their weight).
         origins: int64 (N,) by name, where each labelled state comes from: ``ladder`` for batch_kind=per-ladder;
             ``room``, ``x``, ``y`` (and ``dying``) for view=agent-crop.
-        unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram.
+        unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram,
+            ``action``, ``previous_action`` for localiser=learned.
         device: where to train; the ensemble stays there.
 
     Returns:
@@ -128,21 +129,33 @@ def _view(
         return FullView(observations.shape[1:])
     montezuma_only(observations.shape[1:], "view=agent-crop")
     needed(origins, POSITION, "view=agent-crop")
+    if len(unlabelled):
+        needed(unlabelled_origins, POSITION if config.localiser == "ram" else ACTIONS, f"localiser={config.localiser}")
     if config.localiser == "ram":
-        if len(unlabelled):
-            needed(unlabelled_origins, POSITION, "localiser=ram")
         localiser: Localiser = RamLocaliser(observations.shape[1:])
     else:
-        localiser = _learned(observations, origins or {}, seed)
+        localiser = _learned(observations, unlabelled, seed, origins or {}, unlabelled_origins or {})
     return AgentView(observations.shape[1:], config.crop_height, config.crop_width, localiser)
 
 
-def _learned(observations: NDArray[np.uint8], origins: Origins, seed: int) -> LearnedLocaliser:
-    """A localiser learned from the labelled states in which the agent lives: dying it is nowhere, or elsewhere."""
+def _learned(
+    observations: NDArray[np.uint8],
+    unlabelled: NDArray[np.uint8],
+    seed: int,
+    origins: Origins,
+    unlabelled_origins: Origins,
+) -> LearnedLocaliser:
+    """A localiser from the labelled states in which the agent lives (dying it is elsewhere) and from unlabelled ones.
+
+    Of unlabelled states it sees the agent's actions, which the agent knows, and not its positions.
+    """
     positions = positions_of(origins)
     assert positions is not None
     alive = np.flatnonzero(origins.get("dying", np.zeros(len(positions))) == 0)
-    return fit_localiser(observations[alive], pixels_of(positions[alive]), seed)
+    none = np.zeros(0, dtype=np.int64)
+    actions = np.stack([unlabelled_origins.get(name, none) for name in ACTIONS], axis=1)
+    known = np.flatnonzero((actions >= 0).all(axis=1))
+    return fit_localiser(observations[alive], pixels_of(positions[alive]), unlabelled[known], actions[known], seed)
 
 
 def _ladders(config: EnsembleConfig, origins: Origins | None) -> NDArray[np.int64] | None:

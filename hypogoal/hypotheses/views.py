@@ -11,7 +11,7 @@ from torch import nn
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.localisers import Localiser
 
-POSITION = ("room", "x", "y")
+POSITION, ACTIONS = ("room", "x", "y"), ("action", "previous_action")  # names of origins
 CHUNK = 1024  # states at once: so many crops are gathered from whole images at a time
 
 

@@ -16,6 +16,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import (
     LearnedLocaliser,
     RamLocaliser,
+    _action_loss,
     _changed,
     fit_localiser,
     pixels_of,
@@ -104,43 +105,61 @@ def test_stacked_members_of_several_views(localisers: str) -> None:
     assert np.ptp(expected) > 1e-3
 
 
-def square_states(count: int, seed: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """48x48: an agent of two shades moves about; others of the same size, of one shade each, move or stand; a wall."""
+def square_states(count: int, seed: int) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.int64]]:
+    """48x48: an agent of two shades, which moves down, up or stays as its action says; others of one shade each move
+    anyhow; a wall. States, places, and the last two actions.
+    """
     rng = np.random.default_rng(seed)
     states = np.zeros((count, 48, 48, 4), dtype=np.uint8)
     states[:, 40:] = rng.integers(20, 120, size=(count, 1, 1, 1))
+    actions = rng.integers(3, size=(count, 2))
     places = np.empty((count, 2))
-    for state, place in zip(states, places, strict=True):
+    for state, place, action in zip(states, places, actions, strict=True):
         for thing in range(4):
             at, speed = rng.integers(6, 36, size=2), rng.integers(-2, 3, size=2)
             for frame in range(4):
-                top, left = at + speed * (frame - 3)
-                top, left = max(top, 0), max(left, 0)
+                down, right = speed * (frame - 3)
+                if thing == 3:
+                    down, right = -2 * (action - 1)[: max(3 - frame, 0)].sum(), 0
+                top, left = max(at[0] + down, 0), max(at[1] + right, 0)
                 state[top : top + 6, left : left + 4, frame] = 90 + 50 * thing if thing < 3 else 120
                 if thing == 3:
                     state[top + 2 : top + 4, left : left + 4, frame] = 250
             place[:] = at + np.array([2.5, 1.5])
-    return states, places
+    return states, places, actions
 
 
 def test_a_localiser_learns_a_toy() -> None:
     """Beyond the paper: the agent among things that move as it does, in states never seen; the same bytes again."""
-    states, places = square_states(200, seed=0)
-    others, wanted = square_states(100, seed=1)
-    first = fit_localiser(states, places, seed=3, steps=120)
-    away = np.abs(first.locate(others) - wanted).max(axis=1)
-    untrained = np.abs(fit_localiser(states, places, seed=3, steps=1).locate(others) - wanted).max(axis=1)
-    assert (away <= 4).mean() > 0.9
-    assert (untrained <= 4).mean() < 0.3
-    assert not first.needs_positions
-    again = fit_localiser(states, places, seed=3, steps=3).state_dict()
-    second = fit_localiser(states, places, seed=3, steps=3).state_dict()
-    assert all(torch.equal(value, again[name]) for name, value in second.items())
+    states, places, _ = square_states(200, seed=0)
+    unlabelled, _, actions = square_states(100, seed=1)
+    others, wanted, _ = square_states(100, seed=2)
+    localiser = fit_localiser(states, places, unlabelled, actions, seed=3, steps=100)
+    untrained = fit_localiser(states, places, unlabelled, actions, seed=3, steps=1)
+    assert (np.abs(localiser.locate(others) - wanted).max(axis=1) <= 4).mean() > 0.9
+    assert (np.abs(untrained.locate(others) - wanted).max(axis=1) <= 4).mean() < 0.3
+    again = fit_localiser(states, places, unlabelled, actions, seed=3, steps=1).state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in untrained.state_dict().items())
+
+
+def test_actions_alone_tell_where_the_agent_is() -> None:
+    """Beyond the paper: a heat-map on the agent makes its actions likelier than one on anything else."""
+    _, places, actions = square_states(50, seed=0)
+    cells = np.floor((places + 0.5) / 4).astype(int)
+    guesses, heat = torch.zeros(50, 6, 12, 12), torch.zeros(50, 12, 12)
+    for state, (row, column) in enumerate(cells):
+        for which in range(2):
+            guesses[state, 3 * which + actions[state, which], row, column] = 5.0
+        heat[state, row, column] = 20.0
+    right = _action_loss(heat, guesses, torch.from_numpy(actions))
+    wrong = _action_loss(heat.roll(3, dims=1), guesses, torch.from_numpy(actions))
+    assert right.item() == pytest.approx(-2 * np.log(np.exp(5) / (np.exp(5) + 2)), rel=1e-3)
+    assert wrong.item() == pytest.approx(2 * np.log(3), rel=1e-3)
 
 
 def test_what_is_made_up_leaves_the_agent_alone() -> None:
     """Of changed states the agent's pixels are as they were, mirrored perhaps, where the changed place says."""
-    states, places = square_states(40, seed=0)
+    states, places, _ = square_states(40, seed=0)
     changed, moved = _changed(states, places, np.random.default_rng(0))
     inside = ((moved > 4) & (moved < 43)).all(axis=1)
     assert inside.sum() > 5
