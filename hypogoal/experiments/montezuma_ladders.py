@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import as_dict, from_values, parse_assignments, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma_ladders import ladder_named
 from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
+from hypogoal.hypotheses.config import EnsembleConfig
 
 DOMAIN = "montezuma"
 STAGES = ("collect", "train-ensemble", "train-options")
 
 # What things cost on one core of the machine of docs/performance.md: seconds per collection, per gradient step of a
-# member, per environment step of an option, per member that is evaluated.
+# member, per localiser learned, per environment step of an option, per member that is evaluated.
 PER_COLLECTION = 30.0
-PER_MEMBER_STEP = 0.11
+PER_MEMBER_STEP = {"montezuma": 0.11, "montezuma-crop": 0.01}
+PER_LOCALISER = 90.0
 PER_STEP = {"light": 2.5e-3, "paper": 4.0}
 PER_EVALUATED_MEMBER = 4.0
 
@@ -40,6 +43,11 @@ class RunConfig:
         "ensembles: D-BAT, the same without diversity, a single CNN",
         source="Spec F1",
         choices=METHODS,
+    )
+    variants: tuple[str, ...] = setting(
+        (),
+        "changes to compare: settings of train-ensemble as key=value, several with spaces between; each gives one more "
+        "ensemble per method",
     )
     ladders: tuple[str, ...] = setting((), "ladders to learn options on; empty for none", source="Spec D4")
     option_groups: tuple[int, ...] = setting(
@@ -67,6 +75,19 @@ def _check(config: RunConfig) -> None:
             raise UserError(f"no ensembles of {missing} to learn options for", name, f"Add it to {whole}.")
 
 
+def _changed(ensemble: EnsembleConfig, variant: str) -> EnsembleConfig:
+    """The settings of a variant."""
+    values = {**as_dict(ensemble), **parse_assignments(variant.split())}
+    return from_values(type(ensemble), values, "train-ensemble")
+
+
+def _training(ensemble: EnsembleConfig, members: int) -> float:
+    """Seconds that an ensemble takes."""
+    learned = ensemble.view == "agent-crop" and ensemble.localiser == "learned"
+    per_step = PER_MEMBER_STEP.get(ensemble.network, max(PER_MEMBER_STEP.values()))
+    return per_step * ensemble.steps * members + PER_LOCALISER * learned
+
+
 def cells(
     out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
 ) -> list[Cell]:
@@ -80,6 +101,7 @@ def cells(
     made: list[Path] = []
 
     ensemble, play = resolved["train-ensemble"], resolved["train-options"]
+    variants = {variant: _changed(ensemble, variant) for variant in ("", *config.variants)}
     members = {method: 1 if method == "cnn" else ensemble.members for method in METHODS}
     option = play.steps * PER_STEP[play.network]
     evaluated = 0
@@ -90,12 +112,13 @@ def cells(
 
     for groups in config.groups:
         data = add(f"data/groups-{groups}.h5", ("collect", DOMAIN, "--set", f"groups={groups}"), PER_COLLECTION)
-        for method in config.methods:
-            for seed in config.seeds:
-                place = f"ensemble/{method}/groups-{groups}-seed-{seed}"
-                arguments = ("train-ensemble", str(data), *METHODS[method], "--seed", str(seed))
-                evaluated += members[method]
-                made.append(add(place, arguments, PER_MEMBER_STEP * ensemble.steps * members[method], (data,)))
+        for method, variant, seed in product(config.methods, ("", *config.variants), config.seeds):
+            folders = ("ensemble", method, variant.replace(" ", ","), f"groups-{groups}-seed-{seed}")
+            place = "/".join(filter(None, folders))
+            changes = (part for change in variant.split() for part in ("--set", change))
+            arguments = ("train-ensemble", str(data), *METHODS[method], *changes, "--seed", str(seed))
+            evaluated += members[method]
+            made.append(add(place, arguments, _training(variants[variant], members[method]), (data,)))
     for ladder in config.ladders:
         for seed in config.seeds:
             for groups in config.option_groups:

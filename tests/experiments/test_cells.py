@@ -45,12 +45,24 @@ def test_the_ladders_experiment_has_every_method_group_and_control() -> None:
     assert len(options) == 2 * 3 * 2
 
 
+def test_each_variant_gives_one_more_ensemble_per_method_and_seed() -> None:
+    """Spec F1: the settings that are compared stand in the commands, and what has none of them stays."""
+    changes = ["groups=1", "seeds=0,1", "methods=dbat,none", "variants=localiser=ram,view=full network=montezuma"]
+    cells = plan("montezuma-ladders", OUT, assignments=changes).cells
+    trained = [cell for cell in cells if cell.arguments[0] == "train-ensemble"]
+    assert len(trained) == 3 * 2 * 2
+    assert sum("localiser=ram" in cell.arguments for cell in trained) == 4
+    full = [cell for cell in trained if "view=full" in cell.arguments]
+    assert len(full) == 4 and all("network=montezuma" in cell.arguments for cell in full)
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         (["option_groups=3", "groups=1,2", "ladders=1L"], "option_groups"),
         (["option_methods=none", "methods=dbat", "ladders=1L"], "option_methods"),
         (["ladders=1X"], "unknown ladder"),
+        (["variants=thresold=0.5"], "has no setting"),
         (["train-meta.steps=3"], "no such stage"),
     ],
 )
