@@ -115,8 +115,8 @@ def cells(
         for method, variant, seed in product(config.methods, ("", *config.variants), config.seeds):
             folders = ("ensemble", method, variant.replace(" ", ","), f"groups-{groups}-seed-{seed}")
             place = "/".join(filter(None, folders))
-            changes = (part for change in variant.split() for part in ("--set", change))
-            arguments = ("train-ensemble", str(data), *METHODS[method], *changes, "--seed", str(seed))
+            settings = (part for change in variant.split() for part in ("--set", change))
+            arguments = ("train-ensemble", str(data), *METHODS[method], *settings, "--seed", str(seed))
             evaluated += members[method]
             made.append(add(place, arguments, _training(variants[variant], members[method]), (data,)))
     for ladder in config.ladders:
