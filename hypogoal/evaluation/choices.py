@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.evaluation.selection import most_and_least, preference, rank_correlations, shares
 
 LATE = 0.25  # the last part of training that is looked at by itself
+PARTS = 20  # of training, in which choices are counted apart
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,28 @@ class Choices:
     def total(self, name: str, options: int) -> NDArray[np.float64]:
         """The sum of column ``name`` over all windows, (O,)."""
         return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
+
+
+def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[str, NDArray[np.float64]]:
+    """Spec E5, F6: choices counted in equal parts of training, in the order of time.
+
+    Args:
+        choices: windows, each counted in the part in which it ends.
+        options: O.
+        parts: at most; as many as there are windows where those are fewer.
+
+    Returns:
+        ``step``, where each part ends (P,), and ``chosen`` and ``expected``, (P, O) each.
+    """
+    windows = np.unique(choices.step)
+    parts = min(parts, len(windows))
+    ends = np.array([part[-1] for part in np.array_split(windows, parts)]) if parts else np.zeros(0)
+    part = np.searchsorted(ends, choices.step)
+    found = {"step": ends.astype(np.float64)}
+    for name in ("chosen", "expected"):
+        counts = np.bincount(part * options + choices.option, getattr(choices, name), minlength=parts * options)
+        found[name] = counts.reshape(parts, options).astype(np.float64)
+    return found
 
 
 def selection_of_run(

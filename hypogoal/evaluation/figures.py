@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
-import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -203,32 +202,4 @@ def to_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     with styled():
         figure.savefig(buffer, format="png", dpi=160, facecolor="white", metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) -> bytes:
-    """Figures 2 and 9: signed attributions as a PNG of their own size.
-
-    Orange where positive, blue where negative (a pair that all readers tell apart), white where none; full colour at
-    the 99.5th percentile of the absolute values. The state shows through as a light shade.
-
-    Args:
-        values: float (H, W).
-        grey: the state's brightness, float (H, W) in 0..1.
-    """
-    size = float(np.quantile(np.abs(values), 0.995)) or 1.0
-    strength = np.clip(np.abs(values) / size, 0, 1)[..., None]
-    ends = np.array([matplotlib.colors.to_rgb(colour) for colour in (BLUE, VERMILLION)])
-    paper = np.repeat(1 - 0.28 * grey[..., None], 3, axis=-1)
-    image = (1 - strength) * paper + strength * ends[(values > 0).astype(np.int64)]
-    return image_png((255 * image).round().astype(np.uint8))
-
-
-def image_png(image: NDArray[np.uint8]) -> bytes:
-    """An observation uint8 (H, W, 3) or (H, W) as a PNG of its own size."""
-    from matplotlib.image import imsave
-
-    buffer = io.BytesIO()
-    options = {"cmap": "gray", "vmin": 0, "vmax": 255} if image.ndim == 2 else {}
-    imsave(buffer, image, format="png", metadata={"Software": ""}, **options)  # type: ignore[arg-type]
     return buffer.getvalue()

@@ -86,6 +86,8 @@ QUANTITIES: dict[str, dict[str, str]] = {
         "unit": "log-odds",
         "meaning": "|attributed - (log_odds - baseline_log_odds)|; 0 but for rounding if attributions are complete",
     },
+    "shown": {"unit": "states", "meaning": "held-out states of a sub-goal that the page lets one browse"},
+    "explained": {"unit": "states", "meaning": "those of them whose attributions are kept"},
     "last_frame": {"unit": "fraction", "meaning": "share of all attribution, absolute, that is in the last channel"},
     "match": {
         "unit": "fraction",

@@ -30,7 +30,8 @@ from hypogoal.evaluation.agents import (
     missing_agents,
 )
 from hypogoal.evaluation.arrays import write_curves
-from hypogoal.evaluation.choices import selection_of_run
+from hypogoal.evaluation.browsing import browse_states
+from hypogoal.evaluation.choices import over_training, selection_of_run
 from hypogoal.evaluation.curves import GAMMA, SOLVED, WINDOW
 from hypogoal.evaluation.distance import INSIDE, LAST, NEAR, ORACLE, distance_tables, ladder_numbers
 from hypogoal.evaluation.ensembles import ensemble_name, ensemble_names, hypotheses_table, sub_goal_metrics
@@ -115,7 +116,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             if runs:
                 write_curves(arrays, groups)
             selection = evaluate_selection(found, groups, arrays, progress)
-            ensembles, saliency = evaluate_ensembles(found, arrays, progress)
+            ensembles, saliency, explorer = evaluate_ensembles(found, arrays, progress)
             distance = evaluate_distance(found, ensembles, arrays, progress)
         rooms = rooms_table(ensembles)
         metrics = {
@@ -129,6 +130,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             "rooms": rooms,
             "distance": distance,
             "saliency": saliency,
+            "explorer": explorer,
             "selection": selection,
             "provenance": provenance(found, data),
             "quantities": QUANTITIES,
@@ -165,16 +167,18 @@ def find(run: Path) -> Found:
 
 def evaluate_ensembles(
     found: Found, arrays: Any, progress: Progress
-) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+) -> tuple[list[dict[str, Any]], dict[str, Any] | None, dict[str, Any] | None]:
     """Spec F1, F2: every ensemble of the run on its data's held-out and unlabelled states.
 
-    Of one ensemble, the first of those with the most members, example states and attributions are kept too.
+    Of one ensemble, the first of those with the most members, example states and attributions are kept too; of one,
+    the one with the most members whose options were learned most often, states to browse.
     """
     artefacts = found.ensembles
     configs = [artefact.config for artefact in artefacts]
     rows: list[list[dict[str, Any]]] = [[] for _ in artefacts]
     shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
-    explained = []
+    browsed = _most_used(found)
+    explained, browsable = [], []
     sources = [artefact.input("data") for artefact in artefacts]
     for path in sorted(set(sources)):
         dataset = open_dataset(path)
@@ -194,12 +198,28 @@ def evaluate_ensembles(
                 rows[index].append(row)
                 if index == shown:
                     explained.append(show_states(ensemble, sub_goal, split, judged, unlabelled, arrays))
+                if index == browsed:
+                    count = len(configs[index]["sub_goals"])
+                    browsable.append(browse_states(ensemble, sub_goal, split, judged, unlabelled, kinds, count, arrays))
                 progress.advance(len(rows[index]) == len(configs[index]["sub_goals"]))
     metrics = _named(found, rows)
-    if shown is None:
-        return metrics, None
+    if shown is None or browsed is None:
+        return metrics, None, None
     about = {"ensemble": metrics[shown]["path"], "seed": metrics[shown]["seed"], "baseline": BASELINE}
-    return metrics, {**about, "sub_goals": explained}
+    other = {"ensemble": metrics[browsed]["path"], "seed": metrics[browsed]["seed"], "baseline": BASELINE}
+    return metrics, {**about, "sub_goals": explained}, {**other, "sub_goals": browsable}
+
+
+def _most_used(found: Found) -> int | None:
+    """Which of the ensembles with the most members the most artefacts were learned from; the first of several."""
+    users = [artefact.input("ensemble").resolve() for artefact in (*found.agents, *found.ladders) if takes(artefact)]
+    rank = [(artefact.config["members"], users.count(artefact.path.resolve())) for artefact in found.ensembles]
+    return max(range(len(rank)), key=lambda index: rank[index], default=None)
+
+
+def takes(artefact: Artefact) -> bool:
+    """Whether it was learned with the verdicts of an ensemble's members."""
+    return artefact.kind != "baseline" and artefact.config["termination"] == "learned"
 
 
 def judge(
@@ -240,6 +260,9 @@ def evaluate_distance(
     for artefact, about in zip(found.ladders, abouts, strict=True):
         config, path = artefact.config, found.name(artefact)
         own = executions[path] = read_executions(artefact.path / "executions.csv")
+        if "terminations.h5" in artefact.manifest["files"]:
+            for option, states in read_terminations(artefact.path / "terminations.h5").items():
+                arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
         validated = about.pop("validated")
         found_rows = ladder_numbers(
             own, config["sub_goals"], config["members"], validated, masked=config["mask_reached"]
@@ -261,18 +284,26 @@ def _ladders_named(found: Found, ensembles: list[dict[str, Any]]) -> list[dict[s
     methods: list[str] = []
     groups: list[int | None] = []
     validated: list[dict[str, int | None]] = []
+    sources: list[str | None] = []
     for artefact in found.ladders:
         source = open_artefact(artefact.input("ensemble"), "ensemble")
         known = by_path.get(source.path.resolve(), {})
-        oracle = artefact.config["termination"] == "oracle"
+        oracle = not takes(artefact)
+        sources.append(None if oracle else within(found, source))
         methods.append(ORACLE if oracle else known.get("method", ensemble_name(source.config)))
         groups.append(None if oracle else groups_of(source.config))
         validated.append({} if oracle else validated_members(known))
     names = ladder_names(methods, groups, [artefact.config for artefact in found.ladders])
     return [
-        {"method": name, "groups": own, "validated": member}
-        for name, own, member in zip(names, groups, validated, strict=True)
+        {"method": name, "groups": own, "ensemble": path, "validated": member}
+        for name, own, path, member in zip(names, groups, sources, validated, strict=True)
     ]
+
+
+def within(found: Found, source: Artefact) -> str | None:
+    """An ensemble's path within the run; None where it is not one of the run's."""
+    same = (own for own in found.ensembles if own.path.resolve() == source.path.resolve())
+    return next((found.name(own) for own in same), None)
 
 
 def validated_members(ensemble: Mapping[str, Any]) -> dict[str, int | None]:
@@ -323,7 +354,10 @@ def evaluate_selection(
                 place = f"terminations/{run.path}/{option}"
                 arrays[place] = overlay(states)
                 arrays[place].attrs["states"] = len(states)
+            for column, counts in over_training(choices, len(run.config["sub_goals"]) * run.config["members"]).items():
+                arrays[f"choices/{run.path}/{column}"] = counts
             about = {"path": run.path, "seed": run.seed, "layout_seed": run.layout["layout_seed"]}
+            about["ensemble"] = within(found, source)
             rows.append({**about, **row})
         if rows:
             metrics.append({"name": name, "runs": rows, "rank_correlation": _over_runs(name, rows)})

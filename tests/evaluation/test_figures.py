@@ -8,12 +8,12 @@ from hypogoal.evaluation.figures import (
     VERMILLION,
     Line,
     best_mean_worst_members,
-    image_png,
     learning_curves,
     preference_against_match,
     to_png,
     to_svg,
 )
+from hypogoal.evaluation.pictures import image_png
 
 GRID = np.arange(0, 1_001, 100)
 

@@ -142,6 +142,18 @@ def test_attributions_are_of_an_ensemble_that_can_disagree(run, metrics):
         assert all(re.fullmatch(r"room (2|6|9|20) \(unseen\)", place) for place in places)
 
 
+def test_states_to_browse_say_room_and_kind(metrics, page):
+    """Spec F2, F7: of the ensemble that options were learned with; members lead to those options, by ladder."""
+    assert metrics["explorer"]["ensemble"] == "ensemble/dbat/groups-2-seed-0"
+    (goal,) = json.loads(re.search(r'id="explorer-data">(.*?)</script>', page, re.S)[1])["goals"]
+    assert {state["kind"] for state in goal["states"]} == {"base", "near-base", "on-ladder", "elsewhere"}
+    assert {state["place"] for state in goal["states"]} >= {"room 9 (unseen)", "room 1 (labelled data from it)"}
+    names = [option["name"] for option in goal["members"][1]["options"]]
+    assert names == ["ladder 1L, seed 0", "ladder 2-6, seed 0"]
+    assert ["distance from a true base", "20.0"] in goal["members"][1]["options"][0]["facts"]
+    assert '<option value="near-base">' in page
+
+
 def test_every_number_is_explained(metrics):
     """Spec A5: what metrics.json calls a number is in its own glossary; strict JSON as written."""
     known = set(metrics["quantities"])
@@ -178,7 +190,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
         "Summary", "Hypotheses against labelled ladders", "Options on ladders", "Where options stop on the ladders",
-        "Example states", "What members look at", "Data, settings, provenance",
+        "Explore the hypotheses", "Example states", "What members look at", "Data, settings, provenance",
     ]  # fmt: skip
     assert page.count("<figure") == 5
     assert "about 70 % for the best member at N=1" in page

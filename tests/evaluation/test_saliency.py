@@ -8,7 +8,7 @@ from torch import nn
 
 from hypogoal.dataset import Split
 from hypogoal.evaluation.examples import pick_to_explain
-from hypogoal.evaluation.figures import attribution_png
+from hypogoal.evaluation.pictures import attribution_png
 from hypogoal.evaluation.saliency import Attributions, attributable, deep_lift, explanation, mean_state
 from hypogoal.evaluation.shown import Unlabelled, show_states
 from hypogoal.hypotheses.ensemble import Ensemble

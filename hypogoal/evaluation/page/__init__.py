@@ -9,6 +9,7 @@ from hypogoal.evaluation.page.agents import curves_section, summary_section
 from hypogoal.evaluation.page.blocks import Block, Material, listed
 from hypogoal.evaluation.page.choices import choices_section, terminations_section
 from hypogoal.evaluation.page.distance import distance_section, stops_section
+from hypogoal.evaluation.page.explorer import explorer_section
 from hypogoal.evaluation.page.hypotheses import examples_section, hypotheses_section
 from hypogoal.evaluation.page.ladders import ladders_section
 from hypogoal.evaluation.page.provenance import provenance_section
@@ -19,7 +20,7 @@ __all__ = ["Material", "render"]
 
 AGENTS = (summary_section, curves_section)
 LADDERS = (ladders_section, rooms_section, distance_section, stops_section)
-STATES = (examples_section, saliency_section)
+STATES = (explorer_section, examples_section, saliency_section)
 CHOICES = (terminations_section, choices_section)
 
 

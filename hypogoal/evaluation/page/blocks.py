@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.figures import COLOURS, image_png, to_svg
+from hypogoal.evaluation.figures import COLOURS, to_svg
+from hypogoal.evaluation.pictures import image_png
 
 Block = dict[str, Any]
 

@@ -6,11 +6,8 @@ import base64
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hypogoal.evaluation.figures import attribution_png
 from hypogoal.evaluation.page.blocks import Block, Material, picture, section, texts
+from hypogoal.evaluation.pictures import attribution_png, brightness, flat
 
 KINDS = {
     "true positive": "a true positive",
@@ -79,21 +76,12 @@ def _cards(material: Material, sub_goal: str, index: int, state: Mapping[str, An
         values = flat(arrays["attributions"][index, number])
         cards.append(
             {
-                "png": base64.b64encode(attribution_png(values, grey(arrays["seen"][index]))).decode("ascii"),
+                "png": base64.b64encode(attribution_png(values, brightness(arrays["seen"][index]) / 255)).decode(
+                    "ascii"
+                ),
                 "alt": f"Attributions of member {number}, which says {said}.",
                 "title": f"member {number}",
                 "lines": lines,
             }
         )
     return {"kind": "cards", "heading": name, "cards": cards, "small": True}
-
-
-def flat(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Attributions (H, W, C) to be drawn, (H, W): of colours their sum, of a stack of frames the last."""
-    return values.sum(-1) if values.shape[-1] == 3 else values[..., -1]
-
-
-def grey(observation: NDArray[np.uint8]) -> NDArray[np.floating]:
-    """An observation (H, W, C) as brightness in 0..1, (H, W)."""
-    shown = observation.mean(-1) if observation.shape[-1] == 3 else observation[..., -1]
-    return shown / 255

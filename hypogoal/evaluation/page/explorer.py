@@ -1,0 +1,173 @@
+"""The section in which held-out states are browsed: what each member says, goes by and leads to (Spec F2, F6, F7).
+
+The page holds the states as data; ``templates/explorer.js`` shows those that its filters let through.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from hypogoal.evaluation.agents import LEARNED
+from hypogoal.evaluation.page.blocks import Block, Material, first_named, fixed, picture, section, texts
+from hypogoal.evaluation.pictures import FULL, attribution_png
+from hypogoal.evaluation.summary import percent
+
+TITLE = "Explore the hypotheses"
+
+
+def explorer_section(material: Material) -> Block:
+    """A browser of held-out states, with filters."""
+    found = material.metrics.get("explorer")
+    if found is None:
+        old = "explorer" not in material.metrics and material.metrics["ensembles"]
+        needed = "a new evaluation: evaluate --force" if old else "an ensemble artefact: train-ensemble"
+        missing = [f"States to browse: they need {needed}."]
+        return section("explorer", TITLE, [], [], missing)
+    source = next(one for one in material.metrics["ensembles"] if one["path"] == found["ensemble"])
+    shown, states = (sum(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
+    text = (
+        f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them: {shown:,} "
+        f"of {states:,}, drawn so that every kind of outcome and every place comes up; how often one does says "
+        "nothing. Choose a state to see each member's verdict and what it goes by (orange speaks for 'reached', blue "
+        "against it), and a member to see the options it became. The address of the page holds the filters: it can "
+        "be shared."
+    )
+    goals = [_goal(material, source, goal["sub_goal"]) for goal in found["sub_goals"]]
+    places = list(dict.fromkeys(state["place"] for goal in goals for state in goal["states"] if state["place"]))
+    kinds = list(dict.fromkeys(state["kind"] for goal in goals for state in goal["states"] if state["kind"]))
+    errors = [("", "any"), ("none", "all right"), ("some", "some wrong"), ("all", "all wrong")]
+    choices = {
+        "goal": [(goal["name"], goal["name"]) for goal in goals],
+        "errors": [*errors, *((str(member), f"member {member} wrong") for member in range(source["members"]))],
+        "place": _any(sorted(places, key=_natural)),
+        "kind": _any(sorted(kinds)),
+    }
+    script = resources.files("hypogoal.evaluation").joinpath("templates/explorer.js").read_text(encoding="utf-8")
+    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "script": script}
+    return section("explorer", TITLE, [text], [block])
+
+
+def _any(values: Sequence[str]) -> list[tuple[str, str]]:
+    """Choices of a filter, each value's own name; none where there is nothing to choose."""
+    return [("", "any"), *((value, value) for value in values)] if len(values) > 1 else []
+
+
+def _natural(place: str) -> tuple[int, str]:
+    """Layout 9 before layout 10."""
+    digits = "".join(character for character in place.partition("(")[0] if character.isdigit())
+    return int(digits or 0), place
+
+
+def _goal(material: Material, source: Mapping[str, Any], sub_goal: str) -> dict[str, Any]:
+    numbers = next(row for row in source["sub_goals"] if row["sub_goal"] == sub_goal)
+    members = [
+        {"facts": _facts(member), "options": _options(material, source["path"], sub_goal, member["member"])}
+        for member in numbers["members"]
+    ]
+    return {"name": sub_goal, "members": members, "states": _states(material, sub_goal)}
+
+
+def _facts(member: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [
+        ("balanced accuracy, held-out", fixed(member["balanced_accuracy"], 3)),
+        ("precision", fixed(member["precision"], 3)),
+        ("recall", fixed(member["recall"], 3)),
+        ("says yes, unlabelled states", percent(member["says_yes_unlabelled"])),
+    ]
+
+
+def _states(material: Material, sub_goal: str) -> list[dict[str, Any]]:
+    arrays = {
+        key.rpartition("/")[2]: values
+        for key, values in material.arrays.items()
+        if key.startswith(f"explorer/{sub_goal}/")
+    }
+    places, kinds, explained = texts(arrays["places"]), texts(arrays["kinds"]), len(arrays["attributions"])
+    found = []
+    for index in np.argsort(arrays["rows"], kind="stable"):
+        saliency = []
+        if index < explained:
+            grey = arrays["brightness"][index] / 255
+            saliency = [_png(attribution_png(values / FULL, grey)) for values in arrays["attributions"][index]]
+        found.append(
+            {
+                "png": picture(arrays["observations"][index]),
+                "truth": bool(arrays["labels"][index]),
+                "says": arrays["verdicts"][index].astype(bool).tolist(),
+                "p": [round(float(value), 3) for value in arrays["probabilities"][index]],
+                "place": places[index],
+                "kind": kinds[index],
+                "saliency": saliency,
+            }
+        )
+    return found
+
+
+def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> list[dict[str, Any]]:
+    """What a member's options came to: one entry per agent, or per ladder, that was learned with this ensemble."""
+    found = []
+    agent = first_named(material.metrics["selection"], LEARNED)
+    for run in agent["runs"] if agent else ():
+        goal = next((one for one in run["sub_goals"] if one["sub_goal"] == sub_goal), None)
+        if run["ensemble"] == ensemble and goal is not None:
+            found.append(_chosen(material, run, goal, member))
+    for row in material.metrics["distance"]["options"]:
+        if row["ensemble"] == ensemble and row["sub_goal"] == sub_goal:
+            found.append(_stopped(material, row, member))
+    return found
+
+
+def _chosen(material: Material, run: Mapping[str, Any], goal: Mapping[str, Any], member: int) -> dict[str, Any]:
+    own = goal["members"][member]
+    chosen, expected = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
+    notes = [word for word in ("most", "least") if goal[word] == member]
+    return {
+        "name": f"layout {run['layout_seed']}, run seed {run['seed']}",
+        "note": f"{notes[0]} preferred of its sub-goal" if notes else "",
+        "facts": [
+            ("chosen", f"{own['chosen']:,} of {own['offered']:,} offers"),
+            ("preference", f"{fixed(own['preference'], 2)} (1: as by chance)"),
+            ("its classifier ended it", f"{own['reached']:,} times"),
+            ("mean steps", fixed(own["duration"], 1)),
+            ("match on this layout", fixed(own["match"], 2)),
+        ],
+        "over": _over(chosen[:, own["option"]], expected[:, own["option"]]),
+        "png": _overlay(material, run["path"], own["option"]),
+    }
+
+
+def _over(chosen: Any, expected: Any) -> list[float | None]:
+    """Preference in each part of training; None where it was not offered."""
+    return [round(float(c / e), 3) if e > 0 else None for c, e in zip(chosen, expected, strict=True)]
+
+
+def _stopped(material: Material, row: Mapping[str, Any], member: int) -> dict[str, Any]:
+    own = row["options"][member]
+    notes = [word for word in ("best", "validated") if row[word] == member]
+    return {
+        "name": f"ladder {row['ladder']}, seed {row['seed']}",
+        "note": f"{' and '.join(notes)} member here" if notes else "",
+        "facts": [
+            ("distance from a true base", fixed(own["distance"], 1)),
+            ("stopped at one", percent(own["reached_base"])),
+            ("began inside", percent(own["inside_at_start"])),
+            ("timed out", percent(own["timed_out"])),
+            ("mean steps", fixed(own["duration"], 1)),
+        ],
+        "over": [],
+        "png": _overlay(material, row["path"], own["option"]),
+    }
+
+
+def _overlay(material: Material, path: str, option: int) -> str:
+    place = f"terminations/{path}/{option}"
+    return picture(material.arrays[place]) if place in material.arrays else ""
+
+
+def _png(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

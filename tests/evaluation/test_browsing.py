@@ -1,0 +1,79 @@
+"""Spec F2, F6, F7: which states are browsed, and how they and their attributions become small pictures."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from hypogoal.evaluation.browsing import pick_to_browse, take_turns
+from hypogoal.evaluation.choices import Choices, over_training
+from hypogoal.evaluation.pictures import attribution_png, brightness, flat, image_png, to_bytes
+
+
+def test_groups_take_turns():
+    """Spec F7: the first of each group in the order given, then the second of each; by hand."""
+    order = np.array([4, 3, 2, 1, 0])
+    assert take_turns(order, np.array([7, 7, 5, 5, 5])).tolist() == [4, 1, 3, 0, 2]
+
+
+def test_every_outcome_and_place_is_among_the_states_to_browse():
+    """Spec F7: one error in 1,000 states is shown though only 12 are; alike each time; places come up evenly."""
+    labels = np.arange(1000) % 2 == 0
+    verdicts = np.repeat(labels[:, None], 3, axis=1)
+    verdicts[500] = ~verdicts[500]  # all err
+    verdicts[501, 1] = ~verdicts[501, 1]  # members disagree
+    rooms = np.arange(1000) // 250
+    pick = [pick_to_browse(verdicts, labels, [rooms], 12, np.random.default_rng(0)) for _ in range(2)]
+    np.testing.assert_array_equal(*pick)
+    assert len(set(pick[0].tolist())) == 12
+    assert {500, 501} <= set(pick[0].tolist())
+    assert np.bincount(rooms[pick[0]], minlength=4).min() >= 2
+    assert len(pick_to_browse(verdicts[:5], labels[:5], [], 12, np.random.default_rng(0))) == 5
+
+
+def test_choices_over_training_by_hand():
+    """Spec E5, F6: three windows in two parts; each part ends with its last window."""
+    step = np.array([10, 10, 20, 20, 30, 30])
+    ones = np.ones(6, dtype=np.int64)
+    choices = Choices(step, np.array([0, 1] * 3), ones, np.array([1, 2, 3, 4, 5, 6]), 0.5 * ones, ones, ones)
+    found = over_training(choices, 2, parts=2)
+    assert found["step"].tolist() == [20, 30]
+    assert found["chosen"].tolist() == [[4, 6], [5, 6]]
+    assert found["expected"].tolist() == [[1, 1], [0.5, 0.5]]
+    assert over_training(choices, 2)["chosen"].shape == (3, 2)
+    nothing = Choices(*(np.zeros(0, dtype=np.int64) for _ in range(7)))
+    assert over_training(nothing, 2)["chosen"].shape == (0, 2)
+
+
+def test_attributions_as_bytes():
+    """Spec F2: the sign stays, each picture has a scale of its own, and one without attributions stays empty."""
+    values = np.zeros((3, 10, 10))
+    values[0, 0] = [4, -4, 2, 0, 0, 0, 0, 0, 0, 0]
+    values[1] = 100 * values[0]
+    stored = to_bytes(values)
+    assert stored.dtype == np.int8
+    assert stored[0, 0, :4].tolist() == [127, -127, 64, 0]
+    np.testing.assert_array_equal(stored[0], stored[1])
+    assert not stored[2].any()
+
+
+def test_what_is_drawn_of_a_state():
+    """Spec F2: of colours their sum and mean, of stacked frames the last."""
+    colours, frames = np.array([[1.0, 2.0, 3.0]]), np.array([[1.0, 2.0, 3.0, 4.0]])
+    assert flat(colours).tolist() == [6]
+    assert flat(frames).tolist() == [4]
+    assert brightness(np.array([[10, 20, 30]], np.uint8)).tolist() == [20]
+    assert brightness(np.array([[10, 20, 30, 40]], np.uint8)).tolist() == [40]
+
+
+def test_pictures_are_the_same_pixels_and_small():
+    """Spec F7: with few colours a palette, with many none; either way pixel for pixel."""
+    rng = np.random.default_rng(0)
+    few = rng.integers(0, 5, (64, 64, 1), dtype=np.uint8).repeat(3, axis=2) * 50
+    many = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    for image, mode in ((few, "P"), (many, "RGB"), (many[..., 0], "L")):
+        read = Image.open(io.BytesIO(image_png(image)))
+        assert read.mode == mode
+        np.testing.assert_array_equal(np.asarray(read.convert("RGB" if image.ndim == 3 else "L")), image)
+    noise = attribution_png(rng.normal(size=(84, 84)), rng.random((84, 84)))
+    assert Image.open(io.BytesIO(noise)).mode == "P"

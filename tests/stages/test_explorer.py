@@ -1,0 +1,188 @@
+"""Spec F2, F6, F7: the states to browse, what the page says of them, and the page's filters in a real browser."""
+
+import json
+import re
+
+import h5py
+import numpy as np
+import pytest
+from browser import document_of, needs_browser, title_of
+
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
+from hypogoal.evaluation.browsing import MOST_EXPLAINED, MOST_STATES
+from hypogoal.stages.collect import collect
+from hypogoal.stages.evaluate import evaluate
+from hypogoal.stages.report import report
+from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
+from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
+
+QUIET = {"quiet": True}
+MEMBERS = 2
+GOAL = "collect-red-key"
+FEW = {"MOST_STATES": 150, "MOST_EXPLAINED": 10}  # for the test's speed
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Two ensembles alike and an agent that was learned with the second."""
+    run = tmp_path_factory.mktemp("runs") / "browsed"
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=3, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
+    for seed in (0, 1):
+        config = TrainEnsembleConfig(steps=12, members=MEMBERS, workers=1)
+        train_ensemble(run / "data.h5", config, run / f"ensemble/seed-{seed}", seed=seed, **QUIET)
+    short = TrainMetaConfig(steps=2_048, max_episode_steps=64, random_episodes=5, layout_seed=100)
+    train_meta(run / "ensemble/seed-1", short, run / "meta", **QUIET)
+    return run
+
+
+@pytest.fixture(scope="module")
+def metrics(run):
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in FEW.items():
+            patch.setattr(f"hypogoal.evaluation.browsing.{name}", value)
+        return evaluate(run, run / "evaluation", **QUIET)
+
+
+@pytest.fixture(scope="module")
+def page(run, metrics):
+    return report(run)
+
+
+@pytest.fixture(scope="module")
+def data(page):
+    """What the page holds."""
+    found = re.search(r'id="explorer-data">(.*?)</script>', page.read_text(encoding="utf-8"), re.S)
+    return {goal["name"]: goal for goal in json.loads(found[1])["goals"]}
+
+
+def test_the_states_are_those_of_the_ensemble_that_was_used(run, metrics, data):
+    """Spec F2: of two ensembles alike the one that agents were learned with; verdicts and truth as in the data."""
+    assert (metrics["explorer"]["ensemble"], metrics["explorer"]["seed"]) == ("ensemble/seed-1", 1)
+    split = open_dataset(run / "data.h5").heldout(GOAL)
+    about = next(goal for goal in metrics["explorer"]["sub_goals"] if goal["sub_goal"] == GOAL)
+    assert about == {"sub_goal": GOAL, "states": len(split.labels), "shown": 30, "explained": 2}
+    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+        group = arrays[f"explorer/{GOAL}"]
+        rows = group["rows"][()]
+        assert len(set(rows.tolist())) == 30
+        np.testing.assert_array_equal(group["observations"][()], split.observations[rows])
+        np.testing.assert_array_equal(group["labels"][()], split.labels[rows])
+        order = np.argsort(rows)
+        verdicts, seeds = group["verdicts"][()][order], split.origins["layout_seed"][rows[order]]
+        assert group["attributions"].shape == (2, MEMBERS, 64, 64)
+        assert np.abs(group["attributions"][()].astype(int)).max() == 127
+    assert [state["says"] for state in data[GOAL]["states"]] == verdicts.tolist()
+    assert [state["place"] for state in data[GOAL]["states"]] == [f"layout {seed}" for seed in seeds]
+    assert sum(len(state["saliency"]) == MEMBERS for state in data[GOAL]["states"]) == 2
+    assert {state["truth"] for state in data[GOAL]["states"]} == {True, False}
+
+
+def test_members_say_what_they_led_to(run, metrics, data):
+    """Spec F6: how often the agent chose each member, in all and part by part of training."""
+    (run_row,) = metrics["selection"][0]["runs"]
+    assert run_row["ensemble"] == "ensemble/seed-1"
+    for goal in run_row["sub_goals"]:
+        for member in goal["members"]:
+            (option,) = data[goal["sub_goal"]]["members"][member["member"]]["options"]
+            assert option["name"] == "layout 100, run seed 0"
+            assert ["chosen", f"{member['chosen']:,} of {member['offered']:,} offers"] in option["facts"]
+    table = np.genfromtxt(run / "meta" / "choices.csv", delimiter=",", names=True)
+    with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
+        for key in ("chosen", "expected"):
+            counts = arrays[f"choices/meta/{key}"][()]
+            assert counts.shape == (len(arrays["choices/meta/step"]), len(SUB_GOALS) * MEMBERS)
+            assert counts.sum() == pytest.approx(table[key].sum())
+
+
+def test_the_page_stays_small(page):
+    """Spec F7: under 10 MB even if every state took what the dearest takes here, at the numbers that are allowed."""
+    found = re.search(r'id="explorer-data">(.*?)</script>', page.read_text(encoding="utf-8"), re.S)
+    states = [state for goal in json.loads(found[1])["goals"] for state in goal["states"]]
+    picture = max(len(state["png"]) for state in states)
+    attributions = max(len(png) for state in states for png in state["saliency"])
+    assert MOST_STATES * picture + MOST_EXPLAINED * 6 * attributions < 9_000_000
+
+
+def expected(data, **wanted):
+    """How many states of ``GOAL`` pass."""
+    states = data[GOAL]["states"]
+    if "truth" in wanted:
+        states = [one for one in states if one["truth"] == (wanted["truth"] == "yes")]
+    if "members" in wanted:
+        states = [one for one in states if (len(set(one["says"])) > 1) == (wanted["members"] == "disagree")]
+    if "errors" in wanted:
+        wrong = {id(one): [said != one["truth"] for said in one["says"]] for one in states}
+        kinds = {"none": lambda w: not any(w), "some": any, "all": all, "1": lambda w: w[1]}
+        states = [one for one in states if kinds[wanted["errors"]](wrong[id(one)])]
+    if "place" in wanted:
+        states = [one for one in states if one["place"] == wanted["place"]]
+    return len(states)
+
+
+FILTERS = [
+    {},
+    {"truth": "yes"},
+    {"members": "disagree"},
+    {"members": "agree", "truth": "no"},
+    {"errors": "none"},
+    {"errors": "all"},
+    {"errors": "1", "truth": "yes"},
+    {"place": "layout 1001", "errors": "some"},
+]
+
+# Sets each control as a user does, and reports what is shown after each step.
+USE = """
+const $ = (id) => document.getElementById(id);
+const tiles = () => document.querySelectorAll("#explorer-tiles button");
+const choose = (id, value) => { $(id).value = value; $(id).dispatchEvent(new Event("change")); };
+const told = [];
+for (const filters of FILTERS) {
+  $("explorer-reset").click();
+  choose("explorer-goal", GOAL);
+  for (const [name, value] of Object.entries(filters)) choose("explorer-" + name, value);
+  told.push([$("explorer-count").textContent, tiles().length]);
+}
+$("explorer-reset").click();
+tiles()[0].click();
+tiles()[0].dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
+const second = document.activeElement.getAttribute("data-state");
+document.querySelectorAll("#explorer-detail button")[1].click();
+document.title = JSON.stringify({
+  told, second, hash: location.hash,
+  pressed: [...document.querySelectorAll("#explorer-tiles [aria-pressed=true]")].map((b) => b.dataset.state),
+  heading: $("explorer-member").querySelector("h3").textContent,
+  focused: document.activeElement.textContent,
+  unnamed: [...document.querySelectorAll("#explorer button, #explorer select")].filter(
+    (node) => !(node.labels?.[0]?.textContent || node.getAttribute("aria-label") || node.textContent)).length,
+  wide: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+});
+"""
+
+
+@pytest.mark.browser
+@needs_browser
+def test_the_filters_in_a_browser(page, data, tmp_path):
+    """Spec F7: each filter shows just the states it should; states and members can be chosen by click and by key."""
+    script = USE.replace("FILTERS", json.dumps(FILTERS)).replace("GOAL", json.dumps(GOAL))
+    found = json.loads(title_of(document_of(page, "", tmp_path, script)))
+    counts = [expected(data, **filters) for filters in FILTERS]
+    assert found["told"] == [[f"{count} of 30 states", count] for count in counts]
+    assert len(set(counts)) > 3
+    assert found["second"] == "1" and found["pressed"] == ["1"]
+    assert found["hash"] == f"#explorer?goal={GOAL}&state=1&member=1"
+    assert found["heading"] == found["focused"] == f"Member 1 of {GOAL}"
+    assert found["unnamed"] == 0
+    assert found["wide"] <= 0
+
+
+@pytest.mark.browser
+@needs_browser
+def test_the_address_holds_the_filters(page, data, tmp_path):
+    """Spec F7: an address that was shared shows what its sender saw."""
+    count = expected(data, errors="some", truth="no")
+    document = document_of(page, f"explorer?goal={GOAL}&errors=some&truth=no&member=1", tmp_path)
+    assert f">{count} of 30 states<" in document
+    assert document.count('class="tile"') == count
+    assert f"Member 1 of {GOAL}" in document
+    assert 'role="status" aria-live="polite"' in document
