@@ -183,13 +183,42 @@ def evaluate(
 @app.command()
 def report(
     run: Annotated[Path, typer.Argument(help="A run that was evaluated.")],
+    figures: Annotated[
+        Path | None, typer.Option(help="Instead of the page: the paper's figures, with captions, into this folder.")
+    ] = None,
+    format_: Annotated[str, typer.Option("--format", help="Of --figures: svg, pdf or png.")] = "svg",
+    videos: Annotated[
+        int, typer.Option(min=0, help="Also so many episodes of the policy over options, as RUN/report/videos/*.gif.")
+    ] = 0,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Draw RUN/report/index.html: one file, readable offline."""
+    from hypogoal.stages.report import draw_figures
     from hypogoal.stages.report import report as stage
 
-    typer.echo(stage(run, force=force))
+    if figures is None:
+        typer.echo(stage(run, videos=videos, force=force))
+        return
+    written, missing = draw_figures(run, figures, format_, force=force)
+    for line in missing:
+        typer.echo(line, err=True)
+    for path in written:
+        typer.echo(path)
+
+
+@app.command()
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN ...", help="Evaluated runs; the first is compared with.")
+    ],
+    out: Out,
+    force: Force = False,
+) -> None:
+    """Evaluated runs side by side: what differs, curves, tables, who wins seed by seed."""
+    from hypogoal.stages.compare import compare as stage
+
+    typer.echo(stage(runs, out, force=force))
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""The commands that only look: ``show``, ``verify``, ``config``."""
+"""The commands that only look: ``show``, ``verify``, ``watch``, ``config``."""
 
 from __future__ import annotations
 
@@ -39,6 +39,17 @@ def verify(
     echo({"path": str(path), "faults": faults}, as_json, faults or [f"{path}: whole"])
     if faults:
         raise typer.Exit(2)
+
+
+@app.command()
+def watch(
+    run: Annotated[Path, typer.Argument(help="A run, finished or not.")],
+    once: Annotated[bool, typer.Option("--once", help="Print it once instead of following it.")] = False,
+) -> None:
+    """Follow a run in the terminal: each artefact's steps and success or loss so far. Ctrl-C ends it."""
+    from hypogoal.watching import watch as look
+
+    look(run, once=once)
 
 
 @app.command()

@@ -136,7 +136,7 @@ def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> F
         axes.set_xlim(-0.6, len(groups) - 0.4)
         axes.grid(visible=False, axis="x")
         axes.set_ylim(0, None)
-        axes.set_ylabel("distance to the nearest true base")
+        axes.set_ylabel("distance to the nearest true base\n(units of position)")
         _legend(figure, [axes], 2)
         return figure
 

@@ -29,7 +29,12 @@ def image_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) -> bytes:
-    """Figures 2 and 9: signed attributions as a picture.
+    """Figures 2 and 9: signed attributions as a PNG, see :func:`attribution_image`."""
+    return image_png(attribution_image(values, grey))
+
+
+def attribution_image(values: NDArray[np.floating], grey: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Figures 2 and 9: signed attributions as a picture, uint8 (H, W, 3).
 
     Orange where positive, blue where negative, white where none; full colour at the 99.5th percentile of the absolute
     values. The state shows through as a light shade. In steps, which keeps the file small.
@@ -44,7 +49,7 @@ def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) ->
     ends = np.array([AGAINST, FOR]) / 255
     paper = np.repeat(1 - 0.28 * shade, 3, axis=-1)
     image = (1 - strength) * paper + strength * ends[(values > 0).astype(np.int64)]
-    return image_png((255 * image).round().astype(np.uint8))
+    return np.asarray((255 * image).round().astype(np.uint8))
 
 
 def flat(values: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -105,10 +105,22 @@ QUANTITIES: dict[str, dict[str, str]] = {
         "unit": "Spearman's rho, -1..1",
         "meaning": "with the match; 'all': over all options, 'within': mean over sub-goals of that among members",
     },
+    "probability": {
+        "unit": "fraction",
+        "meaning": "share of pairs of runs, alike in layout and seed, in which the first is better; a tie counts half",
+    },
+    "wins": {"unit": "pairs", "meaning": "in which the first is better"},
+    "ties": {"unit": "pairs", "meaning": "in which both are the same"},
+    "difference": {"unit": "as said beside it", "meaning": "mean over pairs of first - second"},
+    "difference_interval": {"unit": "as said beside it", "meaning": "95 % bootstrap interval of the difference"},
+    "sign_test": {"unit": "probability", "meaning": "of wins and losses as uneven as these if neither were better"},
     "mean": {"unit": "as said beside it", "meaning": "over runs"},
     "standard_error": {"unit": "as said beside it", "meaning": "of the mean over runs"},
     "iqm": {"unit": "as said beside it", "meaning": "interquartile mean over runs"},
-    "interval": {"unit": "as said beside it", "meaning": "95 % bootstrap interval of the interquartile mean"},
+    "interval": {
+        "unit": "as said beside it",
+        "meaning": "95 % bootstrap interval, of the interquartile mean or probability",
+    },
     "standard_deviation": {"unit": "as said beside it", "meaning": "over runs (n - 1)"},
     "n": {"unit": "runs", "meaning": "runs that have this number"},
 }

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import binomtest, bootstrap, trim_mean
 
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
@@ -27,9 +27,12 @@ def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> Any:
 
 
 def bootstrap_interval(
-    values: NDArray[np.float64], strata: Sequence[Hashable], rng: np.random.Generator
+    values: NDArray[np.float64],
+    strata: Sequence[Hashable],
+    rng: np.random.Generator,
+    statistic: Callable[..., Any] = interquartile_mean,
 ) -> tuple[float, float, str]:
-    """Spec F5: 95 % percentile bootstrap interval of the interquartile mean.
+    """Spec F5: 95 % percentile bootstrap interval of the interquartile mean, or of another statistic.
 
     Runs are drawn again within their stratum (a layout), so the interval speaks of these layouts with other seeds.
     Where a layout has a single run there is nothing to draw within it: then runs are drawn from all of them, and the
@@ -39,6 +42,7 @@ def bootstrap_interval(
         values: float (n,), one per run.
         strata: n hashable marks.
         rng: draws the resamples.
+        statistic: takes values and ``axis``.
 
     Returns:
         Lower and upper bound, NaN for fewer than two runs, and over what was resampled.
@@ -54,12 +58,12 @@ def bootstrap_interval(
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0]), over
 
-    def statistic(*resampled: NDArray[np.float64], axis: int = -1) -> Any:
-        return interquartile_mean(np.concatenate(resampled, axis=axis), axis=axis)
+    def together(*resampled: NDArray[np.float64], axis: int = -1) -> Any:
+        return statistic(np.concatenate(resampled, axis=axis), axis=axis)
 
     found = bootstrap(
         groups,
-        statistic,
+        together,
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
@@ -99,3 +103,48 @@ def aggregate_with_deviation(
     known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
     deviation = float(known.std(ddof=1)) if len(known) > 1 else float("nan")
     return {**aggregate(values, strata, unit, rng), "standard_deviation": deviation}
+
+
+def compare_pairs(
+    first: NDArray[np.float64],
+    second: NDArray[np.float64],
+    strata: Sequence[Hashable],
+    rng: np.random.Generator,
+    *,
+    higher: bool = True,
+) -> dict[str, Any]:
+    """Spec F5: the first of two methods against the second over n pairs of runs that share layout and seed.
+
+    The probability of improvement is the share of pairs in which the first is better, a tie counting half. Its interval
+    is drawn within strata (see :func:`bootstrap_interval`); where one wins every pair there is nothing to resample and
+    it has no width, so the sign test stands beside it, which few pairs cannot make small.
+
+    Args:
+        first, second: float (n,), pair by pair; pairs with a NaN are left out.
+        strata: n hashable marks.
+        rng: draws the resamples.
+        higher: the better value is the higher one.
+
+    Returns:
+        n, wins, ties, probability, interval (95 %) and interval_over, difference (mean of first - second) and
+        difference_interval (95 %), sign_test (two-sided p, ties left out). NaN without pairs.
+    """
+    known = ~(np.isnan(first) | np.isnan(second))
+    marks = [mark for mark, one in zip(strata, known, strict=True) if one]
+    difference = first[known] - second[known]
+    better = np.sign(difference if higher else -difference)
+    scores = (1 + better) / 2
+    count, wins, ties = len(scores), int((better > 0).sum()), int((better == 0).sum())
+    low, high, over = bootstrap_interval(scores, marks, rng, np.mean)
+    *around, _ = bootstrap_interval(difference, marks, rng, np.mean)
+    return {
+        "n": count,
+        "wins": wins,
+        "ties": ties,
+        "probability": float(scores.mean()) if count else float("nan"),
+        "interval": [low, high],
+        "interval_over": over,
+        "difference": float(difference.mean()) if count else float("nan"),
+        "difference_interval": list(around),
+        "sign_test": float(binomtest(wins, count - ties).pvalue) if count > ties else float("nan"),
+    }

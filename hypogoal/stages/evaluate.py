@@ -32,6 +32,7 @@ from hypogoal.evaluation.agents import (
 from hypogoal.evaluation.arrays import write_curves
 from hypogoal.evaluation.browsing import browse_states
 from hypogoal.evaluation.choices import over_training, selection_of_run
+from hypogoal.evaluation.comparisons import compare_agents, compare_distances, compare_hypotheses, compare_rooms
 from hypogoal.evaluation.curves import GAMMA, SOLVED, WINDOW
 from hypogoal.evaluation.distance import INSIDE, LAST, NEAR, ORACLE, distance_tables, ladder_numbers
 from hypogoal.evaluation.ensembles import ensemble_name, ensemble_names, hypotheses_table, sub_goal_metrics
@@ -132,6 +133,12 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             "saliency": saliency,
             "explorer": explorer,
             "selection": selection,
+            "comparisons": {
+                "agents": compare_agents(agents),
+                "hypotheses": compare_hypotheses(ensembles),
+                "rooms": compare_rooms(ensembles),
+                "distance": compare_distances(distance["options"]),
+            },
             "provenance": provenance(found, data),
             "quantities": QUANTITIES,
         }

@@ -2,76 +2,123 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
+from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, open_artefact, versions
 from hypogoal.core.errors import UserError
+from hypogoal.evaluation.evaluated import read_evaluation
+
+KINDS = ("svg", "pdf", "png")
 
 
-def report(run: Path, *, force: bool = False) -> Path:
+def report(run: Path, *, videos: int = 0, force: bool = False) -> Path:
     """Draw the report of an evaluated run.
 
     Args:
         run: a folder with an evaluation artefact in it; that in ``run/evaluation`` where there are several.
+        videos: how many episodes of the agents to play and draw, see :func:`draw_videos`.
         force: replace an existing report.
 
     Returns:
-        The page, ``run/report/index.html``. Beside it ``figures/*.svg`` and ``figures/*.png``.
+        The page, ``run/report/index.html``. Beside it ``figures/*.svg``, ``figures/*.png`` and ``videos/*.gif``.
 
     Raises:
-        UserError: the run was not evaluated, the evaluation is damaged, or the report exists.
+        UserError: the run was not evaluated, the evaluation is damaged, the report exists, or there are to be videos
+            and there is no agent.
     """
     from hypogoal.evaluation.figures import to_png
     from hypogoal.evaluation.page import Material, render
 
     out = run / "report"
-    source = _evaluation_of(run)
+    found = read_evaluation(run)
     claim(out, force=force)
-    material = Material(_metrics(source), _arrays(source.path / "arrays.h5"))
+    material = Material(found.metrics, found.arrays)
     page = render(material, versions().get("hypogoal", "unknown"))
-    with create_artefact(out, kind="report", config={}, seed=0, inputs=[source.path], force=force) as folder:
+    agents = agents_of(run) if videos else []
+    inputs = [found.source.path, *(agent.path for agent in agents[:videos])]
+    with create_artefact(out, kind="report", config={"videos": videos}, seed=0, inputs=inputs, force=force) as folder:
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
         for name, figure in material.figures.items():
             (folder / "figures" / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
             (folder / "figures" / f"{name}.png").write_bytes(to_png(figure))
+        if videos:
+            draw_videos(agents, run, folder / "videos", videos)
     return out / "index.html"
 
 
-def _evaluation_of(run: Path) -> Artefact:
-    found = find_artefacts(run, "evaluation")
+def agents_of(run: Path) -> list[Artefact]:
+    """The run's agents that learned to choose among members' options.
+
+    Raises:
+        UserError: there is none.
+    """
+    found = [
+        artefact
+        for artefact in find_artefacts(run, "meta")
+        if (artefact.config["chooser"], artefact.config["termination"]) == ("ppo", "learned")
+    ]
     if not found:
-        raise UserError("this run was not evaluated", run, f"First run: hypogoal evaluate {run}")
-    preferred = [artefact for artefact in found if artefact.path == run / "evaluation"]
-    return (preferred or found)[0]
+        needed = "Videos need a meta artefact with learned terminations: train-meta."
+        raise UserError("no agent to make videos of", run, needed)
+    return found
 
 
-def _metrics(source: Artefact) -> dict[str, Any]:
-    path = source.path / "metrics.json"
+def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int) -> None:
+    """Spec E1: episodes of the agents in turn, played from their saved weights, one GIF each."""
+    from hypogoal.core.tensors import load_tensors
+    from hypogoal.domains.base import load_domain
+    from hypogoal.evaluation.videos import episode_gif
+    from hypogoal.meta.watched import Agent, play_episode
+
+    folder.mkdir()
+    for index in range(count):
+        artefact, episode = agents[index % len(agents)], index // len(agents)
+        config, source = artefact.config, open_artefact(artefact.input("ensemble"), "ensemble")
+        weights = (load_tensors(artefact.path / f"{name}.safetensors") for name in ("options", "meta"))
+        frames = play_episode(
+            Agent(config, source.config, source.path, *weights), load_domain(config["domain"]), seed=episode
+        )
+        name = artefact.path.relative_to(run).as_posix().replace("/", "-")
+        gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
+        (folder / f"{name}-episode-{episode}.gif").write_bytes(gif)
+
+
+def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:
+    """Draw the paper's figures, those that the run has artefacts for, as files of their own.
+
+    Args:
+        run: as for :func:`report`.
+        folder: gets a file per figure and ``captions.md``.
+        kind: ``svg``, ``pdf`` or ``png``.
+        force: replace files that are there.
+
+    Returns:
+        The files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs.
+
+    Raises:
+        UserError: no such kind, the run was not evaluated, or a file is there already.
+    """
+    from hypogoal.evaluation.figures import to_file
+    from hypogoal.evaluation.page import Material
+    from hypogoal.evaluation.page.paper import paper_figures
+
+    if kind not in KINDS:
+        raise UserError("no such format of figures", kind, f"Choose one of {', '.join(KINDS)}.")
+    found = read_evaluation(run)
+    drawn, missing = paper_figures(Material(found.metrics, found.arrays))
+    files = {folder / f"{one.name}.{kind}": one for one in drawn}
+    captions = folder / "captions.md"
+    for path in (*files, captions):
+        if path.exists() and not force:
+            raise UserError("exists already", path, "Give --force to replace it, or choose another folder.")
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
-    return dict(metrics)
-
-
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    import h5py
-
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def read(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            arrays[name] = np.asarray(item[()])
-
-    try:
-        with h5py.File(path, "r") as file:
-            file.visititems(read)
-    except OSError:
-        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
-    return arrays
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, one in files.items():
+            path.write_bytes(to_file(one.figure, one.name, kind))
+        text = [f"## {path.name}\n\n{one.caption}\n" for path, one in files.items()]
+        captions.write_text("\n".join([*text, *(f"{line}\n" for line in missing)]), encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None
+    return [*files, captions], missing

@@ -17,7 +17,7 @@ from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.stages.evaluate import evaluate, summary_table
-from hypogoal.stages.report import report
+from hypogoal.stages.report import draw_figures, report
 
 QUIET = {"quiet": True}
 
@@ -106,6 +106,9 @@ def test_distances_are_those_of_the_tables(metrics):
     wanted = [1.5 * (10 * (validated[seed] + 1) + seed) for seed in (0, 1)]
     assert dbat["validated"]["mean"] == pytest.approx(np.mean(wanted))
     assert len(found["options"]) == 2 * 2 * 4
+    pairs = {(row["second"], row["where"]): row for row in metrics["comparisons"]["distance"]}
+    assert pairs["single CNN", "N=2"]["ties"] == pairs["single CNN", "N=2"]["n"] == 4
+    assert {row["where"] for row in metrics["comparisons"]["rooms"]} == {"N=1", "N=2", "N=3"}
     assert metrics["agents"] == metrics["selection"] == []
     assert metrics["missing"] == []
 
@@ -212,6 +215,15 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
 def test_the_report_is_the_same_each_time(run, page):
     """Spec G1, F7: pictures and all."""
     assert report(run, force=True).read_text(encoding="utf-8") == page
+
+
+def test_the_papers_figures_as_files(run, metrics, tmp_path):
+    """Spec F1-F4: Figures 2 to 5 and 9 of one sub-goal; what the agents' figures would need."""
+    written, missing = draw_figures(run, tmp_path, "png")
+    assert [path.stem for path in written] == [
+        "figure2", "figure3", "figure3-unseen", "figure4", "figure5-1L-N2", "figure5-2-6-N2", "figure9", "captions",
+    ]  # fmt: skip
+    assert [line.partition(":")[0] for line in missing] == ["Figure 6", "Figure 7", "Figure 8"]
 
 
 def test_ensembles_alone(tmp_path):

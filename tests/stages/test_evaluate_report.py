@@ -16,7 +16,7 @@ from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
 from hypogoal.evaluation.summary import hypotheses_summary
 from hypogoal.stages.collect import collect
 from hypogoal.stages.evaluate import evaluate, summary_table
-from hypogoal.stages.report import report
+from hypogoal.stages.report import draw_figures, report
 from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
 from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
 from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
@@ -132,6 +132,12 @@ def test_metrics_are_written_as_returned(run, metrics):
         aggregated = metrics["agents"][0][key]
         assert {"mean", "standard_error", "iqm", "interval", "interval_over", "n", "unit"} == set(aggregated)
     assert set(metrics["ensembles"][0]["sub_goals"][0]["members"][0]) - {"member"} <= set(metrics["quantities"])
+    named = {"first", "second", "quantity", "where", "higher", "interval_over"}
+    pairs = [*metrics["comparisons"]["agents"], *metrics["comparisons"]["hypotheses"]]
+    assert {(row["second"], row["quantity"]) for row in pairs} >= {
+        ("random choice", "length"), ("PPO tuned", "success"), ("no diversity, K=2", "balanced accuracy, best member"),
+    }  # fmt: skip
+    assert set().union(*pairs) - named <= set(metrics["quantities"])
     kinds = sorted(entry["kind"] for entry in artefact.manifest["inputs"])
     assert kinds == ["baseline", "data", "ensemble", "ensemble", "meta", "meta", "meta"]
 
@@ -219,6 +225,7 @@ def test_the_page_shows_all_of_it(run, page):
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     assert page.count("<figure") == 4
+    assert page.count("<h3>Seed by seed against the first</h3>") == 2
     assert "1 run: layout seed 100, run seed 0" in page
     assert "Figure 6 of the paper" in page
     assert "no agent &#39;DQN tuned&#39;" in page
@@ -231,6 +238,51 @@ def test_the_page_shows_all_of_it(run, page):
 def test_the_report_is_the_same_each_time(run, page):
     """Spec G1, F7: nothing in it depends on when it is made."""
     assert report(run, force=True).read_text(encoding="utf-8") == page
+
+
+def test_the_papers_figures_as_files(run, metrics, tmp_path):
+    """Spec F2, F5, F6: what the run has artefacts for, each with its caption; for the others what they need."""
+    kind = "pdf"
+    written, missing = draw_figures(run, tmp_path / "figures", kind)
+    names = {path.name for path in written}
+    wanted = {
+        "figure6",
+        "figure6-length",
+        "figure7",
+        "figure8",
+        "members",
+        "preference",
+        "terminations-collect-red-key",
+    }
+    assert {f"{name}.{kind}" for name in wanted} <= names
+    explained = [goal["sub_goal"] for goal in metrics["saliency"]["sub_goals"] if goal["states"]]
+    assert len(explained) > 1
+    assert {name for name in names if name.startswith(("figure2", "figure9"))} == {
+        f"figure{number}-{sub_goal}.{kind}" for number in (2, 9) for sub_goal in explained
+    }
+    assert names == {path.name for path in (tmp_path / "figures").iterdir()}
+    files = [path for path in written if path.name != "captions.md"]
+    assert all(path.read_bytes().startswith(b"%PDF") for path in files)
+    captions = (tmp_path / "figures" / "captions.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (.*)$", captions, re.M) == [path.name for path in files]
+    assert "bands: ± one standard error over runs. options (learned members): 1 run: layout seed 100" in captions
+    assert [line.partition(":")[0] for line in missing] == ["Figure 3", "Figure 4", "Figure 5"]
+    assert all("It needs" in line and line in captions for line in missing)
+    with pytest.raises(UserError, match="exists already"):
+        draw_figures(run, tmp_path / "figures", kind)
+
+
+def test_figures_on_request_from_the_command_line(run, metrics, tmp_path, capsys):
+    """Spec F7, G2: files on stdout, what is missing on stderr; an unknown format is one line."""
+    from hypogoal.cli import main
+
+    assert main(["report", str(run), "--figures", str(tmp_path / "a"), "--format", "jpeg"]) == 2
+    assert "Choose one of svg, pdf, png" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+    assert main(["report", str(run), "--figures", str(tmp_path / "a")]) == 0
+    told = capsys.readouterr()
+    assert "Figure 4: not drawn. It needs options artefacts with executions.csv" in told.err
+    assert str(tmp_path / "a" / "figure6.svg") in told.out.splitlines()
 
 
 def test_arrays_say_what_the_report_draws(run, metrics):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import resources
 
 from hypogoal.evaluation.page.agents import curves_section, summary_section
@@ -16,7 +16,7 @@ from hypogoal.evaluation.page.provenance import provenance_section
 from hypogoal.evaluation.page.rooms import rooms_section
 from hypogoal.evaluation.page.saliency import saliency_section
 
-__all__ = ["Material", "render"]
+__all__ = ["Material", "draw_page", "render"]
 
 AGENTS = (summary_section, curves_section)
 LADDERS = (ladders_section, rooms_section, distance_section, stops_section)
@@ -39,24 +39,30 @@ def sections_of(material: Material) -> list[Block]:
 
 
 def render(material: Material, version: str) -> str:
-    """Spec F7: the page, self-contained; ``material.figures`` is filled on the way.
+    """Spec F7: the page of a run, self-contained; ``material.figures`` is filled on the way.
 
     Args:
         material: the evaluation's numbers and arrays.
         version: hypogoal's.
     """
+    about = material.metrics["provenance"]
+    domains = sorted({data["domain"] for data in about["data"]} | _domains_of(about["artefacts"]))
+    subtitle = f"{listed(domains)}; {len(about['artefacts'])} artefacts evaluated; hypogoal {version}"
+    return draw_page(f"hypogoal: {material.metrics['run']}", subtitle, sections_of(material), version)
+
+
+def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
+    """Sections as one HTML file that needs nothing else."""
     import jinja2
 
     loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    about = material.metrics["provenance"]
-    domains = sorted({data["domain"] for data in about["data"]} | _domains_of(about["artefacts"]))
     return environment.get_template("report.html").render(
-        title=f"hypogoal: {material.metrics['run']}",
-        subtitle=f"{listed(domains)}; {len(about['artefacts'])} artefacts evaluated; hypogoal {version}",
+        title=title,
+        subtitle=subtitle,
         version=version,
         css=resources.files("hypogoal.evaluation").joinpath("templates/report.css").read_text(encoding="utf-8"),
-        sections=sections_of(material),
+        sections=sections,
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
 

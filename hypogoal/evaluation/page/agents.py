@@ -22,6 +22,7 @@ from hypogoal.evaluation.page.blocks import (
     spread,
     table,
 )
+from hypogoal.evaluation.page.comparisons import comparison_tables
 from hypogoal.evaluation.summary import percent, solved, thousands
 
 COLOURS = {
@@ -115,7 +116,14 @@ def curves_section(material: Material) -> Block:
         nothing = "It needs options, meta or baseline artefacts: train-meta, train-baseline."
         return section("curves", "Learning curves", [], [figure(material, "reward", "Reward", None, missing=nothing)])
     blocks = [_curve(material, "reward"), _curve(material, "length")]
-    blocks += [_intervals(agents), _every_run(agents), _layouts(material)]
+    blocks += [_intervals(agents)]
+    blocks += comparison_tables(
+        material.comparisons("agents"),
+        "layout and seed",
+        "layouts",
+        {"length": 0, "success": 2, "discounted_return": 2},
+    )
+    blocks += [_every_run(agents), _layouts(material)]
     return section("curves", "Learning curves", [text], blocks)
 
 

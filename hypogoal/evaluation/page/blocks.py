@@ -37,6 +37,10 @@ class Material:
         """Every agent's numbers, in the report's order."""
         return list(self.metrics["agents"])
 
+    def comparisons(self, of: str) -> list[Mapping[str, Any]]:
+        """One method against the others; none in evaluations from before there were any."""
+        return list(self.metrics.get("comparisons", {}).get(of, ()))
+
 
 def first_named(entries: Iterable[Mapping[str, Any]], name: str) -> Mapping[str, Any] | None:
     """The first entry called ``name``, also where settings that differ between runs were added to it."""

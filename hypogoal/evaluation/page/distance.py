@@ -21,6 +21,7 @@ from hypogoal.evaluation.page.blocks import (
     section,
     table,
 )
+from hypogoal.evaluation.page.comparisons import comparison_tables
 from hypogoal.evaluation.summary import percent
 
 SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
@@ -42,6 +43,8 @@ def distance_section(material: Material) -> Block:
         "options at the true base: what is left to it is how well policies were learned."
     )
     blocks = [_bars(material), _table(found["over_ladders"]), _intervals(found["over_ladders"])]
+    digits = {"distance, best member": 1}
+    blocks += comparison_tables(material.comparisons("distance"), "ladder, N and seed", "ladders", digits)
     blocks += [_ladders(found["by_ladder"]), _options(found["options"])]
     return section("distance", title, [text], blocks)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hypogoal.evaluation.comparisons import ALL
 from hypogoal.evaluation.figures import best_mean_worst_members
 from hypogoal.evaluation.page.blocks import (
     Block,
@@ -21,6 +22,7 @@ from hypogoal.evaluation.page.blocks import (
     table,
     texts,
 )
+from hypogoal.evaluation.page.comparisons import comparison_tables
 
 KINDS = {
     "disagree": "members disagree",
@@ -43,7 +45,12 @@ def hypotheses_section(material: Material) -> Block:
             material, "members", "Members' accuracy", None, missing="It needs an ensemble artefact: train-ensemble."
         )
         return section("hypotheses", "Hypotheses", [], [nothing])
-    return section("hypotheses", "Hypotheses", [text], [_dots(material), _table(metrics), *_members(metrics)])
+    pairs = [entry for entry in material.comparisons("hypotheses") if entry["where"] == ALL]
+    shared = "ensemble seed and sub-goal (each sub-goal by itself is in metrics.json)"
+    compared = comparison_tables(pairs, shared, "sub-goals")
+    return section(
+        "hypotheses", "Hypotheses", [text], [_dots(material), _table(metrics), *compared, *_members(metrics)]
+    )
 
 
 def _dots(material: Material) -> Block:

@@ -20,6 +20,7 @@ from hypogoal.evaluation.page.blocks import (
     section,
     table,
 )
+from hypogoal.evaluation.page.comparisons import comparison_tables
 
 SCOPES = {"unseen": "unseen rooms", "all": "all rooms"}
 SCORES = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}
@@ -57,6 +58,7 @@ def rooms_section(material: Material) -> Block:
         blocks += [_best(material, own), _four(material, own), *(_table(own, scope) for scope in SCOPES)]
         blocks += [_intervals(own), _differences(own)]
         blocks += _kinds(material, own) + _rooms(material, own)
+    blocks += comparison_tables(material.comparisons("rooms"), "ensemble seed and N", "sub-goals")
     blocks.append(_members(material))
     return section("rooms", title, [text], blocks)
 
@@ -70,7 +72,8 @@ def _numbers(rows: Sequence[Mapping[str, Any]]) -> list[int | None]:
     return sorted({entry["groups"] for entry in rows}, key=lambda groups: (groups is None, groups or 0))
 
 
-def _panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str, which: str) -> Panel:
+def panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str, which: str) -> Panel:
+    """One plot of Figure 3: a score of one kind of member over N, a line per method of the rows."""
     series = []
     for name in _names(rows):
         own = [entry for entry in rows if entry["method"] == name and entry["groups"] is not None]
@@ -106,7 +109,7 @@ def _best(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
     drawn = None
     if any(entry["groups"] is not None for entry in rows):
         panels = [
-            _panel(rows, f"{SCORES[score]}, {SCOPES[scope]}", scope, score, "best")
+            panel(rows, f"{SCORES[score]}, {SCOPES[scope]}", scope, score, "best")
             for score in ("accuracy", "balanced_accuracy")
             for scope in ("all", "unseen")
         ]
@@ -122,7 +125,7 @@ def _best(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
 def _four(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
     drawn = None
     if any(entry["groups"] is not None for entry in rows):
-        panels = [_panel(rows, name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
+        panels = [panel(rows, name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
         drawn = scores_over_groups(panels, _names(rows))
     caption = (
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "

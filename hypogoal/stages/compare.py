@@ -1,0 +1,81 @@
+"""Spec F5, F7: several evaluated runs side by side, as one page and its numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.artefacts import claim, create_artefact, versions
+from hypogoal.core.errors import UserError
+from hypogoal.evaluation.comparing import compare_runs, differences, domains_of, labels_of, shared, why_not
+from hypogoal.evaluation.evaluated import read_evaluation
+from hypogoal.evaluation.quantities import QUANTITIES, plain
+
+
+def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
+    """Compare evaluated runs: seeds, methods or settings.
+
+    Args:
+        runs: folders with an evaluation in each; the others are compared with the first.
+        out: the artefact to write: ``index.html``, ``metrics.json`` and ``figures/*.svg``.
+        force: replace an existing comparison.
+
+    Returns:
+        The page.
+
+    Raises:
+        UserError: fewer than two runs, one twice, one that was not evaluated, runs that cannot be compared, or ``out``
+            exists.
+    """
+    from hypogoal.evaluation.page import Material, draw_page
+    from hypogoal.evaluation.page.compared import compared_sections
+
+    claim(out, force=force)
+    if len({run.resolve() for run in runs}) < max(2, len(runs)):
+        where = " ".join(map(str, runs))
+        raise UserError("a comparison takes two different runs or more", where, "Name each run once.")
+    labels = labels_of([run.resolve().as_posix() for run in runs])
+    found = {label: read_evaluation(run, "curves/") for label, run in zip(labels, runs, strict=True)}
+    metrics = {label: one.metrics for label, one in found.items()}
+    reason = why_not(metrics)
+    if reason is not None:
+        raise UserError("these runs cannot be compared", reason, "Choose runs of one experiment, evaluated alike.")
+    about = {
+        "runs": [
+            {"label": label, "path": str(run), **_about(metrics[label])}
+            for label, run in zip(labels, runs, strict=True)
+        ],
+        "domains": domains_of(metrics[labels[0]]),
+        "shared": shared(metrics),
+        "differences": differences(metrics),
+        "comparisons": plain(compare_runs(metrics)),
+        **{
+            table: {label: own[table] for label, own in metrics.items()}
+            for table in ("agents", "hypotheses", "rooms", "distance")
+        },
+        "quantities": QUANTITIES,
+    }
+    material = Material(about, {})
+    sections = compared_sections(metrics, {label: one.arrays for label, one in found.items()}, about, material)
+    version = versions().get("hypogoal", "unknown")
+    page = draw_page(
+        f"hypogoal: {len(runs)} runs compared", f"{', '.join(labels)}; hypogoal {version}", sections, version
+    )
+    inputs = [one.source.path for one in found.values()]
+    with create_artefact(out, kind="comparison", config={}, seed=0, inputs=inputs, force=force) as folder:
+        (folder / "index.html").write_text(page, encoding="utf-8")
+        (folder / "metrics.json").write_text(json.dumps(about, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        (folder / "figures").mkdir()
+        for name, drawing in material.drawings.items():
+            (folder / "figures" / f"{name}.svg").write_text(drawing, encoding="utf-8")
+    return out / "index.html"
+
+
+def _about(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run is made of."""
+    artefacts = metrics["provenance"]["artefacts"]
+    layouts = {artefact["config"]["layout_seed"] for artefact in artefacts if "layout_seed" in artefact["config"]}
+    seeds = sorted({artefact["seed"] for artefact in artefacts})
+    return {"artefacts": len(artefacts), "seeds": seeds, "layout_seeds": sorted(layouts)}

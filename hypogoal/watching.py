@@ -1,0 +1,172 @@
+"""A live view of a run out of its ``metrics.jsonl`` files, also of those that are still being written (Spec A6)."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from hypogoal.core.artefacts import MANIFEST, PARTIAL
+from hypogoal.core.errors import UserError
+
+LOG = "metrics.jsonl"
+SHARES = ("success", "reached")  # of episodes or executions, drawn from 0 to 1
+WATCHED = (*SHARES, "loss")  # the number that is followed: the first that a log has
+BARS = "▁▂▃▄▅▆▇█"
+NAME, CURVE = 28, 13  # columns of characters
+SECONDS = 2.0  # between two looks
+WIDTH = 80
+
+
+@dataclass(frozen=True)
+class Progressing:
+    """One artefact that is made, or was.
+
+    Attributes:
+        name: its path within the run; of an ensemble with the sub-goal that it is at.
+        seconds: since its log was written; None when it is complete.
+        step: the last logged.
+        watched: what is followed (one of ``WATCHED``), empty where there is nothing to follow.
+        series: its values so far.
+    """
+
+    name: str
+    seconds: float | None
+    step: int
+    watched: str
+    series: tuple[float, ...]
+
+
+def watch(run: Path, *, once: bool = False) -> None:
+    """Show how a run's artefacts are doing, again and again until it is finished or interrupted.
+
+    Args:
+        run: the folder that ``hypogoal run`` or stages write into.
+        once: print the view once; so it is done too where there is no terminal, and where the run is finished.
+
+    Raises:
+        UserError: there is no such folder, or nothing in it that logs.
+    """
+    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    rows = read_progress(run)
+    if once or not console.is_terminal or finished(run):
+        console.print(view(rows))
+        return
+    try:
+        with Live(view(rows, console.height - 3), console=console, screen=False, auto_refresh=False) as live:
+            while not finished(run):
+                time.sleep(SECONDS)
+                live.update(view(read_progress(run), console.height - 3), refresh=True)
+    except KeyboardInterrupt:
+        return
+
+
+def finished(run: Path) -> bool:
+    """Whether ``hypogoal run`` has said that all is done, and nothing is made anew."""
+    return (run / "run.json").is_file() and not any(row.seconds is not None for row in read_progress(run))
+
+
+def read_progress(run: Path) -> list[Progressing]:
+    """What is being made first, then what is complete, each by its path.
+
+    Raises:
+        UserError: there is no such folder, or nothing in it that logs.
+    """
+    if not run.is_dir():
+        raise UserError("no such run", run, "Give the folder that 'hypogoal run' or a stage writes into.")
+    found = [_read(log, run) for log in sorted(run.rglob(LOG))]
+    if not found:
+        raise UserError(f"nothing to watch: no {LOG}", run, "Training stages write it as they go; is one running?")
+    return sorted(found, key=lambda row: (row.seconds is None, row.name))
+
+
+def _read(log: Path, run: Path) -> Progressing:
+    lines = _lines(log)
+    last = lines[-1] if lines else {}
+    folder = log.parent
+    partial = re.fullmatch(rf"\.(.+){re.escape(PARTIAL)}-\d+", folder.name)
+    place = folder.with_name(partial[1]) if partial else folder
+    name = place.relative_to(run).as_posix() if place != run else place.name
+    if "sub_goal" in last:
+        name = f"{name}: {last['sub_goal']}"
+        lines = [line for line in lines if line.get("sub_goal") == last["sub_goal"]]
+    watched = next((key for key in WATCHED if key in last), "")
+    series = tuple(float(line[watched]) for line in lines if isinstance(line.get(watched), int | float))
+    whole = not partial and (folder / MANIFEST).is_file()
+    try:
+        seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
+    except OSError:  # renamed since: it has just become complete
+        seconds = None
+    return Progressing(name, seconds, int(last.get("step", 0)), watched, series)
+
+
+def _lines(log: Path) -> list[dict[str, Any]]:
+    """The lines of a log; one that is only half written yet is left out."""
+    try:
+        text = log.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
+    found = []
+    for line in text.splitlines():
+        try:
+            value = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(value, dict):
+            found.append(value)
+    return found
+
+
+def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
+    """The rows as a table, at most 80 columns wide and ``most`` rows long."""
+    table = Table(box=None, padding=(0, 1, 0, 0), width=WIDTH - 1, title_justify="left", caption_justify="left")
+    making = sum(row.seconds is not None for row in rows)
+    table.title = f"{making} in the making, {len(rows) - making} complete"
+    table.add_column("artefact", width=NAME, no_wrap=True)
+    table.add_column("written", width=10, justify="right", no_wrap=True)
+    table.add_column("step", width=9, justify="right", no_wrap=True)
+    table.add_column("now", width=14, no_wrap=True)
+    table.add_column("so far", width=CURVE, no_wrap=True)
+    shown = rows if most is None or len(rows) <= most else rows[: max(1, most - 1)]
+    for row in shown:
+        table.add_row(
+            row.name if len(row.name) <= NAME else f"…{row.name[1 - NAME :]}",
+            "done" if row.seconds is None else f"{_ago(row.seconds)} ago",
+            f"{row.step:,}",
+            f"{row.watched} {row.series[-1]:.3g}" if row.series else "–",
+            curve(row.series, (0.0, 1.0) if row.watched in SHARES else None),
+        )
+    if len(shown) < len(rows):
+        table.caption = f"and {len(rows) - len(shown)} more"
+    return table
+
+
+def _ago(seconds: float) -> str:
+    for size, unit in ((3600, "h"), (60, "min")):
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def curve(values: Sequence[float], bounds: tuple[float, float] | None = None, width: int = CURVE) -> str:
+    """Values as blocks of characters, each the mean of an equal part; from their least to their greatest."""
+    known = [value for value in values if value == value]
+    count = min(width, len(known))
+    if count == 0:
+        return ""
+    edges = [round(index * len(known) / count) for index in range(count + 1)]
+    means = [sum(known[start:end]) / (end - start) for start, end in pairwise(edges)]
+    low, high = bounds or (min(means), max(means))
+    span = (high - low) or 1.0
+    places = (min(max((value - low) / span, 0.0), 1.0) for value in means)
+    return "".join(BARS[int(place * (len(BARS) - 1) + 0.5)] for place in places)

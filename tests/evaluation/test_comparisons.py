@@ -1,0 +1,149 @@
+"""Spec F5: methods against each other pair by pair, against values worked by hand."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.comparisons import (
+    ALL,
+    compare_agents,
+    compare_distances,
+    compare_hypotheses,
+    compare_rooms,
+)
+from hypogoal.evaluation.page.comparisons import comparison_tables
+from hypogoal.evaluation.statistics import compare_pairs
+
+
+def pairs(first, second, strata=None, **more):
+    first, second = np.array(first, dtype=float), np.array(second, dtype=float)
+    return compare_pairs(first, second, strata or [0] * len(first), np.random.default_rng(0), **more)
+
+
+def test_probability_of_improvement_by_hand():
+    """Spec F5: won, lost, tied, won: (1 + 0 + 1/2 + 1) / 4; of 3 that are no ties 2 won: p is 1."""
+    found = pairs([3, 5, 2, 4], [1, 6, 2, 2])
+    assert (found["n"], found["wins"], found["ties"]) == (4, 2, 1)
+    assert (found["probability"], found["difference"], found["sign_test"]) == (0.625, 0.75, 1.0)
+    assert pairs([3, 5, 2, 4], [1, 6, 2, 2], higher=False)["probability"] == 0.375
+    assert found["interval"][0] < 0.625 < found["interval"][1]
+
+
+def test_a_win_in_every_pair_is_not_certainty():
+    """Spec F5: five of five: nothing to resample, so the interval has no width; the sign test is 2 / 2**5."""
+    found = pairs([2, 3, 4, 5, 6], [1, 2, 2, 3, 5])
+    assert found["interval"] == [1, 1]
+    assert found["sign_test"] == pytest.approx(2 / 2**5)
+    assert found["difference"] == pytest.approx(7 / 5)
+
+
+def test_the_interval_is_drawn_within_strata():
+    """Spec F5: one layout always won, the other always lost: other seeds of these layouts would give 1/2 again.
+
+    Drawn from all four pairs, 1 in 16 resamples would be all wins, so the 95 % interval would be 0 to 1.
+    """
+    first, second = [1, 1, 0, 0], [0, 0, 1, 1]
+    within = pairs(first, second, [5, 5, 6, 6])
+    assert (within["interval"], within["interval_over"]) == ([0.5, 0.5], "runs within layouts")
+    assert pairs(first, second, [5, 6, 7, 8])["interval"] == [0, 1]
+
+
+def test_pairs_without_a_number_are_left_out():
+    """Spec F5: where a balanced accuracy is not defined; without any pair nothing is said."""
+    found = pairs([np.nan, 1, 1], [0, np.nan, 0])
+    assert (found["n"], found["probability"]) == (1, 1)
+    nothing = pairs([], [])
+    assert nothing["n"] == 0
+    assert np.isnan([nothing["probability"], nothing["difference"], nothing["sign_test"], *nothing["interval"]]).all()
+    assert np.isnan(pairs([1, 2], [1, 2])["sign_test"])
+
+
+def run(layout, seed, length):
+    return {"layout_seed": layout, "seed": seed, "success": 1.0, "length": length, "discounted_return": 1 / length}
+
+
+def test_agents_are_paired_by_layout_and_seed():
+    """Spec F5: runs without a partner count nothing; a shorter episode is the better one."""
+    own = {"name": "options", "runs": [run(100, 0, 12), run(100, 1, 14), run(101, 0, 20), run(102, 0, 5)]}
+    other = {"name": "random", "runs": [run(101, 0, 30), run(100, 0, 24), run(100, 1, 13)]}
+    alone = {"name": "elsewhere", "runs": [run(500, 0, 1)]}
+    rows = compare_agents([own, other, alone])
+    assert [(row["first"], row["second"], row["quantity"]) for row in rows] == [
+        ("options", "random", quantity) for quantity in ("success", "length", "discounted_return")
+    ]
+    success, length, _ = rows
+    assert (success["ties"], success["probability"]) == (3, 0.5)
+    assert (length["n"], length["wins"]) == (3, 2)
+    assert length["difference"] == pytest.approx((-12 + 1 - 10) / 3)
+    assert compare_agents([]) == compare_agents([own]) == []
+
+
+def ensemble(name, seed, **best):
+    goals = [{"sub_goal": goal, "balanced_accuracy": {"best": value, "mean": 0.5}} for goal, value in best.items()]
+    return {"name": name, "seed": seed, "sub_goals": goals}
+
+
+def test_ensembles_are_paired_by_seed_and_sub_goal():
+    """Spec F1: D-BAT first, whatever comes first on disk; over all sub-goals and for each."""
+    rows = compare_hypotheses(
+        [
+            ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
+            ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
+            ensemble("dbat, K=2", 0, red=0.8, door=0.8),
+            ensemble("dbat, K=2", 1, red=0.9, door=1.0),
+        ]
+    )
+    best = {row["where"]: row for row in rows if "best" in row["quantity"]}
+    assert list(best) == [ALL, "door", "red"] or list(best) == [ALL, "red", "door"]
+    assert best[ALL]["first"] == "dbat, K=2"
+    assert (best[ALL]["n"], best[ALL]["wins"], best["red"]["wins"], best["door"]["wins"]) == (4, 3, 2, 1)
+    assert best[ALL]["difference"] == pytest.approx((0.2 + 0.2 - 0.1 + 0.1) / 4)
+
+
+def judged(method, groups, seed, best):
+    score = {"balanced_accuracy": {"best": best, "validated": float("nan"), "mean": best}}
+    rooms = {"scopes": {"unseen": {"scores": score}}}
+    return {"method": method, "groups": groups, "seed": seed, "sub_goals": [{"sub_goal": "down", "rooms": rooms}]}
+
+
+def test_methods_on_ladders_are_paired_at_each_number_of_groups():
+    """Spec F1: N=1 with N=1; where nothing could be validated there is no pair."""
+    bests = {"none": 0.5, "dbat": 0.6}
+    rows = compare_rooms([judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)])
+    found = {(row["where"], row["quantity"].split(", ")[1]): row for row in rows}
+    assert found["N=2", "best member"]["difference"] == pytest.approx(0.1)
+    assert found["N=1", "best member"]["n"] == 1
+    assert found["N=1", "validated member"]["n"] == 0
+
+
+def stopped(method, ladder, seed, distance):
+    option = {"distance": distance}
+    about = {"method": method, "groups": None if method.startswith("oracle") else 2, "ladder": ladder, "seed": seed}
+    return {**about, "sub_goal": "down", "best": 0, "options": [option]}
+
+
+def test_options_are_paired_by_ladder_and_seed():
+    """Spec F3: the nearer is the better; oracle terminations are not a method."""
+    rows = compare_distances(
+        [
+            stopped("none", "1L", 0, 40), stopped("none", "1R", 0, 10), stopped("dbat", "1L", 0, 10),
+            stopped("dbat", "1R", 0, 20), stopped("oracle termination", "1L", 0, 0),
+        ]
+    )  # fmt: skip
+    (row,) = rows
+    assert (row["first"], row["second"], row["wins"], row["n"], row["where"]) == ("dbat", "none", 1, 2, "N=2")
+    assert row["difference"] == -10
+
+
+def test_the_table_says_each_method_once():
+    """Spec F7: with digits and signs; where nothing is told apart by N or sub-goal that column is not there."""
+    rows = compare_agents(
+        [{"name": "a", "runs": [run(1, 0, 10)]}, *({"name": name, "runs": [run(1, 0, 12)]} for name in "bc")]
+    )
+    rows = [{**row, "interval": [None, None], "difference_interval": [None, None]} for row in rows]
+    (table,) = comparison_tables(rows, "seed", "layouts", {"length": 0})
+    assert [column["name"] for column in table["columns"]][:3] == ["quantity", "first", "second"]
+    length = [line["cells"] for line in table["rows"]][2:4]
+    assert length[0][:3] == ["length (lower is better)", "a", "b"]
+    assert length[1][:3] == ["", "", "c"]
+    assert length[0][3]["text"] == "1.00" and length[0][4] == "1–0–0" and length[0][6]["text"] == "-2"
+    assert comparison_tables([], "seed", "layouts") == []

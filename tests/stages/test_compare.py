@@ -1,0 +1,147 @@
+"""Spec F5, F7: runs side by side, from real artefacts with made-up contents; what cannot be compared is one line."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.evaluation.comparing import labels_of, on_grid
+from hypogoal.options.recording import write_table
+from hypogoal.stages.compare import compare
+from hypogoal.stages.evaluate import evaluate
+
+STEPS = 3_000
+
+
+def write_baseline(run, agent, layout, seed, length, steps=STEPS, **more):
+    """A baseline artefact whose episodes all take ``length`` steps and reach the goal."""
+    config = {"agent": agent, "setting": "tuned", "steps": steps, "layout_seed": layout, "domain": "doorkey", **more}
+    with create_artefact(
+        run / f"{agent}/layout-{layout}-seed-{seed}", kind="baseline", config=config, seed=seed
+    ) as out:
+        rows = [(end, length, 1, 1) for end in range(length, steps + 1, length)]
+        write_table(out / "episodes.csv", ("step", "length", "reward", "terminated"), rows)
+        facts = {"layout_seed": layout, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
+        (out / "layout.json").write_text(json.dumps(facts), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two settings of one agent on two layouts and seeds, in which the second is faster but for one pair."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, shorter, rate in (("slow", 0, 1e-3), ("fast", 5, 1e-4)):
+        for layout in (100, 101):
+            for seed in (0, 1):
+                usual = 20 + layout - 100
+                length = usual - shorter if (layout, seed) != (101, 1) else usual + (name == "fast")
+                write_baseline(folder / name, "ppo", layout, seed, length, learning_rate=rate)
+        evaluate(folder / name, folder / name / "evaluation", quiet=True)
+    write_baseline(folder / "slow", "dqn", 100, 0, 50)
+    evaluate(folder / "slow", folder / "slow" / "evaluation", quiet=True, force=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compared(runs):
+    assert main(["compare", str(runs / "slow"), str(runs / "fast"), "--out", str(runs / "both")]) == 0
+    return json.loads((runs / "both" / "metrics.json").read_text(encoding="utf-8"))
+
+
+def test_what_differs_is_told_and_nothing_else(compared):
+    """Spec A8, F7: the setting that was changed; agents that only one run has show in what they bring."""
+    found = {(one["of"], one["setting"]): one["values"] for one in compared["differences"]}
+    assert found == {
+        ("baseline", "agent"): {"slow": "dqn, ppo", "fast": "ppo"},
+        ("baseline", "learning_rate"): {"slow": "0.001", "fast": "0.0001"},
+    }
+    assert [one["label"] for one in compared["runs"]] == ["slow", "fast"]
+    assert compared["runs"][0]["layout_seeds"] == [100, 101]
+
+
+def test_runs_are_paired_by_layout_and_seed(compared):
+    """Spec F5: the first run against the second by hand: it loses three pairs by 5 steps and wins one by 1."""
+    (length,) = (row for row in compared["comparisons"] if row["quantity"] == "length")
+    assert (length["first"], length["second"], length["where"]) == ("slow", "fast", "PPO tuned")
+    assert (length["n"], length["wins"], length["probability"]) == (4, 1, 0.25)
+    assert length["difference"] == pytest.approx((5 + 5 + 5 - 1) / 4)
+    assert compared["shared"] == ["agents"]
+
+
+def test_the_page_shows_both(runs, compared):
+    """Spec F7: curves with seeds and bands in the caption, every agent in the table, one file, its inputs known."""
+    text = (runs / "both" / "index.html").read_text(encoding="utf-8")
+    titles = re.findall(r"<h2>(.*?)</h2>", text)
+    assert titles == ["What is compared", "What differs", "Agents", "Who wins, seed by seed"]
+    assert text.count("<figure") == 2
+    assert "± one standard error over them (slow, 4 runs: layout seeds 100 and 101, run seeds 0 and 1; fast" in text
+    assert "DQN tuned" in text
+    assert not re.search(r'(?:src|href)="(?!#|data:)', text)
+    artefact = open_artefact(runs / "both", "comparison")
+    assert [entry["kind"] for entry in artefact.manifest["inputs"]] == ["evaluation", "evaluation"]
+    assert {path.name for path in (runs / "both" / "figures").iterdir()} == {"reward-0.svg", "length-0.svg"}
+
+
+def test_methods_side_by_side(runs, tmp_path):
+    """Spec F5: runs without a common agent share one figure of all; there are no pairs."""
+    write_baseline(tmp_path / "other", "dqn", 100, 0, 30, steps=6_000)
+    evaluate(tmp_path / "other", tmp_path / "other" / "evaluation", quiet=True)
+    text = compare([runs / "fast", tmp_path / "other"], tmp_path / "out").read_text(encoding="utf-8")
+    assert text.count("<figure") == 2
+    assert "fast: PPO tuned" in text and "other: DQN tuned" in text
+    assert "No two runs share a seed" in text
+
+
+def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
+    """Spec G2: one run, one run twice, none evaluated, another domain, other settings, an older evaluation."""
+    slow, fast = runs / "slow", runs / "fast"
+
+    def refused(*given):
+        capsys.readouterr()
+        assert main(["compare", *map(str, given), "--out", str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert not (tmp_path / "out").exists()
+        return line
+
+    def changed(name, change):
+        shutil.copytree(fast, tmp_path / name)
+        path = tmp_path / name / "evaluation" / "metrics.json"
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        change(metrics)
+        path.write_text(json.dumps(metrics), encoding="utf-8")
+        return tmp_path / name
+
+    assert "two different runs or more" in refused(slow)
+    assert "two different runs or more" in refused(slow, fast, runs / "both" / ".." / "slow")
+    (tmp_path / "empty").mkdir()
+    assert "was not evaluated" in refused(slow, tmp_path / "empty")
+
+    def elsewhere(metrics):
+        for artefact in metrics["provenance"]["artefacts"]:
+            artefact["config"]["domain"] = "montezuma"
+
+    line = refused(slow, changed("elsewhere", elsewhere))
+    assert "different domains (slow: doorkey; elsewhere: montezuma)" in line
+    line = refused(slow, changed("otherwise", lambda metrics: metrics["settings"].update(window=50)))
+    assert "different window (slow: 100; otherwise: 50)" in line
+    line = refused(slow, changed("bare", lambda metrics: metrics.update(agents=[])))
+    assert "no kind of result in common (slow: agents; bare: nothing)" in line
+    assert "older hypogoal (no distance)" in refused(slow, changed("old", lambda metrics: metrics.pop("distance")))
+    with pytest.raises(UserError, match="exists already"):
+        compare([slow, fast], fast)
+
+
+def test_labels_tell_runs_apart():
+    """Spec F7: as short as that can be."""
+    assert labels_of(["/a/one", "/a/two"]) == ["one", "two"]
+    assert labels_of(["/a/run", "/b/run"]) == ["a/run", "b/run"]
+
+
+def test_curves_on_another_grid():
+    """Spec F5: the last value known, nothing before the first and past the end."""
+    found = on_grid(np.array([[1.0, 2.0, 3.0]]), np.array([10, 20, 30]), np.array([0, 10, 15, 30, 40]))
+    np.testing.assert_array_equal(found, [[np.nan, 1, 1, 3, np.nan]])

@@ -1,0 +1,118 @@
+"""Spec D1, D6, E1, F7: an agent's episode out of its saved artefacts, and what is drawn of it."""
+
+import io
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_tensors
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.evaluation.videos import BAR, draw_frame, episode_gif, frame_lines
+from hypogoal.hypotheses.storage import read_ensemble
+from hypogoal.meta.watched import Agent, Frame, play_episode
+from hypogoal.stages.collect import collect
+from hypogoal.stages.report import agents_of, draw_videos
+from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
+from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
+
+QUIET = {"quiet": True}
+CAP, TIMEOUT, MEMBERS = 30, 7, 2
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """An agent, barely trained, and the random chooser beside it."""
+    run = tmp_path_factory.mktemp("runs") / "watched"
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
+    few = TrainEnsembleConfig(steps=10, members=MEMBERS, workers=1)
+    train_ensemble(run / "data.h5", few, run / "ensemble", **QUIET)
+    short = TrainMetaConfig(
+        steps=640, max_episode_steps=CAP, option_timeout=TIMEOUT, random_episodes=1, layout_seed=100, warm_up=100
+    )
+    train_meta(run / "ensemble", short, run / "meta", **QUIET)
+    train_meta(run / "ensemble", replace(short, chooser="random"), run / "meta-random", **QUIET)
+    return run
+
+
+@pytest.fixture(scope="module")
+def frames(run):
+    artefact = open_artefact(run / "meta")
+    source = open_artefact(run / "ensemble")
+    weights = (load_tensors(artefact.path / f"{name}.safetensors") for name in ("options", "meta"))
+    agent = Agent(artefact.config, source.config, source.path, *weights)
+    played = [play_episode(agent, DOMAIN, seed=3) for _ in range(2)]
+    for first, second in zip(*played, strict=True):
+        assert (first.option, first.step, first.ended) == (second.option, second.step, second.ended)
+    return played[0]
+
+
+def test_an_episode_is_whole(frames):
+    """Spec D1: every step once, from 0 to the cap or the goal; each execution's time runs down by one a step."""
+    running = [frame for frame in frames if not frame.ended]
+    assert [frame.step for frame in running] == list(range(len(running)))
+    assert frames[-1].ended and frames[-1].step == len(running) <= CAP
+    for before, after in pairwise(frames):
+        if before.ended:
+            assert after.left == TIMEOUT
+            assert after.step == before.step
+            np.testing.assert_array_equal(after.observation, before.observation)
+        else:
+            assert (after.left, after.option, after.step) == (before.left - 1, before.option, before.step + 1)
+    for frame in frames:
+        if frame.ended == "its time is up":
+            assert frame.left == 0 and not frame.says_yes
+        if frame.ended == "its classifier says yes":
+            assert frame.says_yes
+
+
+def test_verdicts_are_those_of_the_member_that_runs(run, frames):
+    """Spec D1, D6: recomputed here from the pictures and the weights."""
+    source = open_artefact(run / "ensemble")
+    for option in {frame.option for frame in frames}:
+        own = [frame for frame in frames if frame.option == option]
+        ensemble = read_ensemble(source.path, source.config, source.config["sub_goals"][option // MEMBERS])
+        says = ensemble.verdicts(np.stack([frame.observation for frame in own]))[:, option % MEMBERS]
+        assert says.tolist() == [frame.says_yes for frame in own]
+
+
+def test_videos_are_files_of_the_agents_that_choose(run, tmp_path):
+    """Spec E1, F7: of the one that learned to choose, not of the random chooser; a frame for each of the episode's."""
+    agents = agents_of(run)
+    assert [artefact.path.name for artefact in agents] == ["meta"]
+    draw_videos(agents, run, tmp_path / "videos", 2)
+    files = sorted((tmp_path / "videos").iterdir())
+    assert [path.name for path in files] == ["meta-episode-0.gif", "meta-episode-1.gif"]
+    with Image.open(files[0]) as video:
+        assert video.format == "GIF"
+        assert 2 < video.n_frames <= 2 * CAP + 1
+        assert video.size[0] == 320
+
+
+def test_a_run_without_such_an_agent_is_one_line(tmp_path):
+    """Spec G2: what is missing is named."""
+    with create_artefact(
+        tmp_path / "meta", kind="meta", config={"chooser": "random", "termination": "learned"}, seed=0
+    ):
+        pass
+    with pytest.raises(UserError, match="Videos need a meta artefact with learned terminations"):
+        agents_of(tmp_path)
+
+
+def test_what_is_drawn_of_a_frame():
+    """Spec F7: option, member, verdict and time left in words; the bar is as long as the time that is left."""
+    stack = np.zeros((84, 84, 4), np.uint8)
+    stack[..., 3] = 200
+    frame = Frame(stack, 12, 3, False, 5, "")
+    assert frame_lines(frame, ["red", "door"], 2) == ["door, member 1", "step 12   reached? no   5 left", ""]
+    assert frame_lines(replace(frame, ended="its time is up"), ["red", "door"], 2)[2] == "ends: its time is up"
+    picture = draw_frame(frame, ["red", "door"], 2, timeout=10)
+    assert picture.shape[1] == 336 and (picture[:336] == 200).all()
+    bar = picture[336 + BAR // 2]
+    assert (bar[:168] == bar[0]).all() and (bar[170:] == bar[-1]).all() and (bar[0] != bar[-1]).any()
+    video = Image.open(io.BytesIO(episode_gif([frame, replace(frame, left=0, ended="x")], ["red", "door"], 2, 10)))
+    assert video.n_frames == 2

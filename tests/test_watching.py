@@ -1,0 +1,103 @@
+"""Spec A6: the view of a run out of its logs, finished or not."""
+
+import io
+import json
+import os
+import time
+
+import pytest
+from rich.console import Console
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.core.progress import MetricsLog
+from hypogoal.watching import BARS, curve, finished, read_progress, view
+
+
+def write(folder, rows):
+    log = MetricsLog(folder / "metrics.jsonl")
+    for row in rows:
+        log.write(**row)
+    log.close()
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A complete ensemble and an agent whose artefact is still being made, its last line half written."""
+    run = tmp_path / "run"
+    with create_artefact(run / "ensemble", kind="ensemble", config={}, seed=0) as folder:
+        goals = ("collect-red-key", "open-red-door")
+        write(folder, [{"sub_goal": goal, "step": s, "loss": 1 / s} for goal in goals for s in (10, 20)])
+    with create_artefact(run / "meta/layout-100-seed-0", kind="meta", config={}, seed=0) as folder:
+        write(folder, [{"step": 1_000 * s, "success": s / 10, "length": 50.0} for s in range(1, 10)])
+        with (folder / "metrics.jsonl").open("a") as file:
+            file.write('{"step": 10000, "succ')
+        yield run
+
+
+def test_what_is_being_made_comes_first(run):
+    """Spec A6: read from the folder that a stage fills, under the name that it will have."""
+    agent, ensemble = read_progress(run)
+    assert (agent.name, agent.step, agent.watched) == ("meta/layout-100-seed-0", 9_000, "success")
+    assert agent.series == tuple(s / 10 for s in range(1, 10))
+    assert agent.seconds is not None and agent.seconds < 60
+    assert (ensemble.name, ensemble.seconds) == ("ensemble: open-red-door", None)
+    assert ensemble.series == (0.1, 0.05)
+
+
+def test_the_view_fits_80_columns(run):
+    """Spec A6: with ages, steps, the last value and a curve; long names lose their beginning."""
+    log = next(run.glob("meta/.*/metrics.jsonl"))
+    os.utime(log, (time.time() - 300, time.time() - 300))
+    deep = run / "a-setting-with-a-long-name" / "options" / "layout-123-seed-45"
+    with create_artefact(deep, kind="options", config={}, seed=0) as folder:
+        write(folder, [{"step": 1_500_000, "reached": 0.987654321}])
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(view(read_progress(run)))
+    lines = console.export_text().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "1 in the making, 2 complete" in lines[0]
+    text = "\n".join(lines)
+    assert "5 min ago" in text and "1,500,000" in text and "reached 0.988" in text
+    assert "options/layout-123-seed-45" in text
+    assert "▂▃▃▄▅▅▆▇▇" in text or "▂▂▃▄▅▅▆▇▇" in text
+    assert sum(line.startswith("…") for line in lines) == 1
+
+
+def test_a_view_of_few_rows_says_that_there_are_more(run):
+    """Spec A6: what does not fit the terminal is counted."""
+    table = view(read_progress(run) * 10, most=5)
+    assert table.row_count == 4
+    assert table.caption == "and 16 more"
+
+
+def test_curves_by_hand():
+    """Spec A6: shares from 0 to 1, anything else from its least to its greatest; a constant is flat."""
+    assert curve([0, 0.5, 1], (0, 1)) == BARS[0] + BARS[4] + BARS[7]
+    assert curve([10, 20]) == BARS[0] + BARS[7]
+    assert curve([3, 3, 3]) == BARS[0] * 3
+    assert curve([float("nan")]) == ""
+    assert curve([1, 1, 3, 3], width=2) == BARS[0] + BARS[7]
+
+
+def test_watch_from_the_command_line(run, capsys, tmp_path):
+    """Spec A6, G2: without a terminal it prints once; nothing to watch is one line."""
+    assert main(["watch", str(run), "--once"]) == 0
+    assert "meta/layout-100-seed-0" in capsys.readouterr().out
+    assert main(["watch", str(run)]) == 0
+    capsys.readouterr()
+    assert main(["watch", str(tmp_path / "nowhere")]) == 2
+    assert "no such run" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=r"no metrics\.jsonl"):
+        read_progress(tmp_path / "empty")
+
+
+def test_a_run_is_finished_when_it_says_so(tmp_path):
+    """Spec A6: run.json is written last; while something is made anew it is not finished."""
+    with create_artefact(tmp_path / "meta", kind="meta", config={}, seed=0) as folder:
+        write(folder, [{"step": 1, "success": 0.5}])
+        (tmp_path / "run.json").write_text(json.dumps({}))
+        assert not finished(tmp_path)
+    assert finished(tmp_path)
