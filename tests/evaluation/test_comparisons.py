@@ -141,9 +141,12 @@ def test_the_table_says_each_method_once():
     )
     rows = [{**row, "interval": [None, None], "difference_interval": [None, None]} for row in rows]
     (table,) = comparison_tables(rows, "seed", "layouts", {"length": 0})
-    assert [column["name"] for column in table["columns"]][:3] == ["quantity", "first", "second"]
+    assert [column["name"] for column in table["columns"]][:2] == ["quantity", "second"]
+    assert table["heading"] == "Seed by seed: a against the others"
     length = [line["cells"] for line in table["rows"]][2:4]
-    assert length[0][:3] == ["length (lower is better)", "a", "b"]
-    assert length[1][:3] == ["", "", "c"]
-    assert length[0][3]["text"] == "1.00" and length[0][4] == "1–0–0" and length[0][6]["text"] == "-2"
+    assert length[0][:2] == ["length (lower is better)", "b"]
+    assert length[1][:2] == ["", "c"]
+    assert length[0][2]["text"] == "1.00" and length[0][3] == "1–0–0" and length[0][5]["text"] == "-2"
+    (told,) = comparison_tables([*rows, {**rows[0], "first": "b", "where": "N=1"}], "seed", "layouts")
+    assert [column["name"] for column in told["columns"]][:4] == ["quantity", "of", "first", "second"]
     assert comparison_tables([], "seed", "layouts") == []

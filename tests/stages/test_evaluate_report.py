@@ -225,7 +225,7 @@ def test_the_page_shows_all_of_it(run, page):
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     assert page.count("<figure") == 4
-    assert page.count("<h3>Seed by seed against the first</h3>") == 2
+    assert page.count("<h3>Seed by seed: ") == 2
     assert "1 run: layout seed 100, run seed 0" in page
     assert "Figure 6 of the paper" in page
     assert "no agent &#39;DQN tuned&#39;" in page

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 from hypogoal.evaluation.page.blocks import Block, cell, fixed, row, table
 
 CAPTION = (
-    "Pairs of runs that share {shared}. Probability: the share of pairs in which the first is better, a tie counting "
-    "half, with its 95 % bootstrap interval (2,000 resamples, within {strata} where each has several); 0.5: neither "
-    "is. An interval without width means that every pair came out alike, not that it is certain: see the number of "
-    "pairs and the sign test (two-sided, ties left out). Difference: mean of first − second, with its 95 % interval."
+    "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
+    "better, a tie counting half, with its 95 % bootstrap interval (2,000 resamples, within {strata} where each has "
+    "several); 0.5: neither is. An interval without width means that every pair came out alike, not that it is "
+    "certain: see the number of pairs and the sign test (two-sided, ties left out). Difference: mean of first − "
+    "second, with its 95 % interval."
 )
 
 
@@ -25,19 +27,24 @@ def comparison_tables(
         shared, strata: what pairs share, and within what they are drawn.
         digits: decimals of a quantity's difference, 3 where it is not named.
     """
+    pairs = [entry for entry in rows if entry["n"]]
+    if not pairs:
+        return []
+    firsts = {entry["first"] for entry in pairs}
+    texts: dict[str, Callable[[Mapping[str, Any]], str]] = {
+        "quantity": _quantity,
+        "of": itemgetter("where"),
+        "first": itemgetter("first"),
+    }
+    shown = [name for name in texts if {"of": any(map(texts["of"], pairs)), "first": len(firsts) > 1}.get(name, True)]
     lines: list[dict[str, Any]] = []
-    last: tuple[str, str] | None = None
-    for entry in rows:
-        if not entry["n"]:
-            continue
-        key = (entry["quantity"], entry["where"])
+    last: tuple[str, ...] | None = None
+    for entry in pairs:
+        key = tuple(texts[name](entry) for name in shown)
         places = (digits or {}).get(entry["quantity"], 3)
-        better = "" if entry["higher"] else " (lower is better)"
         lines.append(
             row(
-                f"{entry['quantity']}{better}" if key != last else "",
-                entry["where"] if key != last else "",
-                entry["first"] if key != last else "",
+                *(key if key != last else [""] * len(key)),
                 entry["second"],
                 cell(fixed(entry["probability"], 2), _between(entry["interval"], 2)),
                 f"{entry['wins']}–{entry['n'] - entry['wins'] - entry['ties']}–{entry['ties']}",
@@ -47,25 +54,23 @@ def comparison_tables(
             )
         )
         last = key
-    if not lines:
-        return []
-    if not any(line["cells"][1] for line in lines):
-        lines = [{**line, "cells": [line["cells"][0], *line["cells"][2:]]} for line in lines]
-        columns: tuple[str, ...] = ("quantity", "first", "second")
-    else:
-        columns = ("quantity", "of", "first", "second")
-    numbers = ("probability of improvement", "won–lost–tied", "sign test p", "difference")
-    caption = CAPTION.format(shared=shared, strata=strata)
+    numbers = ("P(first better)", "won–lost–tied", "sign test p", "difference")
+    title = f"Seed by seed: {firsts.pop()} against the others" if len(firsts) == 1 else "Seed by seed"
     return [
         table(
-            (*columns, *numbers),
+            (*shown, "second", *numbers),
             lines,
-            texts=len(columns),
+            texts=len(shown) + 1,
             tight=True,
-            heading="Seed by seed against the first",
-            caption=caption,
+            heading=title,
+            caption=CAPTION.format(shared=shared, strata=strata),
         )
     ]
+
+
+def _quantity(entry: Mapping[str, Any]) -> str:
+    name = str(entry["quantity"]).replace("_", " ")
+    return name if entry["higher"] else f"{name} (lower is better)"
 
 
 def _between(bounds: Sequence[float | None], digits: int) -> str:

@@ -139,7 +139,10 @@
     const { states, members } = goal();
     member = Math.min(Math.max(member, 0), members.length - 1);
     const shown = states.map((one, index) => [one, index]).filter(([one]) => passes(one));
-    if (!shown.some(([, index]) => index === state)) state = shown.length ? shown[0][1] : null;
+    if (!shown.some(([, index]) => index === state)) {
+      const first = shown.find(([one]) => one.saliency.length) ?? shown[0]; // one with attributions says more
+      state = first ? first[1] : null;
+    }
     at("count").textContent = `${shown.length} of ${states.length} states`;
     at("tiles").replaceChildren(...shown.map(([one, index]) => tile(one, index)));
     at("detail").replaceChildren(...detail());
