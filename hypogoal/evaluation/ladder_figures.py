@@ -68,6 +68,8 @@ def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
             place.set_xlim(min(ticks, default=0) - 0.4, max(ticks, default=1) + 0.4)
         for place in axes[-1]:
             place.set_xlabel("labelled ladder groups, N")
+        for place in axes[:, 0]:
+            place.set_ylabel("fraction")
         for place in axes.flat[len(panels) :]:
             place.set_visible(False)
         _legend(figure, list(axes.flat), 3)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, open_artefact
+from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
@@ -37,6 +36,7 @@ from hypogoal.evaluation.curves import GAMMA, SOLVED, WINDOW
 from hypogoal.evaluation.distance import INSIDE, LAST, NEAR, ORACLE, distance_tables, ladder_numbers
 from hypogoal.evaluation.ensembles import ensemble_name, ensemble_names, hypotheses_table, sub_goal_metrics
 from hypogoal.evaluation.examples import overlay
+from hypogoal.evaluation.found import Found, find, most_used, takes, within
 from hypogoal.evaluation.ladders import ladder_names, missing_ladders
 from hypogoal.evaluation.quantities import QUANTITIES, plain
 from hypogoal.evaluation.reading import read_choices, read_episodes, read_executions, read_layout, read_terminations
@@ -54,33 +54,6 @@ __all__ = ["evaluate", "hypotheses_summary", "summary_table"]
 SELECTED = (LEARNED, RANDOM, PRETRAINING)  # agents whose options are members: the others have nothing to select
 SETTINGS = {"window": WINDOW, "solved": SOLVED, "gamma": GAMMA, "threshold": THRESHOLD}
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
-
-
-@dataclass(frozen=True)
-class Found:
-    """The artefacts of a run that are evaluated.
-
-    Attributes:
-        run: its folder.
-        ensembles: every one.
-        agents: what plays a layout: metas, options that no meta continues, baselines.
-        ladders: options learned from a named start each, with a table of where they stopped.
-        silent: options learned from a named start without that table; they are not evaluated.
-    """
-
-    run: Path
-    ensembles: list[Artefact]
-    agents: list[Artefact]
-    ladders: list[Artefact]
-    silent: list[Artefact]
-
-    def everything(self) -> list[Artefact]:
-        """All of them."""
-        return [*self.ensembles, *self.agents, *self.ladders]
-
-    def name(self, artefact: Artefact) -> str:
-        """Its path within the run."""
-        return artefact.path.relative_to(self.run).as_posix()
 
 
 def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) -> dict[str, Any]:
@@ -148,30 +121,6 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
     return metrics
 
 
-def find(run: Path) -> Found:
-    """The artefacts to evaluate: options that a meta artefact continues are part of that one.
-
-    Raises:
-        UserError: there is none, or one is damaged.
-    """
-    metas = find_artefacts(run, "meta")
-    continued = {
-        (artefact.path / entry["relative"]).resolve()
-        for artefact in metas
-        for entry in artefact.manifest["inputs"]
-        if entry["kind"] == "options"
-    }
-    options = [artefact for artefact in find_artefacts(run, "options") if artefact.path.resolve() not in continued]
-    ladders = [artefact for artefact in options if "executions.csv" in artefact.manifest["files"]]
-    silent = [artefact for artefact in options if artefact not in ladders and artefact.config.get("start")]
-    others = [artefact for artefact in options if artefact not in (*ladders, *silent)]
-    agents = [*metas, *others, *find_artefacts(run, "baseline")]
-    found = Found(run, find_artefacts(run, "ensemble"), agents, ladders, silent)
-    if not found.everything():
-        raise UserError("nothing to evaluate", run, "Train something into it first, see 'hypogoal run --help'.")
-    return found
-
-
 def evaluate_ensembles(
     found: Found, arrays: Any, progress: Progress
 ) -> tuple[list[dict[str, Any]], dict[str, Any] | None, dict[str, Any] | None]:
@@ -184,7 +133,7 @@ def evaluate_ensembles(
     configs = [artefact.config for artefact in artefacts]
     rows: list[list[dict[str, Any]]] = [[] for _ in artefacts]
     shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
-    browsed = _most_used(found)
+    browsed = most_used(found)
     explained, browsable = [], []
     sources = [artefact.input("data") for artefact in artefacts]
     for path in sorted(set(sources)):
@@ -215,18 +164,6 @@ def evaluate_ensembles(
     about = {"ensemble": metrics[shown]["path"], "seed": metrics[shown]["seed"], "baseline": BASELINE}
     other = {"ensemble": metrics[browsed]["path"], "seed": metrics[browsed]["seed"], "baseline": BASELINE}
     return metrics, {**about, "sub_goals": explained}, {**other, "sub_goals": browsable}
-
-
-def _most_used(found: Found) -> int | None:
-    """Which of the ensembles with the most members the most artefacts were learned from; the first of several."""
-    users = [artefact.input("ensemble").resolve() for artefact in (*found.agents, *found.ladders) if takes(artefact)]
-    rank = [(artefact.config["members"], users.count(artefact.path.resolve())) for artefact in found.ensembles]
-    return max(range(len(rank)), key=lambda index: rank[index], default=None)
-
-
-def takes(artefact: Artefact) -> bool:
-    """Whether it was learned with the verdicts of an ensemble's members."""
-    return artefact.kind != "baseline" and artefact.config["termination"] == "learned"
 
 
 def judge(
@@ -305,12 +242,6 @@ def _ladders_named(found: Found, ensembles: list[dict[str, Any]]) -> list[dict[s
         {"method": name, "groups": own, "ensemble": path, "validated": member}
         for name, own, path, member in zip(names, groups, sources, validated, strict=True)
     ]
-
-
-def within(found: Found, source: Artefact) -> str | None:
-    """An ensemble's path within the run; None where it is not one of the run's."""
-    same = (own for own in found.ensembles if own.path.resolve() == source.path.resolve())
-    return next((found.name(own) for own in same), None)
 
 
 def validated_members(ensemble: Mapping[str, Any]) -> dict[str, int | None]:
