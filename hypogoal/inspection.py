@@ -9,7 +9,7 @@ from typing import Any
 from hypogoal.core.artefacts import MANIFEST, check_files, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import SPLITS, open_dataset
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import installed_domain
 
 
 def describe_path(path: Path) -> dict[str, Any]:
@@ -93,10 +93,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
 
 def kinds_of(domain: str) -> Sequence[str]:
     """What the values of the origin ``kind`` mean in a domain; nothing where it is not installed or has no kinds."""
-    try:
-        return getattr(load_domain(domain), "kinds", ())
-    except UserError:
-        return ()
+    return getattr(installed_domain(domain), "kinds", ())
 
 
 def faults_of(path: Path) -> list[str]:

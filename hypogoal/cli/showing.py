@@ -52,7 +52,7 @@ def config(
     from hypogoal.domains.base import defaults_of
     from hypogoal.stages.run import config_class_of
 
-    rows = describe(config_class_of(stage, domain), defaults_of(domain, stage))
+    rows = describe(config_class_of(stage, domain), defaults_of(domain, stage, given=True))
     if as_json:
         echo(rows, True, [])
         return

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_json
+from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+
+AGAIN = "Evaluate the run again."
 
 
 def report(run: Path, *, force: bool = False) -> Path:
@@ -32,8 +34,11 @@ def report(run: Path, *, force: bool = False) -> Path:
     out = run / "report"
     source = _evaluation_of(run)
     claim(out, force=force)
-    material = Material(_metrics(source), _arrays(source.path / "arrays.h5"))
-    page = render(material, versions().get("hypogoal", "unknown"))
+    material = Material(_metrics(source.whole()), _arrays(source.path / "arrays.h5"))
+    try:
+        page = render(material, versions().get("hypogoal", "unknown"))
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise UserError("the evaluation does not fit this hypogoal, or is damaged", source.path, AGAIN) from error
     with create_artefact(out, kind="report", config={}, seed=0, inputs=[source.path], force=force) as folder:
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
@@ -53,25 +58,15 @@ def _evaluation_of(run: Path) -> Artefact:
 
 def _metrics(source: Artefact) -> dict[str, Any]:
     path = source.path / "metrics.json"
-    try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
-    return dict(metrics)
+    metrics = read_json(path, "the evaluation is", AGAIN)
+    if not isinstance(metrics, dict):
+        raise UserError("the evaluation is damaged", path, AGAIN)
+    return metrics
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    import h5py
-
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def read(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            arrays[name] = np.asarray(item[()])
-
-    try:
-        with h5py.File(path, "r") as file:
-            file.visititems(read)
-    except OSError:
-        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
-    return arrays
+    with open_hdf5(path, "the evaluation's arrays", AGAIN) as file:
+        try:
+            return {name: read_array(file, name, "uibfT") for name in walk(file)}
+        except Foreign as error:
+            raise UserError(f"the evaluation's arrays are damaged ({error})", path, AGAIN) from None

@@ -70,7 +70,7 @@ def train_baseline(
 
     prepare(device)
     claim(out, force=force)
-    played = load_domain(domain)
+    played = load_domain(domain, given=True)
     chosen = hyperparameters(config.agent, config.setting)
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)

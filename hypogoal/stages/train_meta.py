@@ -66,8 +66,8 @@ def train_meta(
         Steps, episodes, and success and length over the last 100 episodes.
     """
     prepare(device)
-    source = open_artefact(ensemble, "ensemble")
-    trained = open_artefact(options, "options") if options else None
+    source = open_artefact(ensemble, "ensemble").whole()
+    trained = open_artefact(options, "options").whole() if options else None
     if trained:
         _check_fit(trained, source, config)
     claim(out, force=force)

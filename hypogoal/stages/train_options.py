@@ -57,7 +57,7 @@ def train_options(
         an episode, instead of these two the shares of ``recorder.recent``.
     """
     prepare(device)
-    source = open_artefact(ensemble, "ensemble")
+    source = open_artefact(ensemble, "ensemble").whole()
     claim(out, force=force)
     domain = load_domain(source.config["domain"])
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
