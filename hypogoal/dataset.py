@@ -96,7 +96,7 @@ def write_dataset(
                 _write_split(file, split, states, collected.sub_goals)
                 file.flush()
             group = file.create_group("unlabelled")
-            _write_observations(group, collected.unlabelled.observations)
+            write_observations(group, collected.unlabelled.observations)
             _write_origins(group, collected.unlabelled.origins)
             file.flush()
             file.attrs["complete"] = True
@@ -110,7 +110,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
     for index, sub_goal in enumerate(sub_goals):
         group = file.create_group(f"{split}/{sub_goal}")
         if first is None:
-            _write_observations(group, states.observations)
+            write_observations(group, states.observations)
             _write_origins(group, states.origins)
             first = group
         else:
@@ -120,7 +120,8 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
         group.create_dataset("labels", data=states.labels[:, index].astype(np.bool_))
 
 
-def _write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
+def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
+    """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
     chunk = (min(64, max(1, len(observations))), *observations.shape[1:])
     group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
 

@@ -1,4 +1,4 @@
-"""What is at a path, and is it whole: the answers of ``hypogoal show`` and ``hypogoal verify``."""
+"""What is at a path: the answers of ``hypogoal show``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import MANIFEST, check_files, open_artefact
+from hypogoal.core.artefacts import MANIFEST, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
@@ -23,12 +23,13 @@ def describe_path(path: Path) -> dict[str, Any]:
             **about,
             "config": dataset.config,
             "counts": dataset.counts(),
+            "lost": list(dataset.lost) or None,
         }
     if (path / MANIFEST).is_file():
         artefact = open_artefact(path)
         keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
         return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
-    return {"kind": "run", "path": str(path), "artefacts": [describe_path(part) for part in _parts(path)]}
+    return {"kind": "run", "path": str(path), "artefacts": [describe_path(part) for part in parts_of(path)]}
 
 
 def lines(about: dict[str, Any]) -> list[str]:
@@ -96,35 +97,12 @@ def kinds_of(domain: str) -> Sequence[str]:
     return getattr(installed_domain(domain), "kinds", ())
 
 
-def faults_of(path: Path) -> list[str]:
-    """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
-    try:
-        if path.is_file():
-            return _data_faults(path)
-        if (path / MANIFEST).is_file():
-            artefact = open_artefact(path)
-            return [f"{path}/{fault}" for fault in check_files(artefact)]
-        return [fault for part in _parts(path) for fault in faults_of(part)]
-    except UserError as error:
-        return [str(error)]
+def parts_of(run: Path) -> list[Path]:
+    """The data files and artefacts of a run.
 
-
-def _data_faults(path: Path) -> list[str]:
-    dataset = open_dataset(path)
-    faults = []
-    for split in SPLITS:
-        for sub_goal in dataset.sub_goals:
-            part = getattr(dataset, split)(sub_goal)
-            if part.observations.shape[1:] != dataset.observation_shape or part.observations.dtype.name != "uint8":
-                faults.append(f"{path}: {split}/{sub_goal}: observations are not uint8 {dataset.observation_shape}")
-            if len(part.labels) != len(part.observations):
-                faults.append(f"{path}: {split}/{sub_goal}: {len(part.labels)} labels, {len(part.observations)} states")
-    if dataset.unlabelled().shape[1:] != dataset.observation_shape:
-        faults.append(f"{path}: unlabelled: observations are not uint8 {dataset.observation_shape}")
-    return faults
-
-
-def _parts(run: Path) -> list[Path]:
+    Raises:
+        UserError: there is none.
+    """
     if not run.is_dir():
         raise UserError("no such file or folder", run, "Check the path.")
     artefacts = [manifest.parent for manifest in sorted(run.rglob(MANIFEST)) if not _hidden(manifest, run)]

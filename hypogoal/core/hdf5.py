@@ -134,7 +134,7 @@ def check_dataset(dataset: Any, kinds: str) -> int:
                 raise Foreign(f"{name!r} needs a filter that is not one of {', '.join(FILTERS.values())}")
         size, stored = prod(map(int, shape)) * dtype.itemsize, int(dataset.id.get_storage_size())
         chunk = prod(map(int, dataset.chunks)) * dtype.itemsize if dataset.chunks else 0
-        whole = Path(dataset.file.filename).stat().st_size
+        whole = int(dataset.file.id.get_filesize())
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
         raise Foreign("a dataset is not readable") from None
     ratio = MOST_RATIO if settings.get_nfilters() else 1

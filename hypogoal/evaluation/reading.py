@@ -28,7 +28,7 @@ FLAGS = ("reached", "inside_at_start", "terminated")  # columns of executions.cs
 
 def read_episodes(path: Path) -> Episodes:
     """``episodes.csv``: step, length, reward, terminated."""
-    table = _read_table(path, ("step", "length", "reward", "terminated"))
+    table = read_table(path, ("step", "length", "reward", "terminated"))
     return Episodes(
         table["step"].astype(np.int64),
         table["length"].astype(np.int64),
@@ -40,7 +40,7 @@ def read_episodes(path: Path) -> Episodes:
 def read_choices(path: Path) -> Choices:
     """``choices.csv``: one row per option and window."""
     names = tuple(Choices.__dataclass_fields__)
-    table = _read_table(path, names)
+    table = read_table(path, names)
     columns: dict[str, Any] = {name: table[name].astype(CHOICE_KINDS.get(name, np.int64)) for name in names}
     return Choices(**columns)
 
@@ -48,7 +48,7 @@ def read_choices(path: Path) -> Choices:
 def read_executions(path: Path) -> Executions:
     """``executions.csv``: one row per execution of an option, in the order in which they ended."""
     names = tuple(Executions.__dataclass_fields__)
-    table = _read_table(path, names)
+    table = read_table(path, names)
     columns: dict[str, Any] = {name: table[name].astype(np.bool_ if name in FLAGS else np.int64) for name in names}
     return Executions(**columns)
 
@@ -57,7 +57,7 @@ def read_layout(path: Path) -> dict[str, Any]:
     """``layout.json``: layout_seed, shortest_path, random_success, random_episodes."""
     facts = read_json(path, "the layout's file is", AGAIN)
     wanted = {"layout_seed": int, "shortest_path": int | None, "random_success": float | int | None}
-    fits = isinstance(facts, dict) and all(isinstance(facts.get(key), kind) for key, kind in wanted.items())
+    fits = isinstance(facts, dict) and all(isinstance(facts.get(key, ...), kind) for key, kind in wanted.items())
     if not fits or not 0 <= facts["layout_seed"] < MOST or type(facts.get("random_episodes")) is not int:
         raise UserError("the layout's file is damaged", path, AGAIN)
     return {key: facts[key] for key in (*wanted, "random_episodes")}
@@ -72,10 +72,20 @@ def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:
             raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
 
 
-def _read_table(path: Path, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, NDArray[np.float64]]:
+    """Columns of a table of numbers, float (n,) each.
+
+    Args:
+        path: a CSV file with a header.
+        columns: those that must be there; all that are where None.
+
+    Raises:
+        UserError: missing, too large, no table, or what stands in it is no finite number of at most 2^53.
+    """
     text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
     try:
         reader = csv.DictReader(io.StringIO(text, newline=""))
+        columns = list(reader.fieldnames or ()) if columns is None else columns
         if not set(columns) <= set(reader.fieldnames or ()):
             raise KeyError(path)
         rows = [[float(row[name]) for name in columns] for row in reader]

@@ -19,12 +19,13 @@ from torch import Tensor
 
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow_tensors, linear_epsilon
 from hypogoal.learners.n_step import StepsAhead
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
 from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_to_states
 from hypogoal.options.running import running_verdicts
@@ -262,6 +263,8 @@ class LightLearner:
         """Continue from the weights and counters of an artefact; the replay starts empty."""
         check_actions(state, self.actions, self.config.actions)
         weights = {name[7:]: value for name, value in state.items() if name.startswith("online.")}
+        check_fit(self.online.state_dict(), weights, "options.safetensors", AGAIN)
+        check_counters(state, self.options)
         self.online.load_state_dict(weights)
         self.target.load_state_dict(weights)
         self.option_steps[:] = state["option_steps"].numpy()

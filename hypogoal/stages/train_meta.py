@@ -6,7 +6,6 @@ count in every curve.
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import load_domain
+from hypogoal.evaluation import reading
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
 from hypogoal.meta.ppo import MetaPolicy
@@ -110,10 +110,9 @@ def train_meta(
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     """The rows of an ``episodes.csv``: step, length, reward, terminated."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return [
-            (int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"])) for r in csv.DictReader(file)
-        ]
+    found = reading.read_episodes(path)
+    columns = (found.step, found.length, found.reward, found.terminated.astype(int))
+    return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> None:
