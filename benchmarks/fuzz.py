@@ -42,7 +42,7 @@ from hypogoal.core.artefacts import create_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import Collected, States, write_dataset
 
-SECONDS = 20.0
+SECONDS = 60.0  # of the clock: the machine may be busy
 MEMORY = 2**30
 SUB_GOALS, MEMBERS, SHAPE, NETWORK = ("open-red-door", "go-to-goal"), 2, (24, 32, 3), "montezuma-crop"  # small
 PRESET = {
@@ -371,7 +371,7 @@ def _lines(child: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
     assert child.stdout is not None
     with selectors.DefaultSelector() as selector:
         selector.register(child.stdout, selectors.EVENT_READ)
-        patience = 120.0  # to start
+        patience = 600.0  # to start
         while selector.select(patience):
             line = child.stdout.readline()
             if not line:

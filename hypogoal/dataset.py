@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, plain_name
-from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, find, members, open_hdf5, read_array
+from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, members, open_hdf5, read_array
 from hypogoal.core.manifests import FORMAT_VERSION
 
 SPLITS = ("labelled", "heldout")
@@ -78,13 +78,11 @@ def write_dataset(
     force: bool = False,
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole."""
-    import h5py
-
     claim(path, force=force)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
-        with h5py.File(partial, "w") as file:
+        with create_hdf5(partial) as file:
             file.attrs["format"] = FORMAT_VERSION
             file.attrs["domain"] = domain
             file.attrs["sub_goals"] = json.dumps(list(collected.sub_goals))
@@ -92,14 +90,13 @@ def write_dataset(
             file.attrs["config"] = json.dumps(dict(config))
             file.attrs["seed"] = seed
             file.attrs["versions"] = json.dumps(versions())
+            file.attrs["complete"] = False  # its place is in front: a file that is cut off keeps its attributes
             for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
                 _write_split(file, split, states, collected.sub_goals)
-                file.flush()
             group = file.create_group("unlabelled")
             write_observations(group, collected.unlabelled.observations)
             _write_origins(group, collected.unlabelled.origins)
-            file.flush()
-            file.attrs["complete"] = True
+            file.attrs.modify("complete", True)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, require_file
-from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, find, read_array, walk
+from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, read_array, walk
 from hypogoal.core.preflight import free_disk, human
 from hypogoal.dataset import ATTRIBUTES, open_dataset, write_observations
 
@@ -51,7 +51,7 @@ def repair(path: Path) -> Repaired:
     sub_goals = [name for name in about["sub_goals"] if f"labelled/{name}" in parts]
     if not sub_goals:
         raise UserError("no labelled group is whole, nothing can be saved", path, "Collect it again.")
-    if about["complete"] and all(name in parts for name in _expected(about["sub_goals"])):
+    if all(name in parts for name in _expected(about["sub_goals"])) and _opens(path):
         raise UserError("nothing to repair, every group is whole", path, "See 'hypogoal verify'.")
     lost = [name for name in _expected(about["sub_goals"]) if name not in parts]
     kept = [name for name in parts if name == "unlabelled" or name.partition("/")[2] in sub_goals]
@@ -92,6 +92,14 @@ def _whole_parts(path: Path, size: int) -> tuple[dict[str, Any], dict[str, Part]
                 f"nothing can be saved, the beginning of the file is damaged ({error})", path, again
             ) from None
     return about, parts
+
+
+def _opens(path: Path) -> bool:
+    try:
+        open_dataset(path)
+    except UserError:
+        return False
+    return True
 
 
 def _expected(sub_goals: list[str]) -> list[str]:
@@ -139,16 +147,15 @@ def _last_byte(dataset: Any) -> int:
 def _write(
     path: Path, about: Mapping[str, Any], sub_goals: list[str], parts: Mapping[str, Part], lost: list[str]
 ) -> None:
-    import h5py
-
     written: dict[int, Any] = {}
-    with h5py.File(path, "w") as file:
+    with create_hdf5(path) as file:
         for name, value in about.items():
             if value is not None and name not in ("sub_goals", "observation_shape", "lost", "complete"):
                 file.attrs[name] = value
         file.attrs["sub_goals"] = json.dumps(sub_goals)
         file.attrs["observation_shape"] = json.dumps(about["observation_shape"])
         file.attrs["lost"] = json.dumps(lost)
+        file.attrs["complete"] = True
         for group, arrays in parts.items():
             place = file.create_group(group)
             for name, values in arrays.items():
@@ -159,8 +166,6 @@ def _write(
                 else:
                     place.create_dataset(name, data=values.astype(np.bool_) if name == "labels" else values)
                 written.setdefault(id(values), place[name])
-        file.flush()
-        file.attrs["complete"] = True
     with path.open("rb") as file:
         os.fsync(file.fileno())
 

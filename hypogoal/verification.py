@@ -15,7 +15,6 @@ from hypogoal.core.files import read_json, read_text
 from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
-from hypogoal.evaluation.reading import read_table
 from hypogoal.inspection import parts_of
 
 AGAIN = "Make the artefact again."
@@ -81,6 +80,12 @@ def _fault(read: Callable[[], object]) -> Iterator[str]:
         yield str(error)
 
 
+def _read_table(path: Path) -> None:
+    from hypogoal.evaluation.reading import read_table
+
+    read_table(path)
+
+
 def _read_lines(path: Path) -> None:
     """JSON, one object a line; a number that was not there yet may be NaN."""
     for number, line in enumerate(read_text(path, "the log is", AGAIN).splitlines(), 1):
@@ -103,7 +108,7 @@ def _read_arrays(path: Path) -> None:
 
 CONTENTS: dict[str, Callable[[Path], object]] = {
     ".safetensors": load_tensors,
-    ".csv": read_table,
+    ".csv": _read_table,
     ".json": lambda path: read_json(path, "the file is", AGAIN),
     ".jsonl": _read_lines,
     ".h5": _read_arrays,

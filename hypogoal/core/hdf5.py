@@ -6,6 +6,7 @@ plugins) and declare terabytes in a kilobyte. None of it is needed here, and all
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from math import prod
 from pathlib import Path
@@ -38,6 +39,22 @@ def open_hdf5(path: Path, what: str, do: str) -> Any:
         return h5py.File(path, "r")
     except (OSError, ValueError, RuntimeError, KeyError):
         raise UserError(f"{what} is truncated or not HDF5", path, do) from None
+
+
+@contextlib.contextmanager
+def create_hdf5(path: Path) -> Iterator[Any]:
+    """A fresh HDF5 file to fill, built in memory and written when the block ends.
+
+    Where the disk is full the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished
+    bytes ourselves is an ``OSError`` like any other.
+    """
+    import h5py
+
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    path.write_bytes(image)
 
 
 class Foreign(Exception):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.files import require_file
 
 if TYPE_CHECKING:
@@ -19,10 +19,18 @@ MAX_HEADER_BYTES = 16 * 2**20  # names and shapes: 100 bytes a tensor
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write tensors by name."""
-    from safetensors.torch import save_file
+    """Write tensors by name.
 
-    save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path)
+    Raises:
+        NumericalError: Spec G3, a number is NaN or Inf; nothing is written.
+    """
+    import torch
+    from safetensors.torch import save
+
+    for name, tensor in tensors.items():
+        if tensor.dtype.is_floating_point and not torch.isfinite(tensor).all():
+            raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
+    path.write_bytes(save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

@@ -205,7 +205,8 @@ class RecurrentLearner:
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber * torch.from_numpy(weights)).mean()
         if not torch.isfinite(loss):
-            raise NumericalError(f"the loss of option {option} is {float(loss.detach())} at update {member.updates}")
+            where = f"in the batch of its update {member.updates}, its step {member.steps}"
+            raise NumericalError(f"the loss of option {option} is {float(loss.detach())} {where}")
         member.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         member.optimiser.step()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
+from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import open_dataset
@@ -95,8 +96,6 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
     Raises:
         UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
     """
-    import h5py
-
     prepare()
     claim(out, force=force)
     found = find(run)
@@ -106,7 +105,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force
     ) as folder:
         with (
-            h5py.File(folder / "arrays.h5", "w") as arrays,
+            create_hdf5(folder / "arrays.h5") as arrays,
             Progress("evaluate", total=len(inputs), quiet=quiet) as progress,
         ):
             runs = [read_run(found, artefact) for artefact in found.agents]
