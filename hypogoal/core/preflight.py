@@ -11,19 +11,19 @@ from hypogoal.core.errors import UserError
 CGROUP = Path("/sys/fs/cgroup")
 
 
-def preflight(stage: str, out: Path, *, memory: float, disk: float, quiet: bool = False) -> None:
+def preflight(stage: str, out: Path, needs: tuple[float, float], *, quiet: bool = False) -> None:
     """Say what a stage will need, and refuse to start where that does not fit.
 
     Args:
         stage: its command.
         out: what it writes; nothing of it need be there yet.
-        memory: bytes, at the most, of all its processes.
-        disk: bytes it writes, what it removes at the end included.
+        needs: bytes of memory, of all its processes, and of disk, what it removes at the end included.
         quiet: say nothing where it fits.
 
     Raises:
         UserError: it does not fit; the numbers are in the message.
     """
+    memory, disk = needs
     free, space = free_memory(), free_disk(out)
     known = "unknown" if free is None else human(free)
     text = (

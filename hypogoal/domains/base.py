@@ -72,8 +72,9 @@ class Domain(Protocol):
     It may also have ``starts`` (names of places where episodes begin, one of which ``make_engine`` takes as ``start``),
     ``distance`` (positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
     sub-goal holds), ``picture`` (room -> uint8 (height, width, 3)) and ``pixel`` (positions -> column and row in that
-    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``)
-    and ``defaults`` (see ``defaults_of``).
+    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``),
+    ``collected_bytes`` (config -> bytes of observations that ``collect`` will make, at the most) and ``defaults`` (see
+    ``defaults_of``).
     """
 
     name: str

@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -249,6 +250,11 @@ class MontezumaDomain:
             },
         }
     )
+
+    def collected_bytes(self, config: MontezumaConfig) -> int:
+        """Observations of a collection, at the most: every room labelled, unlabelled and held out."""
+        each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
+        return ROOMS * each * math.prod(self.observation_shape)
 
     def collect(self, config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         """See ``collect``."""

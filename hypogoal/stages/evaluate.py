@@ -15,6 +15,7 @@ from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artef
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import create_hdf5
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import open_dataset
@@ -47,6 +48,7 @@ from hypogoal.evaluation.summary import hypotheses_summary, summary_table
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.hypotheses.views import positions_of
+from hypogoal.needs import evaluation_needs
 
 __all__ = ["evaluate", "hypotheses_summary", "summary_table"]
 
@@ -101,6 +103,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
     found = find(run)
     inputs = [artefact.whole().path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})
+    preflight("evaluate", out, evaluation_needs(data), quiet=quiet)
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force
     ) as folder:

@@ -15,6 +15,7 @@ from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artef
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
@@ -23,6 +24,7 @@ from hypogoal.evaluation import reading
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.needs import play_needs
 from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
 from hypogoal.options.recording import Recorder
 
@@ -72,6 +74,7 @@ def train_meta(
         _check_fit(trained, source, config)
     claim(out, force=force)
     domain = load_domain(source.config["domain"])
+    preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     about = as_dict(config) | {
         "sub_goals": source.config["sub_goals"],
