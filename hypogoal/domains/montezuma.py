@@ -7,10 +7,10 @@ and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``mon
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
