@@ -88,13 +88,14 @@ def fit(
     ensemble.to(device)
     networks = ensemble.networks()
     states = TrainingStates(
-        view.see(observations, positions_of(origins)),
+        view.see(observations, positions_of(origins), margin=config.jitter),
         labels,
-        view.see(unlabelled, positions_of(unlabelled_origins)),
+        view.see(unlabelled, positions_of(unlabelled_origins), margin=config.jitter),
         networks[0],
         torch.device(device),
         ladders=_ladders(config, origins),
-        tables=config.augment == "none",
+        grey=config.augment == "grey",
+        jitter=config.jitter,
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
     for done, members in enumerate(rounds):
@@ -126,6 +127,8 @@ def _view(
 ) -> FullView | AgentView:
     """What the members are to see; a localiser that learns is trained here."""
     if config.view == "full":
+        if config.jitter:
+            raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
         return FullView(observations.shape[1:])
     montezuma_only(observations.shape[1:], "view=agent-crop")
     needed(origins, POSITION, "view=agent-crop")
@@ -197,17 +200,17 @@ def _fit_members(
         fused=True,
     )
     watch = _Watch(members, len(frozen) if diverse else 0, config, steps_before, on_step)
-    greys = rng_for(seed, "greys") if config.augment == "grey" else None
+    changes = rng_for(seed, "greys")
     for labelled, unlabelled in states.batches(config, seed):
         if diverse:
-            both = states.forward(trained, labelled, unlabelled, counted=(True, config.unlabelled_bn), greys=greys)
+            both = states.forward(trained, labelled, unlabelled, counted=(True, config.unlabelled_bn), changes=changes)
             rows = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
             pair_losses = _pair_losses(objective, [other for _, other in both], [other[rows] for other in frozen])
         else:
-            both = states.forward(trained, labelled, greys=greys)
+            both = states.forward(trained, labelled, changes=changes)
             pair_losses = torch.zeros(0, device=states.device)
             if config.unlabelled_bn and len(unlabelled):
-                states.count_in(trained, unlabelled, greys)
+                states.count_in(trained, unlabelled, changes)
         targets = states.targets(labelled)
         label_losses = torch.stack([functional.cross_entropy(own[0], targets, class_weights) for own in both])
         loss = label_losses.sum() + config.diversity_weight * pair_losses.sum()

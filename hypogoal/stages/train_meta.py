@@ -26,6 +26,7 @@ from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.needs import play_needs
 from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
+from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 
 
@@ -93,7 +94,10 @@ def train_meta(
             recorder.start_at(trained.config["steps"])
         policy = MetaPolicy(engine, verdicts.options, config, seed) if config.chooser == "ppo" else None
         chooser: Chooser = policy or RandomChooser(rng_for(seed, "random-choice"))
-        loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=config.gamma)
+        initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        loop = OptionLoop(
+            engine, verdicts, learner, chooser, recorder, config, gamma=config.gamma, initiation=initiation
+        )
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             play(loop, config.steps, log, progress)
