@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST, open_artefact
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import UserError, printable
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
@@ -33,7 +33,11 @@ def describe_path(path: Path) -> dict[str, Any]:
 
 
 def lines(about: dict[str, Any]) -> list[str]:
-    """A description as text, a line a fact."""
+    """A description as text, a line a fact, without control characters."""
+    return [printable(line) for line in _lines(about)]
+
+
+def _lines(about: dict[str, Any]) -> list[str]:
     if about["kind"] == "run":
         return [f"{part['path']}: {part['kind']}" for part in about["artefacts"]]
     text = [f"{about['path']}: {about['kind']}"]

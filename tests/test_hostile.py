@@ -22,6 +22,7 @@ from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import stage_cell
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.inspection import lines
 from hypogoal.verification import faults_of
 
 OBSERVATIONS = "labelled/one/observations"
@@ -233,6 +234,7 @@ def test_cells_stay_in_their_run(tmp_path: Path) -> None:
 def test_messages_cannot_drive_a_terminal() -> None:
     """Spec G2: what a stranger's file says is quoted in messages."""
     assert str(UserError("kind \x1b[2J", "\ud800")) == "kind ?[2J: ?"
+    assert lines({"kind": "meta", "path": "a", "config": {"x": "\x1b[2J"}})[-1] == "  x: ?[2J"
     assert not plain_name("\x1b[2J") and plain_name("open-red-door")
     with pytest.raises(UserError):
         parse_json("[1e999]", "here", "it is", "")

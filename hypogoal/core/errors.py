@@ -16,8 +16,12 @@ class UserError(Exception):
         self.what, self.where, self.do = what, where, do
         line = what if where is None else f"{what}: {where}"
         text = " ".join((f"{line}. {do}" if do else line).split())
-        # What a stranger's file says is quoted here: a terminal must not obey it, nor fail to print it.
-        super().__init__("".join(sign if sign.isprintable() else "?" for sign in text))
+        super().__init__(printable(text))
+
+
+def printable(text: str) -> str:
+    """A text that may quote a stranger's file: a terminal must not obey it, nor fail to print it."""
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
 
 
 class NumericalError(Exception):
