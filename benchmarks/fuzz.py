@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -186,8 +187,12 @@ def read_run(case: Path, kind: str, often: bool) -> list[Callable[[], object]]:
         if faults:
             raise UserError(faults[0])
 
-    use = lambda: hypogoal.load_ensemble(path, "go-to-goal") if kind == "ensemble" else hypogoal.load_options(path)  # noqa: E731
-    calls = [check, lambda: lines(describe_path(path)), use, inputs]
+    use = (
+        partial(hypogoal.load_ensemble, path, "go-to-goal")
+        if kind == "ensemble"
+        else partial(hypogoal.load_options, path)
+    )
+    calls: list[Callable[[], object]] = [check, lambda: lines(describe_path(path)), use, inputs]
     if often:
         calls += [lambda: command("verify", path, "--json"), lambda: command("show", path)]
     return calls
@@ -285,7 +290,7 @@ def fuzz_tables(box: Sandbox, rng: Rng, case: int) -> bool:
 
 def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
     from hypogoal.core.config import resolve
-    from hypogoal.stages.run import STAGES, config_class_of
+    from hypogoal.stages.run import EXPERIMENTS, STAGES, config_class_of, plan
 
     path = box.case / "own.toml"
     text = toml_of(tree_changed(PRESET, rng, box.odd), rng).encode(errors="surrogatepass")
@@ -293,12 +298,16 @@ def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
         text = b"a = " + b"[" * 100_000
     path.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
     stages: list[Callable[[], object]] = [
-        lambda stage=stage: resolve(config_class_of(stage), stage=stage, preset=str(path)) for stage in STAGES
+        partial(resolve, config_class_of(stage), stage=stage, preset=str(path)) for stage in STAGES
     ]
-    runs: list[Callable[[], object]] = [
-        lambda name=name: command("run", name, "--out", box.out / "run", "--preset", path, "--dry-run")
-        for name in ("doorkey", "montezuma-ladders")
-    ]
+    runs: list[Callable[[], object]]
+    if case % 10:
+        runs = [partial(plan, name, box.out / "run", preset=str(path)) for name in EXPERIMENTS]
+    else:
+        runs = [
+            partial(command, "run", name, "--out", box.out / "run", "--preset", path, "--dry-run")
+            for name in EXPERIMENTS
+        ]
     return tolerated(*stages, *runs)
 
 
