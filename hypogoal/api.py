@@ -29,7 +29,7 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
     Raises:
         UserError: not an ensemble artefact, or no such sub-goal.
     """
-    artefact = open_artefact(Path(path), "ensemble")
+    artefact = open_artefact(Path(path), "ensemble").whole()
     return read_ensemble(artefact.path, artefact.config, sub_goal)
 
 
@@ -43,10 +43,10 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     Raises:
         UserError: not such an artefact, the ensemble is gone, or the options end at the true sub-goals (oracle).
     """
-    artefact = open_artefact(Path(path), ("options", "meta"))
+    artefact = open_artefact(Path(path), ("options", "meta")).whole()
     config = artefact.config
     folder = Path(ensemble) if ensemble else artefact.input("ensemble")
-    source = open_artefact(folder, "ensemble")
+    source = open_artefact(folder, "ensemble").whole()
     ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
     policies = make_policies(config, load_tensors(artefact.path / "options.safetensors"), source.config)
     return Options(tuple(config["sub_goals"]), config["members"], ensembles, policies, config["option_timeout"])

@@ -8,9 +8,10 @@ last, so a file without it was cut off.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import FORMAT_VERSION, claim, versions
+from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import parse_json, plain_name
+from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, members, open_hdf5, read_array
+from hypogoal.core.manifests import FORMAT_VERSION
 
 SPLITS = ("labelled", "heldout")
+ATTRIBUTES = (
+    "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete", "lost",
+)  # fmt: skip
+AGAIN, REPAIR = "Collect it again.", "hypogoal verify --repair"
+MAX_SIDE = 1 << 16  # of an observation
 
 
 @dataclass(frozen=True)
@@ -69,13 +78,11 @@ def write_dataset(
     force: bool = False,
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole."""
-    import h5py
-
     claim(path, force=force)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
-        with h5py.File(partial, "w") as file:
+        with create_hdf5(partial) as file:
             file.attrs["format"] = FORMAT_VERSION
             file.attrs["domain"] = domain
             file.attrs["sub_goals"] = json.dumps(list(collected.sub_goals))
@@ -83,14 +90,13 @@ def write_dataset(
             file.attrs["config"] = json.dumps(dict(config))
             file.attrs["seed"] = seed
             file.attrs["versions"] = json.dumps(versions())
+            file.attrs["complete"] = False  # its place is in front: a file that is cut off keeps its attributes
             for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
                 _write_split(file, split, states, collected.sub_goals)
-                file.flush()
             group = file.create_group("unlabelled")
-            _write_observations(group, collected.unlabelled.observations)
+            write_observations(group, collected.unlabelled.observations)
             _write_origins(group, collected.unlabelled.origins)
-            file.flush()
-            file.attrs["complete"] = True
+            file.attrs.modify("complete", True)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -101,7 +107,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
     for index, sub_goal in enumerate(sub_goals):
         group = file.create_group(f"{split}/{sub_goal}")
         if first is None:
-            _write_observations(group, states.observations)
+            write_observations(group, states.observations)
             _write_origins(group, states.origins)
             first = group
         else:
@@ -111,7 +117,8 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
         group.create_dataset("labels", data=states.labels[:, index].astype(np.bool_))
 
 
-def _write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
+def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
+    """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
     chunk = (min(64, max(1, len(observations))), *observations.shape[1:])
     group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
 
@@ -122,28 +129,33 @@ def _write_origins(group: Any, origins: Mapping[str, NDArray[np.int64]]) -> None
 
 
 class Dataset:
-    """A complete data file, opened for reading. Use :func:`open_dataset`."""
+    """A complete data file, opened for reading. Use :func:`open_dataset`.
+
+    Attributes:
+        lost: parts (``heldout``, ``labelled/<sub-goal>``) that ``verify --repair`` found cut off; reading them fails.
+    """
 
     def __init__(self, path: Path):
         self.path = path
-        with _open(path) as file:
-            self.attributes = {key: _plain(value) for key, value in file.attrs.items()}
+        with self._file() as file:
+            self.attributes = {name: attribute(file, name) for name in ATTRIBUTES}
         foreign = UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
-        if not isinstance(self.attributes.get("format"), int):
+        version = self.attributes["format"]
+        if not isinstance(version, int) or isinstance(version, bool):
             raise foreign
-        if self.attributes["format"] > FORMAT_VERSION:
-            raise UserError(
-                f"format {self.attributes['format']} is newer than this hypogoal reads", path, "Upgrade hypogoal."
-            )
-        if not self.attributes.get("complete", False):
-            raise UserError("the data file is not complete", path, "Collect it again.")
-        try:
-            self.sub_goals: tuple[str, ...] = tuple(map(str, json.loads(self.attributes["sub_goals"])))
-            self.observation_shape: tuple[int, ...] = tuple(map(int, json.loads(self.attributes["observation_shape"])))
-            self.domain = str(self.attributes["domain"])
-            self.config: dict[str, Any] = dict(json.loads(self.attributes["config"]))
-        except (KeyError, TypeError, ValueError):
-            raise foreign from None
+        if version > FORMAT_VERSION:
+            raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
+        if not self.attributes["complete"]:
+            raise UserError("the data file is not complete", path, f"{AGAIN} Or save what is whole: {REPAIR} {path}")
+        self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
+        self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
+        self.config: dict[str, Any] = self._json("config", dict)
+        self.lost: tuple[str, ...] = tuple(map(str, self._json("lost", list))) if self.attributes["lost"] else ()
+        self.domain = self.attributes["domain"]
+        sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
+        names = all(map(plain_name, self.sub_goals)) and len(set(self.sub_goals)) == len(self.sub_goals)
+        if not (sizes and names and self.observation_shape and self.sub_goals and isinstance(self.domain, str)):
+            raise foreign
 
     def labelled(self, sub_goal: str) -> Split:
         """The labelled states of one sub-goal."""
@@ -155,37 +167,84 @@ class Dataset:
 
     def unlabelled(self) -> NDArray[np.uint8]:
         """The unlabelled states: uint8 (M, *obs)."""
-        with _open(self.path) as file:
-            return _read(file, "unlabelled/observations", self.path)
+        with self._file() as file:
+            return self._observations(file, "unlabelled")
 
     def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
         """Where each unlabelled state comes from: int64 (M,) by name; empty where the file does not say."""
-        with _open(self.path) as file:
-            origins = file["unlabelled"].get("origin", {})
-            return {name: origins[name][()] for name in origins}
+        with self._file() as file:
+            return self._origins(file, "unlabelled", len(self._found(file, "unlabelled/observations")))
 
     def counts(self) -> dict[str, Any]:
-        """Numbers of states and positives, without reading the observations."""
-        with _open(self.path) as file:
-            rows: dict[str, Any] = {"unlabelled": int(file["unlabelled/observations"].shape[0])}
+        """Numbers of states and positives, without reading the observations; of what was lost, none."""
+        with self._file() as file:
+            lost = "unlabelled" in self.lost
+            rows: dict[str, Any] = {"unlabelled": 0 if lost else len(self._found(file, "unlabelled/observations"))}
             for split in SPLITS:
                 rows[split] = {}
                 for goal in self.sub_goals:
-                    labels = _read(file, f"{split}/{goal}/labels", self.path)
-                    rows[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
+                    gone = {split, f"{split}/{goal}"} & {*self.lost}
+                    labels = np.zeros(0, np.bool_) if gone else read_array(file, f"{split}/{goal}/labels", "bui")
+                    rows[split][goal] = {"states": len(labels), "positives": int(labels.astype(np.bool_).sum())}
         return rows
 
     def _split(self, split: str, sub_goal: str) -> Split:
         if sub_goal not in self.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {', '.join(self.sub_goals)}.")
-        with _open(self.path) as file:
-            base = f"{split}/{sub_goal}"
-            origins = file[base].get("origin", {})
-            return Split(
-                _read(file, f"{base}/observations", self.path),
-                _read(file, f"{base}/labels", self.path).astype(np.bool_),
-                {name: origins[name][()] for name in origins},
-            )
+        base = f"{split}/{sub_goal}"
+        with self._file() as file:
+            observations = self._observations(file, base)
+            labels = read_array(file, f"{base}/labels", "bui")
+            if labels.shape != (len(observations),):
+                raise Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
+            return Split(observations, labels.astype(np.bool_), self._origins(file, base, len(observations)))
+
+    def _observations(self, file: Any, base: str) -> NDArray[np.uint8]:
+        name = f"{base}/observations"
+        found = self._found(file, name)
+        if found.shape[1:] != self.observation_shape or found.dtype != np.uint8:
+            raise Foreign(f"{name!r} is {found.dtype} {found.shape}, not uint8 (N, {self.observation_shape})")
+        return read_array(file, name, "u")
+
+    @staticmethod
+    def _found(file: Any, name: str) -> Any:
+        found = find(file, name)
+        if found is None:
+            raise Foreign(f"no readable {name!r}")
+        check_dataset(found, "u")
+        if not found.shape:
+            raise Foreign(f"{name!r} is a single number")
+        return found
+
+    @staticmethod
+    def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:
+        group = find(file, f"{base}/origin")
+        origins = {name: read_array(file, f"{base}/origin/{name}", "iub") for name in members(group or ())}
+        for name, values in origins.items():
+            if values.shape != (count,):
+                raise Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")
+        return {name: values.astype(np.int64) for name, values in origins.items()}
+
+    def _json(self, name: str, kind: type) -> Any:
+        value = self.attributes[name]
+        foreign = UserError(
+            "not a hypogoal data file", self.path, f"Its attribute {name!r} is no JSON {kind.__name__}."
+        )
+        if not isinstance(value, str):
+            raise foreign
+        parsed = parse_json(value, self.path, f"not a hypogoal data file, its attribute {name!r} is", AGAIN)
+        if not isinstance(parsed, kind):
+            raise foreign
+        return parsed
+
+    @contextlib.contextmanager
+    def _file(self) -> Iterator[Any]:
+        """The file, opened; what it should not hold becomes one line."""
+        with open_hdf5(self.path, "the data file", f"{AGAIN} Or save what is whole: {REPAIR} {self.path}") as file:
+            try:
+                yield file
+            except Foreign as error:
+                raise UserError(f"the data file cannot be used: {error}", self.path, AGAIN) from None
 
 
 def open_dataset(path: Path) -> Dataset:
@@ -194,30 +253,10 @@ def open_dataset(path: Path) -> Dataset:
     Raises:
         UserError: missing, truncated, not HDF5, not ours, incomplete, or of a newer format.
     """
-    if not path.exists():
-        raise UserError("no such data file", path, "Make it with 'hypogoal collect'.")
     if path.is_dir():
         raise UserError(
             "a folder where a data file is needed", path, "Give the .h5 file that 'hypogoal collect' wrote."
         )
+    if not path.exists():
+        raise UserError("no such data file", path, "Make it with 'hypogoal collect'.")
     return Dataset(path)
-
-
-def _open(path: Path) -> Any:
-    import h5py
-
-    try:
-        return h5py.File(path, "r")
-    except OSError:
-        raise UserError("the data file is truncated or not HDF5", path, "Collect it again.") from None
-
-
-def _read(file: Any, name: str, path: Path) -> NDArray[Any]:
-    try:
-        return np.asarray(file[name][()])
-    except (KeyError, OSError):
-        raise UserError(f"the data file has no readable {name!r}", path, "Collect it again.") from None
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

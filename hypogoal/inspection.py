@@ -1,4 +1,4 @@
-"""What is at a path, and is it whole: the answers of ``hypogoal show`` and ``hypogoal verify``."""
+"""What is at a path: the answers of ``hypogoal show``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import MANIFEST, check_files, open_artefact
-from hypogoal.core.errors import UserError
+from hypogoal.core.artefacts import MANIFEST, open_artefact
+from hypogoal.core.errors import UserError, printable
 from hypogoal.dataset import SPLITS, open_dataset
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import installed_domain
 
 
 def describe_path(path: Path) -> dict[str, Any]:
@@ -23,16 +23,21 @@ def describe_path(path: Path) -> dict[str, Any]:
             **about,
             "config": dataset.config,
             "counts": dataset.counts(),
+            "lost": list(dataset.lost) or None,
         }
     if (path / MANIFEST).is_file():
         artefact = open_artefact(path)
         keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
         return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
-    return {"kind": "run", "path": str(path), "artefacts": [describe_path(part) for part in _parts(path)]}
+    return {"kind": "run", "path": str(path), "artefacts": [describe_path(part) for part in parts_of(path)]}
 
 
 def lines(about: dict[str, Any]) -> list[str]:
-    """A description as text, a line a fact."""
+    """A description as text, a line a fact, without control characters."""
+    return [printable(line) for line in _lines(about)]
+
+
+def _lines(about: dict[str, Any]) -> list[str]:
     if about["kind"] == "run":
         return [f"{part['path']}: {part['kind']}" for part in about["artefacts"]]
     text = [f"{about['path']}: {about['kind']}"]
@@ -93,41 +98,15 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
 
 def kinds_of(domain: str) -> Sequence[str]:
     """What the values of the origin ``kind`` mean in a domain; nothing where it is not installed or has no kinds."""
-    try:
-        return getattr(load_domain(domain), "kinds", ())
-    except UserError:
-        return ()
+    return getattr(installed_domain(domain), "kinds", ())
 
 
-def faults_of(path: Path) -> list[str]:
-    """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
-    try:
-        if path.is_file():
-            return _data_faults(path)
-        if (path / MANIFEST).is_file():
-            artefact = open_artefact(path)
-            return [f"{path}/{fault}" for fault in check_files(artefact)]
-        return [fault for part in _parts(path) for fault in faults_of(part)]
-    except UserError as error:
-        return [str(error)]
+def parts_of(run: Path) -> list[Path]:
+    """The data files and artefacts of a run.
 
-
-def _data_faults(path: Path) -> list[str]:
-    dataset = open_dataset(path)
-    faults = []
-    for split in SPLITS:
-        for sub_goal in dataset.sub_goals:
-            part = getattr(dataset, split)(sub_goal)
-            if part.observations.shape[1:] != dataset.observation_shape or part.observations.dtype.name != "uint8":
-                faults.append(f"{path}: {split}/{sub_goal}: observations are not uint8 {dataset.observation_shape}")
-            if len(part.labels) != len(part.observations):
-                faults.append(f"{path}: {split}/{sub_goal}: {len(part.labels)} labels, {len(part.observations)} states")
-    if dataset.unlabelled().shape[1:] != dataset.observation_shape:
-        faults.append(f"{path}: unlabelled: observations are not uint8 {dataset.observation_shape}")
-    return faults
-
-
-def _parts(run: Path) -> list[Path]:
+    Raises:
+        UserError: there is none.
+    """
     if not run.is_dir():
         raise UserError("no such file or folder", run, "Check the path.")
     artefacts = [manifest.parent for manifest in sorted(run.rglob(MANIFEST)) if not _hidden(manifest, run)]

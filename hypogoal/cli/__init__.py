@@ -5,6 +5,9 @@ Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import signal
 import sys
 from typing import Annotated
@@ -54,6 +57,10 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         return _fail(f"training stopped: {error}", 1)
+    except OSError as error:
+        if debug:
+            raise
+        return _fail(*_refused(error))
     except KeyboardInterrupt:
         return _fail("stopped; nothing was half-written", 130)
     except Exception as error:
@@ -64,6 +71,26 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         return _fail(f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1)
+
+
+def _refused(error: OSError) -> tuple[str, int]:
+    """What to tell, and the exit code, when the system will not read or write a file."""
+    known = {
+        errno.ENOSPC: "Free some disk space and run it again.",
+        errno.EDQUOT: "Your quota is used up: remove something and run it again.",
+        errno.EFBIG: "The file may not grow larger here (ulimit -f): allow more, or choose another --out.",
+        errno.EROFS: "Choose another --out.",
+        errno.EACCES: "Choose another --out, or ask for permission.",
+        errno.EPERM: "Choose another --out, or ask for permission.",
+        errno.ENAMETOOLONG: "Choose a shorter name.",
+    }
+    # HDF5 tells the number in its text only: "... errno = 28, error message = ..."
+    told = re.search(r"errno = (\d+)", str(error))
+    code = error.errno or (int(told[1]) if told else 0)
+    where = f": {error.filename}" if error.filename else ""
+    if code in known:
+        return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
+    return f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1
 
 
 def _stop(signum: int, _frame: object) -> None:

@@ -38,8 +38,13 @@ def resolve_for(
     preset: str | None,
     assignments: Iterable[str] | None,
     options: Mapping[str, Any] | None = None,
+    *,
+    own: bool = False,
 ) -> T:
-    """A stage's configuration with the presets and defaults of the domain it works on."""
+    """A stage's configuration with the presets and defaults of the domain it works on.
+
+    ``own``: the user gave the domain's name, no file did.
+    """
     from hypogoal.core.config import resolve
     from hypogoal.domains.base import defaults_of
 
@@ -50,7 +55,7 @@ def resolve_for(
         options=options,
         assignments=assignments or (),
         domain=domain,
-        defaults=defaults_of(domain, stage),
+        defaults=defaults_of(domain, stage, given=own),
     )
 
 

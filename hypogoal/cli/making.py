@@ -42,8 +42,8 @@ def collect(
 
     if is_complete(out, resume):
         return
-    found = load_domain(domain)
-    config: Any = resolve_for(domain, found.config_class, "collect", preset, set_)
+    found = load_domain(domain, given=True)
+    config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
     counts = stage(found, config, out, seed=seed, force=force, quiet=quiet)
     if not quiet:
         for split in ("labelled", "heldout"):
@@ -154,7 +154,7 @@ def train_baseline(
     if is_complete(out, resume):
         return
     given = {"agent": agent, "layout_seed": layout_seed}
-    config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given)
+    config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given, own=True)
     print_outcome(stage(domain, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
     typer.echo(out)
 

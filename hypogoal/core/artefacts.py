@@ -21,10 +21,9 @@ from typing import Any
 
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import inside
+from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, read_manifest
 
-FORMAT_VERSION = 1
-MANIFEST = "manifest.json"
-MAX_MANIFEST_BYTES = 16 * 2**20
 PACKAGES = (
     "hypogoal",
     "torch",
@@ -55,23 +54,51 @@ class Artefact:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved configuration that made it."""
-        return dict(self.manifest["config"])
+        """The resolved configuration that made it; asking it for what it does not say is a ``UserError``."""
+        return Settings(self.manifest["config"], self.path)
 
     @property
     def seed(self) -> int:
         """The seed that made it."""
         return int(self.manifest["seed"])
 
+    def whole(self) -> Artefact:
+        """This artefact, every file of it as the manifest says: asked for before a stage starts (some ms per MB).
+
+        Raises:
+            UserError: a file is missing, was changed, or lies outside the folder.
+        """
+        faults = check_files(self)
+        if faults:
+            raise UserError(f"the artefact is damaged ({faults[0]})", self.path, AGAIN)
+        return self
+
     def input(self, kind: str) -> Path:
-        """The path of the input artefact of ``kind``: as recorded, else beside this artefact."""
+        """The path of the input of ``kind``: beside this artefact, else as recorded; its sha256 is as recorded.
+
+        Raises:
+            UserError: it was made from no such input, or that is gone or was changed since.
+        """
         for entry in self.manifest["inputs"]:
             if entry["kind"] == kind:
-                for candidate in (self.path / entry["relative"], Path(entry["path"])):
-                    if candidate.exists():
-                        return candidate.resolve()
-                raise UserError(f"the {kind} that {self.path} was made from is gone", entry["path"], "Restore it.")
+                path, fault = find_input(self.path, entry)
+                if path is None:
+                    raise UserError(
+                        f"the {kind} that {self.path} was made from is {fault}", entry["path"], "Restore it."
+                    )
+                return path
         raise UserError(f"{self.path} was made from no {kind}", self.path / MANIFEST, "Is it the right artefact?")
+
+
+class Settings(dict[str, Any]):
+    """A manifest's configuration: what it does not say is told in one line."""
+
+    def __init__(self, values: dict[str, Any], path: Path):
+        super().__init__(values)
+        self._path = path
+
+    def __missing__(self, key: str) -> Any:
+        raise UserError(f"the manifest's configuration has no {key!r}", self._path / MANIFEST, AGAIN)
 
 
 def sha256_of(path: Path) -> str:
@@ -186,26 +213,7 @@ def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefa
         raise UserError("no such artefact", path, "Check the path, or run the stage that makes it.")
     if not path.is_dir() or not manifest_path.is_file():
         raise UserError(f"not an artefact (no {MANIFEST})", path, "Give the folder that a stage wrote.")
-    if manifest_path.stat().st_size > MAX_MANIFEST_BYTES:
-        raise UserError("the manifest is too large to be one", manifest_path, "Is it a hypogoal artefact?")
-    try:
-        manifest = json.loads(manifest_path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        raise UserError("the manifest is not valid JSON", manifest_path, "Make the artefact again.") from None
-    wanted = {"kind": str, "format": int, "config": dict, "seed": int, "inputs": list, "files": dict}
-    if not isinstance(manifest, dict):
-        raise UserError("the manifest is not a JSON object", manifest_path, "Make the artefact again.")
-    if isinstance(manifest.get("format"), int) and manifest["format"] > FORMAT_VERSION:
-        raise UserError(
-            f"format {manifest['format']} is newer than this hypogoal reads ({FORMAT_VERSION})",
-            manifest_path,
-            "Upgrade hypogoal.",
-        )
-    for key, form in wanted.items():
-        if not isinstance(manifest.get(key), form):
-            raise UserError(
-                f"the manifest's {key!r} is missing or malformed", manifest_path, "Make the artefact again."
-            )
+    manifest = read_manifest(manifest_path)
     kinds = (kind,) if isinstance(kind, str) else kind
     if kinds is not None and manifest["kind"] not in kinds:
         raise UserError(
@@ -232,13 +240,34 @@ def find_artefacts(run: Path, kind: str, depth: int = 3) -> list[Artefact]:
 
 def check_files(artefact: Artefact) -> list[str]:
     """One line for each file of the artefact that is missing or changed; none when it is whole."""
-    faults = []
-    for name, digest in artefact.manifest["files"].items():
-        path = artefact.path / name
-        if not path.resolve().is_relative_to(artefact.path.resolve()):
-            faults.append(f"{name}: outside the artefact")
-        elif not path.is_file():
-            faults.append(f"{name}: missing")
-        elif sha256_of(path) != digest:
-            faults.append(f"{name}: changed since it was written")
-    return faults
+    faults = ((name, file_fault(artefact.path, name, digest)) for name, digest in artefact.manifest["files"].items())
+    return [f"{name}: {fault}" for name, fault in faults if fault]
+
+
+def file_fault(folder: Path, name: str, digest: str) -> str:
+    """What is wrong with a file of an artefact; empty when it is whole."""
+    path = inside(folder, name)
+    if path is None:
+        return "outside the artefact"
+    if not path.is_file():
+        return "missing"
+    return "" if sha256_of(path) == digest else "changed since it was written"
+
+
+def find_input(folder: Path, entry: dict[str, str]) -> tuple[Path | None, str]:
+    """Where an input is that a manifest in ``folder`` records, or None and what is wrong.
+
+    The path is a stranger's word: it is only ever read from, and nothing is looked at but what has the sha256 recorded.
+    """
+    fault = "gone"
+    for candidate in (folder / entry["relative"], Path(entry["path"])):
+        target = candidate / MANIFEST if entry["kind"] != "data" else candidate
+        try:
+            if not target.is_file():
+                continue
+            if sha256_of(target) == entry["sha256"]:
+                return candidate.resolve(), ""
+        except OSError:
+            continue
+        fault = "changed since"
+    return None, fault

@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_text
 
 T = TypeVar("T")
+MAX_PRESET_BYTES = 2**20
 DOMAIN = "doorkey"  # whose presets and defaults hold where no domain is said
 
 
@@ -62,18 +64,17 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str,
     folder = every / domain if domain.isidentifier() and (every / domain).is_dir() else every / DOMAIN
     known = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
     if name.endswith(".toml"):
-        path = Path(name)
-        if not path.is_file():
-            raise UserError("no such preset file", path, f"Presets that come with hypogoal: {', '.join(known)}.")
-        text = path.read_text(encoding="utf-8")
+        if not Path(name).exists():
+            raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(known)}.")
+        text = read_text(Path(name), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
     elif name in known:
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     else:
         raise UserError("unknown preset", name, f"Choose one of {', '.join(known)}, or give a .toml file.")
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"the preset is not valid TOML ({error})", name, "Mend the file.") from None
+    except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
+        raise UserError(f"the preset is not valid TOML ({str(error)[:200]})", name, "Mend the file.") from None
     values = table.get(stage, {})
     if not isinstance(values, dict):
         raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
@@ -166,7 +167,8 @@ def _allowed(meta: Mapping[str, Any]) -> str:
 
 
 def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -> Any:
-    where = f"{field.name}={value!r} in {stage}"
+    shown = repr(value) if len(repr(value)) <= 200 else f"{repr(value)[:200]} ..."
+    where = f"{field.name}={shown} in {stage}"
     try:
         parsed = _parse(kind, value)
     except (TypeError, ValueError, KeyError, OverflowError):

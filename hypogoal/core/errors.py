@@ -15,7 +15,13 @@ class UserError(Exception):
     def __init__(self, what: str, where: object = None, do: str = ""):
         self.what, self.where, self.do = what, where, do
         line = what if where is None else f"{what}: {where}"
-        super().__init__(" ".join((f"{line}. {do}" if do else line).split()))
+        text = " ".join((f"{line}. {do}" if do else line).split())
+        super().__init__(printable(text))
+
+
+def printable(text: str) -> str:
+    """A text that may quote a stranger's file: a terminal must not obey it, nor fail to print it."""
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
 
 
 class NumericalError(Exception):

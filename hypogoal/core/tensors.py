@@ -2,34 +2,88 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.files import require_file
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from torch import Tensor, nn
+
+    M = TypeVar("M", bound=nn.Module)
+
+AGAIN = "Make the artefact again."
+MAX_HEADER_BYTES = 16 * 2**20  # names and shapes: 100 bytes a tensor
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write tensors by name."""
-    from safetensors.torch import save_file
+    """Write tensors by name.
 
-    save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path)
+    Raises:
+        NumericalError: Spec G3, a number is NaN or Inf; nothing is written.
+    """
+    import torch
+    from safetensors.torch import save
+
+    for name, tensor in tensors.items():
+        if tensor.dtype.is_floating_point and not torch.isfinite(tensor).all():
+            raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
+    path.write_bytes(save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
-    """Read tensors by name.
+    """Read tensors by name: as many bytes as the file has, whatever its header declares.
 
     Raises:
-        UserError: missing, truncated or not safetensors.
+        UserError: missing, truncated, not safetensors, or a number is NaN or Inf.
     """
+    import torch
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    if not path.is_file():
-        raise UserError("the weights are missing", path, "Make the artefact again.")
+    size = require_file(path, "the weights are", AGAIN)
+    with path.open("rb") as file:
+        header = int.from_bytes(file.read(8), "little")
+    if header > min(size - 8, MAX_HEADER_BYTES):
+        raise UserError(f"the weights are damaged (a header of {header} bytes in a file of {size})", path, AGAIN)
     try:
-        return load_file(path)
-    except SafetensorError as error:
-        raise UserError(f"the weights are damaged ({error})", path, "Make the artefact again.") from None
+        tensors: dict[str, Tensor] = load_file(path)
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"the weights are damaged ({error})", path, AGAIN) from None
+    for name, tensor in tensors.items():
+        if tensor.dtype.is_floating_point and not torch.isfinite(tensor).all():
+            raise UserError(f"the weights hold NaN or Inf (at {name})", path, AGAIN)
+    return tensors
+
+
+def check_fit(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], where: object, do: str) -> None:
+    """Whether weights are those of a network, by name, shape and kind of number.
+
+    Raises:
+        UserError: a name is missing or too much, or a shape or kind differs.
+    """
+    for name in sorted({*wanted, *given}):
+        one, other = wanted.get(name), given.get(name)
+        if one is None or other is None or one.shape != other.shape or one.dtype != other.dtype:
+            raise UserError(f"the weights do not fit the network (at {name})", where, do)
+
+
+def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object) -> M:
+    """The module that ``make`` makes, with these weights; nothing is allocated before they are known to fit.
+
+    Raises:
+        UserError: see :func:`check_fit`, or no module can be made as the manifest says.
+    """
+    import torch
+
+    try:
+        with torch.device("meta"):  # shapes without numbers: what a manifest asks for may be a thousand times too large
+            wanted = make().state_dict()
+    except (RuntimeError, ValueError, TypeError, ZeroDivisionError, OverflowError):
+        raise UserError("the weights do not fit the manifest", where, AGAIN) from None
+    check_fit(wanted, weights, where, AGAIN)
+    module = make()
+    module.load_state_dict(weights)
+    return module

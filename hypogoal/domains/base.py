@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Mapping
 from importlib import metadata
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -18,6 +19,7 @@ BUILT_IN = {
     "montezuma": "hypogoal.domains.montezuma:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
+ALLOWED = "HYPOGOAL_DOMAINS"
 
 
 class Step(NamedTuple):
@@ -70,8 +72,9 @@ class Domain(Protocol):
     It may also have ``starts`` (names of places where episodes begin, one of which ``make_engine`` takes as ``start``),
     ``distance`` (positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
     sub-goal holds), ``picture`` (room -> uint8 (height, width, 3)) and ``pixel`` (positions -> column and row in that
-    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``)
-    and ``defaults`` (see ``defaults_of``).
+    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``),
+    ``collected_bytes`` (config -> bytes of observations that ``collect`` will make, at the most) and ``defaults`` (see
+    ``defaults_of``).
     """
 
     name: str
@@ -87,35 +90,61 @@ class Domain(Protocol):
         """An engine of ``count`` environments of one layout."""
 
 
-def load_domain(name: str) -> Domain:
+def load_domain(name: str, *, given: bool = False) -> Domain:
     """A domain by its name, by an installed entry point (group ``hypogoal.domains``) or as ``module:object``.
 
+    ``module:object`` is code that will run. It is loaded where the user gave it, not because a data file or a
+    manifest, which may be a stranger's, names it: then the user allows it by the environment variable
+    ``HYPOGOAL_DOMAINS`` (several with commas between).
+
+    Args:
+        name: the domain.
+        given: the user gave this name, on the command line or in a program.
+
     Raises:
-        UserError: no such domain, or the object is not one.
+        UserError: no such domain, code that the user did not allow, or the object is not a domain.
     """
     entries = {entry.name: entry.value for entry in metadata.entry_points(group=ENTRY_POINTS)}
-    target = BUILT_IN.get(name) or entries.get(name) or name
-    if ":" not in target:
+    target = BUILT_IN.get(name) or entries.get(name)
+    if target is None and ":" in name:
+        _allow(name, given)
+        target = name
+    if target is None:
         known = ", ".join(sorted({*BUILT_IN, *entries}))
         raise UserError("unknown domain", name, f"Choose one of {known}, or give module:object.")
     module, _, attribute = target.partition(":")
     try:
         domain = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise UserError(f"the domain cannot be loaded ({error})", name, "Check the module and the object.") from None
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
     return domain
 
 
-def defaults_of(domain: str, stage: str) -> Mapping[str, Any]:
+def installed_domain(name: str, *, given: bool = False) -> Domain | None:
+    """The domain; None where it is not installed here: own data may name one that is not.
+
+    Raises:
+        UserError: the name is code that the user did not allow (see :func:`load_domain`).
+    """
+    _allow(name, given)
+    try:
+        return load_domain(name, given=given)
+    except UserError:
+        return None
+
+
+def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str, Any]:
     """The settings of a stage that this domain has by default, in place of the general ones; empty where none are.
 
-    A domain that cannot be loaded has none: own data may name a domain that is not installed here.
+    Raises:
+        UserError: see :func:`installed_domain`.
     """
-    try:
-        found = load_domain(domain)
-    except UserError:
-        return {}
-    defaults: Mapping[str, Mapping[str, Any]] = getattr(found, "defaults", {})
+    defaults: Mapping[str, Mapping[str, Any]] = getattr(installed_domain(domain, given=given), "defaults", {})
     return defaults.get(stage, {})
+
+
+def _allow(name: str, given: bool) -> None:
+    if ":" in name and not given and name not in os.environ.get(ALLOWED, "").split(","):
+        raise UserError("a file names code of its own as its domain", name, f"Do you trust it? Set {ALLOWED}={name}")

@@ -7,6 +7,7 @@ of one layout), ``doorkey_engine`` (many environments, fast), ``doorkey_registra
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -193,6 +194,12 @@ class DoorKeyDomain:
     observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
     config_class = DoorKeyConfig
     env_id = ENV_ID
+
+    def collected_bytes(self, config: DoorKeyConfig) -> int:
+        """Observations of a collection, at the most: a layout has some 1,640 states (seed 0), others up to 2,500."""
+        draws = config.draws if config.regime == "shuffled" else 1
+        layouts = draws * (1 + len(config.unlabelled_seeds)) + config.heldout_layouts
+        return layouts * 2_500 * math.prod(self.observation_shape)
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """See ``collect``."""

@@ -7,6 +7,7 @@ and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``mon
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -249,6 +250,11 @@ class MontezumaDomain:
             },
         }
     )
+
+    def collected_bytes(self, config: MontezumaConfig) -> int:
+        """Observations of a collection, at the most: every room labelled, unlabelled and held out."""
+        each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
+        return ROOMS * each * math.prod(self.observation_shape)
 
     def collect(self, config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         """See ``collect``."""

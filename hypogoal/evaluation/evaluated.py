@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, find_artefacts
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_json
+from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
 
+AGAIN = "Evaluate the run again."
 PARTS = ("agents", "ensembles", "hypotheses", "rooms", "distance", "saliency", "selection", "settings", "provenance")
 
 
@@ -40,32 +41,23 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     if not found:
         raise UserError("this run was not evaluated", run, f"First run: hypogoal evaluate {run}")
     source = next((artefact for artefact in found if artefact.path == run / "evaluation"), found[0])
+    source.whole()
     return Evaluated(source, _metrics(source.path / "metrics.json"), _arrays(source.path / "arrays.h5", start))
 
 
 def _metrics(path: Path) -> dict[str, Any]:
-    try:
-        metrics = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
+    metrics = read_json(path, "the evaluation is", AGAIN)
+    if not isinstance(metrics, dict):
+        raise UserError("the evaluation is damaged", path, AGAIN)
     lacking = [part for part in PARTS if part not in metrics]
     if lacking:
-        raise UserError(f"evaluated by an older hypogoal (no {', '.join(lacking)})", path, "Evaluate the run again.")
+        raise UserError(f"evaluated by an older hypogoal (no {', '.join(lacking)})", path, AGAIN)
     return metrics
 
 
 def _arrays(path: Path, start: str) -> dict[str, NDArray[Any]]:
-    import h5py
-
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def read(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and name.startswith(start):
-            arrays[name] = np.asarray(item[()])
-
-    try:
-        with h5py.File(path, "r") as file:
-            file.visititems(read)
-    except OSError:
-        raise UserError("missing or damaged", path, "Evaluate the run again.") from None
-    return arrays
+    with open_hdf5(path, "the evaluation's arrays", AGAIN) as file:
+        try:
+            return {name: read_array(file, name, "uibfT") for name in walk(file) if name.startswith(start)}
+        except Foreign as error:
+            raise UserError(f"the evaluation's arrays are damaged ({error})", path, AGAIN) from None

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hypogoal.core.artefacts import MANIFEST
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ def stage_cell(
     out: Path, run: Path, arguments: Sequence[str], needs: Sequence[Path] = (), seconds: float = 0.0
 ) -> Cell:
     """The cell of a stage that writes ``out`` within the run's folder; its name is its place there."""
+    if not all(map(plain_name, out.relative_to(run).parts)):
+        raise UserError("this would be written outside the run", out, "Leave separators and dots out of names.")
     name = out.relative_to(run).with_suffix("").as_posix().replace("/", "-")
     return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), seconds)
 

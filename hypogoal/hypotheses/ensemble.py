@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_fitting
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.networks import as_input, build_network, folded, reordered
 from hypogoal.hypotheses.views import AgentView, FullView
@@ -153,17 +154,19 @@ class Ensemble(nn.Module):
         Raises:
             UserError: the state is not one of such an ensemble, or holds NaN or Inf.
         """
-        ensemble = cls(network, observation_shape, members, torch.Generator(), view)
-        state = {"thresholds": ensemble.thresholds, **state}
-        wanted = ensemble.state_dict()
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
-        for name in sorted({*wanted, *state}):
-            if name not in wanted or name not in state or wanted[name].shape != state[name].shape:
-                raise UserError(f"the weights do not fit the ensemble (at {name})", where, "Train it again.")
-            if not torch.isfinite(state[name]).all():
+        numbers = {name.split(".")[1] for name in state if name.startswith("members.")}
+        if len(numbers) != members:
+            raise UserError(
+                f"the weights do not fit the ensemble (of {len(numbers)} members)", where, "Train it again."
+            )
+        for name, tensor in state.items():
+            if not torch.isfinite(tensor).all():
                 raise UserError(f"the weights hold NaN or Inf (at {name})", where, "Train it again.")
-        ensemble.load_state_dict(state)
-        return ensemble.eval()
+        state = {"thresholds": torch.full((members,), THRESHOLD), **state}
+        return load_fitting(
+            lambda: cls(network, observation_shape, members, torch.Generator(), view), state, where
+        ).eval()
 
     def _device(self) -> torch.device:
         return self.thresholds.device

@@ -130,7 +130,7 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
     if len(observation_shape) != 3 or min(observation_shape) < 1:
         raise UserError("member networks need images (H, W, C)", where, "Collect image observations.")
     height, width, channels = observation_shape
-    seed = int(torch.randint(2**62, (), generator=generator))
+    seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
         torch.manual_seed(seed)
         layers, hidden = parts_of(channels)

@@ -133,7 +133,7 @@ class MetaPolicy:
         goal = torch.from_numpy(advantages + values).float()
         scaled = torch.from_numpy(scaled_advantages(advantages, config.advantage_floor)).float()
         entropy_seen = 0.0
-        for _ in range(config.epochs):
+        for epoch in range(config.epochs):
             order = self.rng.permutation(len(flat))
             for begin in range(0, len(flat), config.meta_batch):
                 rows = order[begin : begin + config.meta_batch]
@@ -143,17 +143,19 @@ class MetaPolicy:
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)
                 loss = loss + config.value_weight * (out[:, -1] - goal[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
-                self._step(loss)
+                self._step(loss, f"update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}")
                 entropy_seen = float(entropy.mean().detach())
         self.updates += 1
         return {"entropy": entropy_seen, "value": float(values.mean())}
 
-    def _step(self, loss: Tensor) -> None:
+    def _step(self, loss: Tensor, where: str) -> None:
         if not torch.isfinite(loss):
-            raise NumericalError(f"the meta-policy's loss is {float(loss.detach())} at update {self.updates}")
+            raise NumericalError(f"the meta-policy's loss is {float(loss.detach())} in {where}")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, GRADIENT_NORM, foreach=True)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, GRADIENT_NORM, foreach=True)
+        if not torch.isfinite(norm):
+            raise NumericalError(f"a gradient of the meta-policy is {float(norm)} in {where}")
         self.optimiser.step()
 
     def state(self) -> dict[str, Tensor]:

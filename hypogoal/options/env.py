@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_fitting
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.execution import offered_options
 from hypogoal.options.exploration import actions_of
@@ -74,16 +75,21 @@ def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: 
             "Load options that were trained with learned members.",
         )
     shape = tuple(about["observation_shape"])
-    if config["network"] == "light":
-        return _light_policies(weights, shape, len(config["sub_goals"]) * config["members"])
-    return _paper_policies(weights, shape)
-
-
-def _light_policies(weights: dict[str, Tensor], shape: tuple[int, ...], options: int) -> Policies:
-    outputs = weights["online.heads.weight"].shape[0] // options
+    options = len(config["sub_goals"]) * config["members"]
+    last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"
+    outputs = len(weights[last]) // (options if config["network"] == "light" else 1) if last in weights else 0
     actions = actions_of(weights, outputs)
-    network = LightQNetwork(shape, options, outputs)
-    network.load_state_dict({name[7:]: value for name, value in weights.items() if name.startswith("online.")})
+    if not outputs or actions.shape != (outputs,):
+        raise UserError("the weights do not fit the manifest", f"{options} options", "Make the artefact again.")
+    make = _light_policies if config["network"] == "light" else _paper_policies
+    return make(weights, shape, options, actions)
+
+
+def _light_policies(
+    weights: dict[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]
+) -> Policies:
+    own = {name[7:]: value for name, value in weights.items() if name.startswith("online.")}
+    network = load_fitting(lambda: LightQNetwork(shape, options, len(actions)), own, "options.safetensors")
 
     def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
         @torch.no_grad()
@@ -95,17 +101,17 @@ def _light_policies(weights: dict[str, Tensor], shape: tuple[int, ...], options:
     return start
 
 
-def _paper_policies(weights: dict[str, Tensor], shape: tuple[int, ...]) -> Policies:
+def _paper_policies(
+    weights: dict[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]
+) -> Policies:
     networks: dict[int, PaperQNetwork] = {}
-    outputs = len(weights["0.values.2.bias"])
-    actions = actions_of(weights, outputs)
 
     def network_of(option: int) -> PaperQNetwork:
         if option not in networks:
             prefix = f"{option}."
-            state = {name[len(prefix) :]: value for name, value in weights.items() if name.startswith(prefix)}
-            networks[option] = PaperQNetwork(shape, outputs).eval()
-            networks[option].load_state_dict(state)
+            own = {name[len(prefix) :]: value for name, value in weights.items() if name.startswith(prefix)}
+            made = load_fitting(lambda: PaperQNetwork(shape, len(actions)), own, "options.safetensors")
+            networks[option] = made.eval()
         return networks[option]
 
     def start(option: int) -> Callable[[NDArray[np.uint8]], int]:

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.domains.base import Engine, Step
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
@@ -208,6 +208,10 @@ class OptionLoop:
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=explore)
         step = self.engine.step(actions)
+        if not np.isfinite(step.rewards).all():
+            place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
+            where = f"in environment {place} under option {option[place]} at step {self.recorder.steps}"
+            raise NumericalError(f"the reward is {step.rewards[place]} {where}")
         reached = self._reached(step.next_ids, option)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
 
@@ -43,6 +45,18 @@ def check_actions(state: Mapping[str, Tensor], actions: NDArray[np.int64], name:
     """
     if not np.array_equal(actions_of(state, len(actions)), actions):
         raise UserError("these options were trained with other actions", f"actions={name}", "Give the same --set.")
+
+
+def check_counters(state: Mapping[str, Tensor], options: int) -> None:
+    """Refuse saved counters of exploration that are not one int64 for each option.
+
+    Raises:
+        UserError: they are not.
+    """
+    for name in ("option_steps", "steps_since_positive"):
+        found = state.get(name)
+        if found is None or found.shape != (options,) or found.dtype != torch.int64 or (found < 0).any():
+            raise UserError(f"the weights do not fit the manifest (at {name})", f"{options} options", AGAIN)
 
 
 class Exploration:

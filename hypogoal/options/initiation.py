@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
@@ -89,6 +90,10 @@ class Initiation:
         own = logits.gather(1, torch.from_numpy(self.option[drawn])[:, None])[:, 0]
         reached = torch.from_numpy(self.reached[drawn]).float()
         loss = torch.nn.functional.binary_cross_entropy_with_logits(own, reached)
+        if not torch.isfinite(loss):
+            raise NumericalError(
+                f"the loss of the initiation sets is {float(loss.detach())} after {self.count} executions"
+            )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()

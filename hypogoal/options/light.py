@@ -19,12 +19,13 @@ from torch import Tensor
 
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow_tensors, linear_epsilon
 from hypogoal.learners.n_step import StepsAhead
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
 from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_to_states
 from hypogoal.options.running import running_verdicts
@@ -218,7 +219,7 @@ class LightLearner:
         error = error * torch.from_numpy(learns)
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber.sum(1) * torch.from_numpy(weights)).mean()
-        self._step(loss)
+        self._step(loss, huber.detach())
         largest = error.detach().abs().amax(1).numpy()
         self.replay.set_priorities(indices, largest[: len(indices)])
         return {"option_loss": float(loss.detach())}
@@ -237,14 +238,18 @@ class LightLearner:
             next_target = apply_to_states(self.target, self.engine, following)
         return values, next_online, next_target
 
-    def _step(self, loss: Tensor) -> None:
+    def _step(self, loss: Tensor, errors: Tensor) -> None:
+        """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""
         if not torch.isfinite(loss):
-            raise NumericalError(
-                f"the option loss is {float(loss.detach())} at update {self.updates}; nothing was saved over"
-            )
+            options = (~errors.isfinite()).any(0).nonzero().flatten().tolist()
+            what = f"the option loss is {float(loss.detach())}, from option {options},"
+            raise NumericalError(f"{what} in the batch of update {self.updates}, step {self.steps}")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.online.parameters(), GRADIENT_NORM, foreach=True)
+        norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), GRADIENT_NORM, foreach=True)
+        if not torch.isfinite(norm):
+            where = f"in the batch of update {self.updates}, step {self.steps}"
+            raise NumericalError(f"a gradient of the options is {float(norm)} {where}")
         self.optimiser.step()
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
@@ -263,6 +268,8 @@ class LightLearner:
         """Continue from the weights and counters of an artefact; the replay starts empty."""
         check_actions(state, self.actions, self.config.actions)
         weights = {name[7:]: value for name, value in state.items() if name.startswith("online.")}
+        check_fit(self.online.state_dict(), weights, "options.safetensors", AGAIN)
+        check_counters(state, self.options)
         self.online.load_state_dict(weights)
         self.target.load_state_dict(weights)
         self.option_steps[:] = state["option_steps"].numpy()

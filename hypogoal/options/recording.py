@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.domains.base import Engine
 
 STOPS_KEPT = 128  # per option
@@ -168,12 +169,10 @@ class Recorder:
 
     def write(self, folder: Path, images: Callable[[NDArray[np.int64]], NDArray[np.uint8]]) -> None:
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
-        import h5py
-
         self.flush()
         write_table(folder / "episodes.csv", EPISODE_COLUMNS, self.episodes)
         write_table(folder / "choices.csv", CHOICE_COLUMNS, self.choices)
-        with h5py.File(folder / "terminations.h5", "w") as file:
+        with create_hdf5(folder / "terminations.h5") as file:
             for option, stops in enumerate(self.stops):
                 if stops:
                     kept = self._pictures[option]

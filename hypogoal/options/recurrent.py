@@ -15,11 +15,12 @@ from torch import Tensor
 
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
 from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import PaperQNetwork
 from hypogoal.options.running import running_verdicts
@@ -205,7 +206,8 @@ class RecurrentLearner:
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber * torch.from_numpy(weights)).mean()
         if not torch.isfinite(loss):
-            raise NumericalError(f"the loss of option {option} is {float(loss.detach())} at update {member.updates}")
+            where = f"in the batch of its update {member.updates}, its step {member.steps}"
+            raise NumericalError(f"the loss of option {option} is {float(loss.detach())} {where}")
         member.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         member.optimiser.step()
@@ -230,9 +232,11 @@ class RecurrentLearner:
     def load(self, state: dict[str, Tensor]) -> None:
         """Continue from the weights and counters of an artefact; the replays start empty."""
         check_actions(state, self.actions, self.config.actions)
+        check_counters(state, self.options)
         for option, member in enumerate(self.members):
             prefix = f"{option}."
             weights = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+            check_fit(member.online.state_dict(), weights, f"option {option} of options.safetensors", AGAIN)
             member.online.load_state_dict(weights)
             member.target.load_state_dict(weights)
             member.steps = int(state["option_steps"][option])

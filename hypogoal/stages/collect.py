@@ -7,9 +7,12 @@ from typing import Any
 
 from hypogoal.core.artefacts import claim
 from hypogoal.core.config import as_dict
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.dataset import open_dataset, write_dataset
 from hypogoal.domains.base import Domain
+
+COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
 
 
 def collect(
@@ -29,6 +32,8 @@ def collect(
         Numbers of states and positives per split and sub-goal.
     """
     claim(out, force=force)
+    size = getattr(domain, "collected_bytes", lambda config: 0)(config)
+    preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
     with Progress(f"collect {domain.name}", total=1, quiet=quiet) as progress:
         collected = domain.collect(config, seed, progress)
     write_dataset(out, collected, domain=domain.name, config=as_dict(config), seed=seed, force=force)

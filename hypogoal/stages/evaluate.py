@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact
 from hypogoal.core.compute import prepare
-from hypogoal.core.errors import UserError
+from hypogoal.core.hdf5 import create_hdf5
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import open_dataset
-from hypogoal.domains.base import Domain, load_domain
+from hypogoal.domains.base import installed_domain, load_domain
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.evaluation.agents import (
     LEARNED,
@@ -48,6 +49,7 @@ from hypogoal.evaluation.summary import hypotheses_summary, summary_table
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.hypotheses.views import positions_of
+from hypogoal.needs import evaluation_needs
 
 __all__ = ["evaluate", "hypotheses_summary", "summary_table"]
 
@@ -70,18 +72,17 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
     Raises:
         UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
     """
-    import h5py
-
     prepare()
     claim(out, force=force)
     found = find(run)
-    inputs = [artefact.path for artefact in found.everything()]
+    inputs = [artefact.whole().path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})
+    preflight("evaluate", out, evaluation_needs(data), quiet=quiet)
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force
     ) as folder:
         with (
-            h5py.File(folder / "arrays.h5", "w") as arrays,
+            create_hdf5(folder / "arrays.h5") as arrays,
             Progress("evaluate", total=len(inputs), quiet=quiet) as progress,
         ):
             runs = [read_run(found, artefact) for artefact in found.agents]
@@ -139,7 +140,7 @@ def evaluate_ensembles(
     for path in sorted(set(sources)):
         dataset = open_dataset(path)
         unlabelled = Unlabelled(dataset.unlabelled(), positions_of(dataset.unlabelled_origins()))
-        kinds = getattr(domain_named(dataset.domain), "kinds", ())
+        kinds = getattr(installed_domain(dataset.domain), "kinds", ())
         for sub_goal in dataset.sub_goals:
             split = dataset.heldout(sub_goal)  # read once for all ensembles: it is the largest thing here
             for index, artefact in enumerate(artefacts):
@@ -214,7 +215,7 @@ def evaluate_distance(
         rows += [{"path": path, "ladder": config["start"], "seed": artefact.seed, **about, **row} for row in found_rows]
         progress.advance()
     names = {artefact.config["domain"] for artefact in found.ladders}
-    domain = domain_named(names.pop()) if len(names) == 1 else None
+    domain = installed_domain(names.pop()) if len(names) == 1 else None
     used = {row["ladder"] for row in rows}
     starts = [start for start in getattr(domain, "starts", ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
@@ -248,14 +249,6 @@ def validated_members(ensemble: Mapping[str, Any]) -> dict[str, int | None]:
     """Per sub-goal the member that the rooms of labelled groups pick."""
     rows = [row for row in ensemble.get("sub_goals", ()) if "rooms" in row]
     return {row["sub_goal"]: row["rooms"]["validated"]["member"] for row in rows}
-
-
-def domain_named(name: str) -> Domain | None:
-    """The domain; None where it is not installed here."""
-    try:
-        return load_domain(name)
-    except UserError:
-        return None
 
 
 def read_run(found: Found, artefact: Artefact) -> Run:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, open_artefact, versions
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.evaluated import read_evaluation
+from hypogoal.evaluation.evaluated import AGAIN, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
 
@@ -34,7 +34,10 @@ def report(run: Path, *, videos: int = 0, force: bool = False) -> Path:
     found = read_evaluation(run)
     claim(out, force=force)
     material = Material(found.metrics, found.arrays)
-    page = render(material, versions().get("hypogoal", "unknown"))
+    try:
+        page = render(material, versions().get("hypogoal", "unknown"))
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise UserError("the evaluation does not fit this hypogoal, or is damaged", found.source.path, AGAIN) from error
     agents = agents_of(run) if videos else []
     inputs = [found.source.path, *(agent.path for agent in agents[:videos])]
     with create_artefact(out, kind="report", config={"videos": videos}, seed=0, inputs=inputs, force=force) as folder:

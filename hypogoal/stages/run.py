@@ -37,7 +37,7 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
         UserError: no such stage or domain, or no experiment is on that domain.
     """
     if stage == "collect":
-        return load_domain(domain).config_class
+        return load_domain(domain, given=True).config_class
     if stage == "run":
         for experiment in EXPERIMENTS.values():
             if domain == experiment.DOMAIN:

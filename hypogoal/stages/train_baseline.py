@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ from typing import Any
 from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import Domain, load_domain
+from hypogoal.needs import baseline_needs
 
 LOG_INTERVAL = 5_000  # environment steps
 
@@ -70,12 +73,14 @@ def train_baseline(
 
     prepare(device)
     claim(out, force=force)
-    played = load_domain(domain)
+    played = load_domain(domain, given=True)
     chosen = hyperparameters(config.agent, config.setting)
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = _make_engine(played, config, chosen.environments)
     env = EngineEnv(engine)
+    size = math.prod(env.observation_space.shape or (1,))
+    preflight("train-baseline", out, baseline_needs(size, getattr(chosen, "replay", 0)), quiet=quiet)
     about = as_dict(config) | {
         "domain": played.name,
         "environments": chosen.environments,

@@ -14,12 +14,14 @@ from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.storage import write_ensemble
 from hypogoal.hypotheses.training import EnsembleConfig, fit
+from hypogoal.needs import ensemble_needs
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ def train_ensemble(
         "domain_config": dataset.config,
     }
     workers = min(config.workers or os.cpu_count() or 1, len(sub_goals))
+    preflight("train-ensemble", out, ensemble_needs(data, config, len(sub_goals), workers), quiet=quiet)
     with create_artefact(out, kind="ensemble", config=about, seed=seed, inputs=[data], force=force) as folder:
         jobs = [(data, sub_goal, config, seed, folder) for sub_goal in sub_goals]
         with Progress("train-ensemble", total=len(jobs), quiet=quiet) as progress:

@@ -6,7 +6,6 @@ count in every curve.
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +15,16 @@ from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artef
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import load_domain
+from hypogoal.evaluation import reading
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.needs import play_needs
 from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
@@ -67,12 +69,13 @@ def train_meta(
         Steps, episodes, and success and length over the last 100 episodes.
     """
     prepare(device)
-    source = open_artefact(ensemble, "ensemble")
-    trained = open_artefact(options, "options") if options else None
+    source = open_artefact(ensemble, "ensemble").whole()
+    trained = open_artefact(options, "options").whole() if options else None
     if trained:
         _check_fit(trained, source, config)
     claim(out, force=force)
     domain = load_domain(source.config["domain"])
+    preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     about = as_dict(config) | {
         "sub_goals": source.config["sub_goals"],
@@ -114,10 +117,9 @@ def train_meta(
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     """The rows of an ``episodes.csv``: step, length, reward, terminated."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return [
-            (int(r["step"]), int(r["length"]), float(r["reward"]), int(r["terminated"])) for r in csv.DictReader(file)
-        ]
+    found = reading.read_episodes(path)
+    columns = (found.step, found.length, found.reward, found.terminated.astype(int))
+    return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> None:

@@ -10,11 +10,13 @@ from typing import Any
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
+from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
+from hypogoal.needs import play_needs
 from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
@@ -58,9 +60,10 @@ def train_options(
         an episode, instead of these two the shares of ``recorder.recent``.
     """
     prepare(device)
-    source = open_artefact(ensemble, "ensemble")
+    source = open_artefact(ensemble, "ensemble").whole()
     claim(out, force=force)
     domain = load_domain(source.config["domain"])
+    preflight("train-options", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     members = verdicts.options // len(source.config["sub_goals"])
     steps = config.steps * (verdicts.options if config.steps_for == "each" else 1)

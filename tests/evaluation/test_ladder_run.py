@@ -22,6 +22,14 @@ from hypogoal.stages.report import draw_figures, report
 QUIET = {"quiet": True}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def trusted():
+    """Spec B6, G2: the data name ladder_run:DOMAIN, code that the user must allow."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HYPOGOAL_DOMAINS", "ladder_run:DOMAIN")
+        yield
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """N of 1, 2, 3 (3: every ladder), two seeds, three methods; options at N=2 on two ladders, oracles beside."""

@@ -1,0 +1,429 @@
+"""Spec G2: thousands of damaged and hostile files of each format, read by every command that reads them.
+
+``python -m benchmarks.fuzz --cases 5000`` prints a table. A case fails when a command ends other than with success or
+with one line and exit code 2, takes longer than ``SECONDS``, needs more than ``MEMORY`` beyond what it began with, or
+changes a file outside its output. ``--format hdf5 --case 17 --debug`` runs one case again with its traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import random
+import resource
+import selectors
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from benchmarks.mutations import (
+    Rng,
+    bytes_changed,
+    hdf5_changed,
+    json_changed,
+    odd_values,
+    safetensors_changed,
+    toml_of,
+    tree_changed,
+)
+from hypogoal.core.artefacts import create_artefact, sha256_of
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import Collected, States, write_dataset
+
+SECONDS = 60.0  # of the clock: the machine may be busy
+MEMORY = 2**30
+SUB_GOALS, MEMBERS, SHAPE, NETWORK = ("open-red-door", "go-to-goal"), 2, (24, 32, 3), "montezuma-crop"  # small
+PRESET = {
+    "collect": {"regime": "fixed", "unlabelled_seeds": [1, 2], "heldout_layouts": 20},
+    "train-ensemble": {"members": 3, "sub_goals": ["go-to-goal"], "diversity_weight": 1e-4, "network": "doorkey"},
+    "train-options": {"steps": 100, "chooser": "random", "bootstrap_timeout": True},
+    "train-meta": {"clip": 0.2, "decisions": 64, "termination": "learned"},
+    "train-baseline": {"agent": "ppo", "setting": "tuned"},
+    "run": {"layout_seeds": [100, 101], "seeds": [0], "controls": ["random"]},
+}
+
+
+def make_seeds(root: Path) -> None:
+    """A small run, whole: data, ensemble, options, meta, with made-up numbers in the real formats."""
+    import torch
+
+    from hypogoal.core.seeding import torch_generator
+    from hypogoal.core.tensors import save_tensors
+    from hypogoal.hypotheses.ensemble import Ensemble
+    from hypogoal.hypotheses.storage import write_ensemble
+    from hypogoal.options.networks import LightQNetwork
+    from hypogoal.options.recording import CHOICE_COLUMNS, EPISODE_COLUMNS, EXECUTION_COLUMNS, write_table
+
+    rng = np.random.default_rng(0)
+
+    def states(count: int) -> States:
+        images = rng.integers(0, 4, size=(count, *SHAPE), dtype=np.uint8)
+        return States(images, np.arange(2 * count).reshape(count, 2) % 3 == 0, {"layout_seed": np.arange(count)})
+
+    collected = Collected(SHAPE, SUB_GOALS, states(6), states(5), states(4))
+    write_dataset(root / "data.h5", collected, domain="doorkey", config={"a": [1, 2]}, seed=3)
+    about = {"sub_goals": list(SUB_GOALS), "members": MEMBERS, "network": NETWORK, "observation_shape": list(SHAPE)}
+    about |= {"domain": "doorkey", "domain_config": {"keyring": True}, "diversity": "dbat", "view": "full"}
+    with create_artefact(root / "ensemble", kind="ensemble", config=about, seed=0, inputs=[root / "data.h5"]) as folder:
+        for sub_goal in SUB_GOALS:
+            write_ensemble(folder, sub_goal, Ensemble(NETWORK, SHAPE, MEMBERS, torch_generator(0, sub_goal)))
+        (folder / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5}\n' * 3)
+    options = len(SUB_GOALS) * MEMBERS
+    settings = about | {"network": "light", "termination": "learned", "chooser": "ppo", "layout_seed": 100, "steps": 50}
+    settings |= {"option_timeout": 10, "mask_reached": True, "setting": "light", "max_episode_steps": 60}
+    for kind, inputs in (("options", ["ensemble"]), ("meta", ["ensemble", "options"])):
+        with create_artefact(
+            root / kind, kind=kind, config=settings, seed=0, inputs=[root / name for name in inputs]
+        ) as folder:
+            state = {f"online.{name}": value for name, value in LightQNetwork(SHAPE, options, 7).state_dict().items()}
+            counters = {
+                name: torch.zeros(options, dtype=torch.int64) for name in ("option_steps", "steps_since_positive")
+            }
+            save_tensors(folder / "options.safetensors", state | counters)
+            write_table(folder / "episodes.csv", EPISODE_COLUMNS, [(10 * n, 10, 1.0, n % 2) for n in range(1, 6)])
+            write_table(folder / "choices.csv", CHOICE_COLUMNS, [(50, n, 9, 3, 2.5, 1, 8) for n in range(options)])
+            rows = [(n, n % options, 3, 1, 0, 0, 1, 10, 20, 5) for n in range(6)]
+            write_table(folder / "executions.csv", EXECUTION_COLUMNS, rows)
+            facts = {"layout_seed": 100, "shortest_path": 9, "random_success": 0.1, "random_episodes": 5}
+            (folder / "layout.json").write_text(json.dumps(facts))
+            with h5py.File(folder / "terminations.h5", "w") as file:
+                file.create_dataset("0", data=collected.unlabelled.observations, compression="gzip")
+    (root / "secret").write_text("secret")
+
+
+class Sandbox:
+    """Where cases run: ``seeds`` whole, ``case`` damaged, ``out`` the output; everything else must stay as it is."""
+
+    def __init__(self, root: Path):
+        self.root, self.seeds, self.case, self.out = root, root / "seeds", root / "case", root / "out"
+        self.outside = root / "outside"
+        for folder in (self.seeds, self.outside):
+            folder.mkdir(parents=True)
+        make_seeds(self.seeds)
+        self.odd = odd_values(self.outside)
+        os.chdir(self.outside)
+        self.before = self.look()
+
+    def look(self) -> dict[str, tuple[int, int]]:
+        """Everything that no case may change: path, size and time of the last change."""
+        ours = (path for part in (self.seeds, self.outside) for path in part.rglob("*"))
+        return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in ours}
+
+    def fresh(self) -> None:
+        """An empty ``out``, and in ``case`` the whole run again."""
+        for folder in (self.case, self.out):
+            shutil.rmtree(folder, ignore_errors=True)
+        self.out.mkdir()
+        shutil.copytree(self.seeds, self.case)
+
+
+def command(*arguments: object) -> None:
+    """Run a command that must succeed or refuse; raises ``UserError`` where it refuses."""
+    from hypogoal.cli import main
+
+    said = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
+        code = main([str(argument) for argument in arguments] + (["--debug"] if DEBUG else []))
+    text = said.getvalue().strip()
+    if code == 2:
+        raise UserError(text)
+    if code != 0:
+        raise AssertionError(f"{arguments[0]} ended with {code}: {text[-300:]}")
+
+
+def tolerated(*calls: Callable[[], object]) -> bool:
+    """Whether all calls succeeded; one that refuses (``UserError``) is no failure."""
+    accepted = True
+    for call in calls:
+        try:
+            call()
+        except UserError as error:
+            accepted = False
+            if "\n" in str(error) or not str(error).isprintable():
+                raise AssertionError(f"not one printable line: {str(error)!r}") from None
+    return accepted
+
+
+def resigned(artefact: Path, name: str) -> None:
+    """Make the manifest agree with a changed file: damage that no hash betrays."""
+    path = artefact / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["files"][name] = sha256_of(artefact / name)
+    path.write_text(json.dumps(manifest))
+
+
+def read_run(case: Path, kind: str, often: bool) -> list[Callable[[], object]]:
+    """The ways in which another stage or a program reads an artefact of a run; commands, which take long, at times."""
+    import hypogoal
+    from hypogoal.inspection import describe_path, lines
+    from hypogoal.stages import evaluate
+    from hypogoal.verification import faults_of
+
+    path = case / kind
+
+    def inputs() -> None:
+        found = evaluate.find(case)
+        for artefact in found.everything():
+            for entry in artefact.manifest["inputs"]:
+                artefact.input(entry["kind"])
+        for artefact in found.agents:
+            evaluate.agent_metrics("agent", [evaluate.read_run(found, artefact)])
+
+    def check() -> None:
+        faults = faults_of(path)
+        if faults:
+            raise UserError(faults[0])
+
+    use = (
+        partial(hypogoal.load_ensemble, path, "go-to-goal")
+        if kind == "ensemble"
+        else partial(hypogoal.load_options, path)
+    )
+    calls: list[Callable[[], object]] = [check, lambda: lines(describe_path(path)), use, inputs]
+    if often:
+        calls += [lambda: command("verify", path, "--json"), lambda: command("show", path)]
+    return calls
+
+
+def read_table(path: Path) -> None:
+    """A table or file of the artefact ``meta``, as its readers do."""
+    from hypogoal.evaluation import reading
+
+    readers: dict[str, Callable[[Path], Any]] = {
+        "episodes.csv": reading.read_episodes,
+        "choices.csv": lambda path: reading.read_choices(path).total("chosen", 4),
+        "executions.csv": reading.read_executions,
+        "layout.json": reading.read_layout,
+        "terminations.h5": reading.read_terminations,
+    }
+    readers[path.name](path)
+
+
+def trained(box: Sandbox, stage: str, source: Path, *more: str) -> Callable[[], object]:
+    """A stage that starts from a damaged file and must write into ``out`` only."""
+    few = ("--set", "steps=8", "--quiet")
+    return lambda: command(stage, source, "--out", box.out / "made", *few, *more)
+
+
+def fuzz_manifest(box: Sandbox, rng: Rng, case: int) -> bool:
+    kind = rng.choice(("ensemble", "meta", "options"))
+    path = box.case / kind / "manifest.json"
+    path.write_bytes(json_changed(path.read_bytes(), rng, box.odd))
+    if rng.random() < 0.1:
+        name = path.parent / rng.choice(sorted(os.listdir(path.parent)))
+        name.unlink()
+        os.symlink(rng.choice((box.seeds / "secret", "/dev/zero", "..", name)), name)
+    calls = read_run(box.case, kind, case % 10 == 0)
+    if case % 100 == 0:
+        own = ("--set", "environments=2", "--set", "warm_up=4", "--set", "random_episodes=0")
+        calls.append(trained(box, "train-options", box.case / "ensemble", *own))
+    return tolerated(*calls)
+
+
+def fuzz_hdf5(box: Sandbox, rng: Rng, case: int) -> bool:
+    from hypogoal.inspection import describe_path, lines
+    from hypogoal.repair import repair
+    from hypogoal.verification import faults_of
+
+    path = box.case / "data.h5"
+    if rng.random() < 0.5:
+        path.write_bytes(bytes_changed(path.read_bytes(), rng))
+    else:
+        with contextlib.suppress(OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError):
+            hdf5_changed(path, rng, box.odd, box.seeds / "secret")
+    copy = box.out / "copy.h5"
+    shutil.copy(path, copy)
+
+    def check() -> None:
+        faults = faults_of(path)
+        if faults:
+            raise UserError(faults[0])
+
+    def mend() -> None:
+        try:
+            repair(copy)
+        except UserError as error:
+            if "nothing to repair" not in str(error):
+                raise
+
+    calls: list[Callable[[], object]] = [check, lambda: lines(describe_path(path)), mend]
+    if case % 10 == 0:
+        calls += [lambda: command("verify", path, "--json"), lambda: command("show", path)]
+    if case % 100 == 0:
+        calls.append(trained(box, "train-ensemble", path, "--set", "workers=1"))
+    return tolerated(*calls)
+
+
+def fuzz_safetensors(box: Sandbox, rng: Rng, case: int) -> bool:
+    where, name = rng.choice((("ensemble", "go-to-goal.safetensors"), ("meta", "options.safetensors")))
+    path = box.case / where / name
+    path.write_bytes(safetensors_changed(path.read_bytes(), rng, box.odd))
+    if rng.random() < 0.9:
+        resigned(path.parent, name)
+    return tolerated(*read_run(box.case, where, case % 10 == 0))
+
+
+def fuzz_tables(box: Sandbox, rng: Rng, case: int) -> bool:
+    name = rng.choice(("episodes.csv", "choices.csv", "executions.csv", "layout.json", "terminations.h5"))
+    path = box.case / "meta" / name
+    if name.endswith(".json"):
+        path.write_bytes(json_changed(path.read_bytes(), rng, box.odd))
+    else:
+        path.write_bytes(bytes_changed(path.read_bytes(), rng))
+    resigned(path.parent, name)
+    calls = read_run(box.case, "meta", often=False) if case % 10 == 0 else []
+    return tolerated(lambda: read_table(path), *calls)
+
+
+def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
+    from hypogoal.core.config import resolve
+    from hypogoal.stages.run import EXPERIMENTS, STAGES, config_class_of, plan
+
+    path = box.case / "own.toml"
+    text = toml_of(tree_changed(PRESET, rng, box.odd), rng).encode(errors="surrogatepass")
+    if case % 100 == 1:
+        text = b"a = " + b"[" * 100_000
+    path.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
+    stages: list[Callable[[], object]] = [
+        partial(resolve, config_class_of(stage), stage=stage, preset=str(path)) for stage in STAGES
+    ]
+    runs: list[Callable[[], object]]
+    if case % 10:
+        runs = [partial(plan, name, box.out / "run", preset=str(path)) for name in EXPERIMENTS]
+    else:
+        runs = [
+            partial(command, "run", name, "--out", box.out / "run", "--preset", path, "--dry-run")
+            for name in EXPERIMENTS
+        ]
+    return tolerated(*stages, *runs)
+
+
+FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {
+    "manifest": fuzz_manifest,
+    "hdf5": fuzz_hdf5,
+    "safetensors": fuzz_safetensors,
+    "tables": fuzz_tables,
+    "toml": fuzz_toml,
+}
+DEBUG = False
+
+
+def work(name: str, cases: range, seed: int) -> Iterator[dict[str, Any]]:
+    """Run cases in this process, in a sandbox of its own; yields how each ended."""
+    import torch
+
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        box = Sandbox(Path(folder))
+        box.fresh()
+        for kind in ("ensemble", "meta"):  # everything is loaded now, and whole files are accepted
+            if not tolerated(*read_run(box.case, kind, often=True), lambda: command("verify", box.case / "data.h5")):
+                raise AssertionError(f"the whole {kind} was refused")
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, hard))
+        for case in cases:
+            yield {"case": case, "begins": True}
+            rng = random.Random(f"{seed} {name} {case}")
+            box.fresh()
+            begun = time.monotonic()
+            try:
+                outcome, why = ("accepted" if FORMATS[name](box, rng, case) else "refused"), ""
+            except Exception as error:  # that nothing else escapes is what is tested
+                if DEBUG:
+                    raise
+                outcome, why = "crashed", f"{type(error).__name__}: {error}"
+            if box.look() != box.before:
+                outcome, why = "escaped", "a file outside the output was changed"
+                box.before = box.look()
+            yield {"case": case, "outcome": outcome, "why": why, "seconds": time.monotonic() - begun}
+        os.chdir("/")
+
+
+def fuzz(name: str, cases: int, seed: int) -> dict[str, Any]:
+    """All cases of a format, in child processes that are started again when one dies or hangs."""
+    counts: Counter[str] = Counter()
+    failures: list[str] = []
+    slowest, following = 0.0, 0
+    while following < cases:
+        arguments = ["--format", name, "--seed", str(seed), "--worker", str(following), str(cases)]
+        with subprocess.Popen([sys.executable, "-m", "benchmarks.fuzz", *arguments], stdout=subprocess.PIPE) as child:
+            lines = _lines(child)
+            for row in lines:
+                if "begins" in row:
+                    following = row["case"] + 1
+                    continue
+                counts[row["outcome"]] += 1
+                slowest = max(slowest, row["seconds"])
+                if row["outcome"] not in ("accepted", "refused"):
+                    failures.append(f"{name} case {row['case']}: {row['outcome']}: {row['why']}")
+            code = child.wait()
+        if code:
+            ended = "hung" if code == -9 else "died"
+            counts[ended] += 1
+            failures.append(f"{name} case {following - 1}: {ended} (exit code {code})")
+            if following == 0:
+                raise RuntimeError("the fuzzer itself fails, see above")
+    bad = {kind: counts[kind] for kind in ("crashed", "hung", "died", "escaped")}
+    return {"format": name, "cases": cases, "accepted": counts["accepted"], "refused": counts["refused"], **bad,
+            "slowest": round(slowest, 2), "failures": failures}  # fmt: skip
+
+
+def _lines(child: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+    """What a worker says, until it ends, or is killed because it says nothing for long."""
+    assert child.stdout is not None
+    with selectors.DefaultSelector() as selector:
+        selector.register(child.stdout, selectors.EVENT_READ)
+        patience = 600.0  # to start
+        while selector.select(patience):
+            line = child.stdout.readline()
+            if not line:
+                return
+            yield json.loads(line)
+            patience = SECONDS
+    child.kill()
+
+
+def main() -> int:
+    """Run the fuzz; exit code 1 when a case failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=5000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--format", action="append", choices=FORMATS)
+    parser.add_argument("--case", type=int)
+    parser.add_argument("--debug", action="store_true")
+    parser.add_argument("--worker", type=int, nargs=2, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.worker or given.case is not None:
+        global DEBUG
+        DEBUG = given.debug
+        cases = range(*given.worker) if given.worker else range(given.case, given.case + 1)
+        for row in work(given.format[0], cases, given.seed):
+            os.write(1, (json.dumps(row) + "\n").encode())
+        return 0
+    rows = []
+    print("| format | cases | accepted | refused | crashed | hung | died | escaped | slowest |\n" + "|---" * 9 + "|")
+    for name in given.format or FORMATS:
+        row = fuzz(name, given.cases, given.seed)
+        rows.append(row)
+        print(f"| {' | '.join(str(value) for key, value in row.items() if key != 'failures')} s |", flush=True)
+    failures = [failure for row in rows for failure in row["failures"]]
+    print("\n".join(failures[:50]), file=sys.stderr)
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,197 @@
+"""HDF5 files that others wrote: what a file declares is held against what it stores before anything is read (Spec G2).
+
+HDF5 can point out of its file (external links, external storage, virtual datasets), load code (filters that are
+plugins) and declare terabytes in a kilobyte. None of it is needed here, and all of it is refused.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name, require_file
+from hypogoal.core.preflight import free_memory, human
+
+FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # all of them built into h5py
+MOST_RATIO = 1032  # bytes that one compressed byte can stand for, at most: deflate's limit, the highest of these
+MAX_CHUNK_BYTES = 256 * 2**20
+MAX_ATTRIBUTE_BYTES = 8 * 2**20
+MAX_ENTRIES = 100_000  # of a group
+
+
+def open_hdf5(path: Path, what: str, do: str) -> Any:
+    """An HDF5 file opened for reading.
+
+    Raises:
+        UserError: missing, no regular file, truncated or not HDF5.
+    """
+    import h5py
+
+    require_file(path, f"{what} is", do)
+    try:
+        return h5py.File(path, "r")
+    except (OSError, ValueError, RuntimeError, KeyError):
+        raise UserError(f"{what} is truncated or not HDF5", path, do) from None
+
+
+@contextlib.contextmanager
+def create_hdf5(path: Path) -> Iterator[Any]:
+    """A fresh HDF5 file to fill, built in memory and written when the block ends.
+
+    Where the disk is full the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished
+    bytes ourselves is an ``OSError`` like any other.
+    """
+    import h5py
+
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        image = file.id.get_file_image()
+    path.write_bytes(image)
+
+
+class Foreign(Exception):
+    """Something in an HDF5 file that is refused; the caller says where and what to do."""
+
+
+def attribute(file: Any, name: str) -> Any:
+    """An attribute of the root: a text, an int, a float or a bool; None where there is none.
+
+    Raises:
+        Foreign: it is something else, or larger than ``MAX_ATTRIBUTE_BYTES``.
+    """
+    import h5py
+
+    try:
+        if name not in file.attrs:
+            return None
+        stored = file.attrs.get_id(name)
+        text = h5py.check_string_dtype(stored.dtype) is not None
+        if stored.shape not in ((), (1,)) or not (text or stored.dtype.kind in "iufb"):
+            raise Foreign(f"the attribute {name!r} is no text or number")
+        if stored.get_storage_size() > MAX_ATTRIBUTE_BYTES:
+            raise Foreign(f"the attribute {name!r} is too large")
+        value = file.attrs[name]
+        value = value.item() if isinstance(value, (np.generic, np.ndarray)) else value
+        return value.decode() if isinstance(value, bytes) else value
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError):  # UnicodeDecodeError is a ValueError
+        raise Foreign(f"the attribute {name!r} is not readable") from None
+
+
+def members(group: Any) -> list[str]:
+    """The names in a group, sorted.
+
+    Raises:
+        Foreign: too many, or names that are no plain ones.
+    """
+    try:
+        count = len(group)
+        names = sorted(group) if count <= MAX_ENTRIES else []
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError):
+        raise Foreign("a group is not readable") from None
+    if count > MAX_ENTRIES or not all(map(plain_name, names)):
+        raise Foreign("a group has names that cannot be right")
+    return names
+
+
+def find(file: Any, name: str) -> Any:
+    """The group or dataset called ``name`` (``a/b``); None where it is missing.
+
+    Raises:
+        Foreign: a soft or external link leads to it, or it is not readable.
+    """
+    import h5py
+
+    place = file
+    for part in name.split("/"):
+        try:
+            # Not `part in place` and not `place.get`: these follow links, into other files too.
+            if not isinstance(place, h5py.Group) or not place.id.links.exists(part.encode()):
+                return None
+            if place.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
+                raise Foreign(f"{name!r} is a link, which may lead anywhere")
+            place = place[part]
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+            raise Foreign(f"{name!r} is not readable") from None
+    return place
+
+
+def check_dataset(dataset: Any, kinds: str) -> int:
+    """The size in bytes that reading a dataset takes, found not to be more than its file can hold.
+
+    Args:
+        dataset: from :func:`find`.
+        kinds: the kinds of number allowed, letters of NumPy's ``dtype.kind``; ``T`` for one text.
+
+    Raises:
+        Foreign: another type (references among them), data outside the file, a filter that is a plugin, or more bytes
+            declared than what is stored can stand for.
+    """
+    import h5py
+
+    if not isinstance(dataset, h5py.Dataset):
+        raise Foreign("a dataset is missing")
+    try:
+        dtype, shape, name = dataset.dtype, dataset.shape, dataset.name
+        text = h5py.check_string_dtype(dtype) is not None
+        settings = dataset.id.get_create_plist()
+        if text != ("T" in kinds and shape == ()) or not (text or dtype.kind in kinds) or shape is None:
+            raise Foreign(f"{name!r} has values of an unexpected type ({dtype}, shape {shape})")
+        if dataset.is_virtual or settings.get_external_count():
+            raise Foreign(f"the data of {name!r} lie in another file")
+        for index in range(settings.get_nfilters()):
+            if settings.get_filter(index)[0] not in FILTERS:
+                raise Foreign(f"{name!r} needs a filter that is not one of {', '.join(FILTERS.values())}")
+        size, stored = prod(map(int, shape)) * dtype.itemsize, int(dataset.id.get_storage_size())
+        chunk = prod(map(int, dataset.chunks)) * dtype.itemsize if dataset.chunks else 0
+        whole = int(dataset.file.id.get_filesize())
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
+        raise Foreign("a dataset is not readable") from None
+    ratio = MOST_RATIO if settings.get_nfilters() else 1
+    if not text and (stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES):
+        raise Foreign(f"{name!r} declares {human(size)}, of which {human(stored)} are stored in {human(whole)}")
+    return size
+
+
+def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
+    """A dataset's values, after :func:`check_dataset`.
+
+    Raises:
+        Foreign: missing, refused, damaged, or larger than the memory that is free.
+    """
+    dataset = find(file, name)
+    if dataset is None:
+        raise Foreign(f"no readable {name!r}")
+    size = check_dataset(dataset, kinds)
+    free = free_memory()
+    if free is not None and size > free:
+        raise Foreign(f"{name!r} needs {human(size)} of memory, {human(free)} are free")
+    try:
+        return np.asarray(dataset[()])
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError):
+        raise Foreign(f"{name!r} is damaged") from None
+
+
+def walk(group: Any, prefix: str = "", depth: int = 8) -> Iterator[str]:
+    """The names of all datasets below a group.
+
+    Raises:
+        Foreign: a link, unreadable parts, or groups within each other more than ``depth`` deep.
+    """
+    import h5py
+
+    for name in members(group):
+        item = find(group, name)
+        if isinstance(item, h5py.Group):
+            if depth == 0:
+                raise Foreign("groups are nested too deep")
+            yield from walk(item, f"{prefix}{name}/", depth - 1)
+        elif isinstance(item, h5py.Dataset):
+            yield f"{prefix}{name}"

@@ -1,0 +1,90 @@
+"""What a ``manifest.json`` must look like before anything in it is believed (Spec A8, G2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name, read_json
+
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+MAX_MANIFEST_BYTES = 16 * 2**20
+AGAIN = "Make the artefact again."
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest in a file, every key that all artefacts have checked, and the settings that other stages read.
+
+    Raises:
+        UserError: not JSON, of a newer format, or a key or setting is missing or malformed.
+    """
+    manifest: Any = read_json(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
+    if not isinstance(manifest, dict):
+        raise UserError("the manifest is not a JSON object", path, AGAIN)
+    if type(manifest.get("format")) is int and manifest["format"] > FORMAT_VERSION:
+        raise UserError(
+            f"format {manifest['format']} is newer than this hypogoal reads ({FORMAT_VERSION})",
+            path,
+            "Upgrade hypogoal.",
+        )
+    for key, fits in WANTED.items():
+        if key not in manifest or not fits(manifest[key]):
+            raise UserError(f"the manifest's {key!r} is missing or malformed", path, AGAIN)
+    for key, fits in SETTINGS.items():
+        if key in manifest["config"] and not fits(manifest["config"][key]):
+            raise UserError(f"the manifest's setting {key!r} is malformed", path, AGAIN)
+    return manifest
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str) and "\0" not in value and len(value) < 4096
+
+
+def _count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 1 << 53
+
+
+def _list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and all(map(fits, value))
+
+
+def _input(value: Any) -> bool:
+    return isinstance(value, dict) and all(_text(value.get(key)) for key in ("path", "relative", "kind", "sha256"))
+
+
+def _files(value: Any) -> bool:
+    return isinstance(value, dict) and all(_text(name) and _text(digest) for name, digest in value.items())
+
+
+def _plain_names(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(map(plain_name, value)) and len({*value}) == len(value)
+
+
+def _size(value: Any) -> bool:
+    return _count(value) and 0 < value < 1 << 16
+
+
+# What must be in a manifest, and what settings that other stages read must look like where they are there.
+WANTED: dict[str, Callable[[Any], bool]] = {
+    "kind": plain_name,
+    "format": lambda value: type(value) is int,
+    "config": lambda value: isinstance(value, dict),
+    "seed": _count,
+    "inputs": _list_of(_input),
+    "files": _files,
+}
+SETTINGS: dict[str, Callable[[Any], bool]] = {
+    "sub_goals": _plain_names,
+    "members": _size,
+    "observation_shape": lambda value: isinstance(value, list) and bool(value) and all(map(_size, value)),
+    "domain_config": lambda value: isinstance(value, dict),
+    **dict.fromkeys(("crop_height", "crop_width"), _size),
+    **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), _count),
+    **dict.fromkeys(
+        ("domain", "network", "setting", "agent", "termination", "chooser", "start", "view", "localiser", "diversity"),
+        _text,
+    ),
+}

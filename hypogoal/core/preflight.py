@@ -1,0 +1,103 @@
+"""Before a stage starts: what it will need of memory and disk, and whether that is there (Spec G1)."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+from hypogoal.core.errors import UserError
+
+CGROUP = Path("/sys/fs/cgroup")
+
+
+def preflight(stage: str, out: Path, needs: tuple[float, float], *, quiet: bool = False) -> None:
+    """Say what a stage will need, and refuse to start where that does not fit.
+
+    Args:
+        stage: its command.
+        out: what it writes; nothing of it need be there yet.
+        needs: bytes of memory, of all its processes, and of disk, what it removes at the end included.
+        quiet: say nothing where it fits.
+
+    Raises:
+        UserError: it does not fit; the numbers are in the message.
+    """
+    memory, disk = needs
+    free, space = free_memory(), free_disk(out)
+    known = "unknown" if free is None else human(free)
+    text = (
+        f"{stage}: needs about {human(memory)} of memory ({known} free) and {human(disk)} of disk ({human(space)} free)"
+    )
+    if free is not None and memory > free:
+        raise UserError(
+            f"not enough memory: about {human(memory)} needed, {human(free)} free", stage, "See 'hypogoal config'."
+        )
+    if disk > space:
+        raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
+    if not quiet:
+        print(text, file=sys.stderr, flush=True)
+
+
+def free_disk(path: Path) -> int:
+    """Bytes that a user may still write where ``path`` is to be."""
+    return shutil.disk_usage(next(folder for folder in path.absolute().parents if folder.is_dir())).free
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that can be had: the system's, or less where a control group allows less; None if unknown."""
+    known = [amount for amount in (_system(), *_groups()) if amount is not None]
+    return min(known) if known else None
+
+
+def _system() -> int | None:
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        return None
+    return None
+
+
+def _groups() -> list[int]:
+    """What each control group that we are in leaves (a container's, a cluster job's), of either version."""
+    left = []
+    for folder, names in _folders():
+        try:
+            limit, used = (int((folder / name).read_text(encoding="ascii")) for name in names[:2])
+            rows = (line.split() for line in (folder / "memory.stat").read_text(encoding="ascii").splitlines())
+            cache = next((int(row[1]) for row in rows if row[0] == names[2]), 0)
+        except (OSError, ValueError, IndexError):  # no such file, or "max": no limit
+            continue
+        left.append(max(0, limit - (used - cache)))  # the cache of files is given up when memory is asked for
+    return left
+
+
+def _folders() -> list[tuple[Path, tuple[str, str, str]]]:
+    """The folders of our control groups and of those above them, and how three things are called there."""
+    try:
+        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return []
+    folders = []
+    for line in lines:
+        number, controllers, path = line.split(":", 2)
+        if number == "0":
+            base, names = CGROUP, ("memory.max", "memory.current", "file")
+        elif "memory" in controllers.split(","):
+            base, names = CGROUP / "memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_cache")
+        else:
+            continue
+        own = base / path.lstrip("/")
+        folders += [(folder, names) for folder in (own, *own.parents) if folder.is_relative_to(base)]
+    return folders
+
+
+def human(amount: float) -> str:
+    """Bytes as a person reads them: 1.4 GB."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if amount < 1000:
+            return f"{amount:.0f} {unit}" if unit == "bytes" or amount >= 100 else f"{amount:.1f} {unit}"
+        amount /= 1000
+    return f"{amount:.1f} TB"

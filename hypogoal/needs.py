@@ -1,0 +1,78 @@
+"""What each stage will need of memory and disk, in bytes, said before it starts (``core.preflight``).
+
+Estimates on the high side, from what is kept: states, replays, networks with their optimiser. ``BASE`` is what a
+process with torch has before any of it (450 MB were measured while ``train-meta`` ran on DoorKey, light).
+"""
+
+from __future__ import annotations
+
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.base import Domain
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.meta.playing import LEARNERS, PlayConfig
+from hypogoal.options.recording import STOPS_KEPT
+
+BASE = 450e6
+MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal (the paper's for Montezuma)
+PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
+COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
+PER_TRANSITION = 50  # bytes in a replay, its sum tree included
+LOGS = 50e6
+
+
+class Needs(NamedTuple):
+    """Bytes of memory, of all processes of a stage together, and of disk."""
+
+    memory: float
+    disk: float
+
+
+def ensemble_needs(data: Path, config: EnsembleConfig, sub_goals: int, workers: int) -> Needs:
+    """``train-ensemble``: each process holds a sub-goal's states three times (read, as seen, prepared)."""
+    dataset = open_dataset(data)
+    counts = dataset.counts()
+    labelled = max((row["states"] for row in counts["labelled"].values()), default=0)
+    states = (labelled + counts["unlabelled"]) * prod(dataset.observation_shape)
+    own = BASE + 3 * states + COPIES * config.members * MEMBER
+    return Needs(workers * own, sub_goals * config.members * MEMBER + LOGS)
+
+
+def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Needs:
+    """``train-options`` and ``train-meta``.
+
+    Args:
+        domain: where they play; one with named starts remembers a frame of each step as far back as replays reach.
+        about: the ensemble manifest's configuration.
+        config: how options are learned.
+    """
+    oracle = config.termination == "oracle"
+    options = len(domain.sub_goals) if oracle else len(about["sub_goals"]) * about["members"]
+    picture = prod(domain.observation_shape)
+    paper = config.network == "paper"
+    replays = options if paper else 1
+    weights = options * PAPER_POLICY if paper else 8e6
+    frames = LEARNERS[config.network].reach(config, options) * prod(domain.observation_shape[:2])
+    kept = frames if getattr(domain, "starts", ()) else 0
+    stops = STOPS_KEPT * options * picture
+    memory = BASE + replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
+    return Needs(memory + len(about["sub_goals"]) * about["members"] * MEMBER, weights + stops + LOGS)
+
+
+def baseline_needs(observation: int, replay: int) -> Needs:
+    """``train-baseline``: ``replay`` transitions of two observations of so many bytes."""
+    return Needs(BASE + 100e6 + 2.0 * observation * replay, LOGS)
+
+
+def evaluation_needs(data: list[Path]) -> Needs:
+    """``evaluate``: the held-out and unlabelled states of one data file at a time, twice."""
+    largest = 0
+    for path in data:
+        dataset = open_dataset(path)
+        counts = dataset.counts()
+        heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
+        largest = max(largest, (heldout + counts["unlabelled"]) * prod(dataset.observation_shape))
+    return Needs(BASE + 300e6 + 2.0 * largest, 2 * LOGS)

@@ -1,0 +1,147 @@
+"""Faults on the way: numbers that are none, disks that are full, folders that may not be written (Spec G2, G3)."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from corridor import Corridor
+
+import hypogoal
+from hypogoal.cli import main
+from hypogoal.core.errors import NumericalError
+from hypogoal.core.tensors import save_tensors
+from hypogoal.domains.base import Step
+from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import OptionLoop, RandomChooser
+from hypogoal.options.light import LightLearner
+from hypogoal.options.recording import Recorder
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+TESTS = Path(__file__).parent
+CONFIG = OptionConfig(environments=4, warm_up=20, update_interval=4, option_batch=16)
+
+
+class Spoiled(Corridor):
+    """A domain whose rewards are no numbers from its 30th step on."""
+
+    steps = 0
+
+    def step(self, actions: np.ndarray) -> Step:
+        self.steps += 1
+        step = super().step(actions)
+        rewards = step.rewards.copy()
+        rewards[2] = np.nan if self.steps > 30 else rewards[2]
+        return step._replace(rewards=rewards)
+
+
+def loop_of(engine: Corridor) -> OptionLoop:
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner = LightLearner(engine, verdicts, CONFIG, 0)
+    return OptionLoop(
+        engine, verdicts, learner, RandomChooser(np.random.default_rng(0)), Recorder(2), CONFIG, gamma=0.9
+    )
+
+
+def test_a_reward_that_is_no_number_stops_the_run() -> None:
+    """Spec G3: environment, option and step are named."""
+    loop = loop_of(Spoiled(4))
+    for _ in range(30):
+        loop.step()
+    with pytest.raises(NumericalError, match=r"^the reward is nan in environment 2 under option [01] at step 120$"):
+        loop.step()
+
+
+def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
+    """Spec G3: the option, the batch and the step are named; the weights stay as they were."""
+    loop = loop_of(Corridor(4))
+    for _ in range(20):
+        loop.step()
+    learner = loop.learner
+    before = {name: value.clone() for name, value in learner.state().items()}
+    hook = learner.online.heads.weight.register_hook(lambda gradient: gradient * torch.inf)
+    with pytest.raises(
+        NumericalError, match=r"a gradient of the options is (nan|inf) in the batch of update \d+, step"
+    ):
+        learner._update()
+    hook.remove()
+    assert all(torch.equal(before[name], value) for name, value in learner.state().items())
+    with torch.no_grad():
+        learner.online.heads.bias.view(2, -1)[1] = torch.nan
+    with pytest.raises(NumericalError, match=r"the option loss is nan, from option \[1\], in the batch of update \d+"):
+        learner._update()
+
+
+def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:
+    """Spec G3."""
+    policy = MetaPolicy(Corridor(4), 2, MetaConfig(), seed=0)
+    weight = policy.parameters[0]
+    with pytest.raises(
+        NumericalError, match=r"a gradient of the meta-policy is (nan|inf) in update 3, epoch 1, batch 2"
+    ):
+        policy._step((weight - weight.detach()).sqrt().sum(), "update 3, epoch 1, batch 2")
+    assert torch.isfinite(weight).all()
+
+
+def test_weights_that_are_no_numbers_are_never_saved(tmp_path: Path) -> None:
+    """Spec G3: whatever let them through."""
+    with pytest.raises(NumericalError, match=r"the weight b of options is NaN or Inf"):
+        save_tensors(tmp_path / "options.safetensors", {"a": torch.zeros(2), "b": torch.tensor([1.0, torch.inf])})
+    assert list(tmp_path.iterdir()) == []
+
+
+FULL = """
+import resource, sys
+sys.path[:0] = [{tests!r}, {tests!r} + "/domains"]
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+from hypogoal.cli import main
+sys.exit(main({arguments!r}))
+"""
+
+
+def limited(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command in a process that may write no file larger than 3,000 bytes: what a full disk does to it."""
+    code = FULL.format(tests=str(TESTS), arguments=list(arguments))
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=TESTS.parent)
+
+
+def test_a_full_disk_is_one_line_and_nothing_half_written(tmp_path: Path) -> None:
+    """Spec G2: HDF5, here of ``collect``; what stood at --out before stands there still."""
+    out = tmp_path / "data.h5"
+    done = limited("collect", "own_domain:DOMAIN", "--out", str(out), "-q")
+    assert done.returncode == 2, done.stderr
+    assert re.fullmatch(r"hypogoal: File too large.*Nothing was half-written\. .*\n", done.stderr)
+    assert list(tmp_path.iterdir()) == []
+    out.write_text("old")
+    assert limited("collect", "own_domain:DOMAIN", "--out", str(out), "--force", "-q").returncode == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["data.h5"] and out.read_text() == "old"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_folders_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: --out is refused; data in a read-only folder are read."""
+    from toy_data import write
+
+    path = write(tmp_path / "data.h5")
+    path.chmod(0o444)
+    tmp_path.chmod(0o555)
+    try:
+        assert main(["verify", str(path)]) == 0
+        assert main(["collect", "doorkey", "--out", str(tmp_path / "new.h5")]) == 2
+        assert "no permission to write" in capsys.readouterr().err
+    finally:
+        tmp_path.chmod(0o755)
+
+
+def test_nothing_depends_on_the_clock() -> None:
+    """Spec G1: no decision reads the time of day or when a file was changed; durations are of the monotonic clock."""
+    sources = sorted(Path(hypogoal.__file__).parent.rglob("*.py"))
+    told = re.compile(r"\btime\.time\(|\bdatetime\b|st_[mca]time|get[mca]time")
+    assert len(sources) > 50
+    assert [str(path) for path in sources if told.search(path.read_text(encoding="utf-8"))] == []

@@ -1,0 +1,240 @@
+"""Files of strangers: nothing runs, nothing is allocated for a claim, nothing is written elsewhere (Spec G2)."""
+
+import json
+import os
+import resource
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from toy_data import SHAPE, write
+
+from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.config import resolve
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import inside, parse_json, plain_name, read_text
+from hypogoal.core.tensors import load_fitting, load_tensors
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.base import load_domain
+from hypogoal.experiments.cells import stage_cell
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.inspection import lines
+from hypogoal.verification import faults_of
+
+OBSERVATIONS = "labelled/one/observations"
+
+
+def replaced(path: Path, name: str, make: Any) -> None:
+    with h5py.File(path, "a") as file:
+        del file[name]
+        make(file)
+
+
+def external(file: Any, secret: Path) -> None:
+    file.create_dataset(OBSERVATIONS, shape=(7, *SHAPE), dtype="u1", external=[(str(secret), 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file: Any, secret: Path) -> None:
+    layout = h5py.VirtualLayout(shape=(7, *SHAPE), dtype="u1")
+    layout[...] = h5py.VirtualSource(str(secret), "x", shape=(7, *SHAPE))
+    file.create_virtual_dataset(OBSERVATIONS, layout)
+
+
+HOSTILE = {
+    "external link": (lambda f, s: f.__setitem__(OBSERVATIONS, h5py.ExternalLink(str(s), "/x")), "is a link"),
+    "soft link": (lambda f, s: f.__setitem__(OBSERVATIONS, h5py.SoftLink("/heldout/one/observations")), "is a link"),
+    "external storage": (external, "lie in another file"),
+    "virtual": (virtual, "lie in another file"),
+    "references": (lambda f, s: f.create_dataset(OBSERVATIONS, shape=(7, *SHAPE), dtype=h5py.ref_dtype), "type"),
+    "floats": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, *SHAPE))), "type"),
+    "a filter": (
+        lambda f, s: f.create_dataset(OBSERVATIONS, shape=(7, *SHAPE), dtype="u1", chunks=True, scaleoffset=0),
+        "filter",
+    ),
+    "terabytes": (lambda f, s: f.create_dataset(OBSERVATIONS, shape=(2**40, *SHAPE), dtype="u1"), "declares"),
+    "terabytes in chunks": (
+        lambda f, s: f.create_dataset(
+            OBSERVATIONS, shape=(2**40, *SHAPE), dtype="u1", chunks=(64, *SHAPE), compression="gzip"
+        ),
+        "declares",
+    ),
+    "another shape": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, 9), "u1")), "not uint8"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_hdf5(tmp_path: Path, case: str) -> None:
+    """Spec G2: links, other files, references, filters, sizes that are only declared."""
+    make, words = HOSTILE[case]
+    with h5py.File(tmp_path / "secret.h5", "w") as file:
+        file["x"] = np.ones((7, *SHAPE), "u1")
+    path = write(tmp_path / "data.h5")
+    replaced(path, OBSERVATIONS, lambda file: make(file, tmp_path / "secret.h5"))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(UserError, match=words) as caught:
+        open_dataset(path).labelled("one")
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    assert any(words in fault for fault in faults_of(path))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+def test_a_bomb_is_weighed_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G2: what compresses a thousand times is legal; it must fit the memory that is free."""
+    path = write(tmp_path / "data.h5")
+    replaced(
+        path,
+        OBSERVATIONS,
+        lambda file: file.create_dataset(OBSERVATIONS, data=np.zeros((10**5, *SHAPE), "u1"), compression="gzip"),
+    )
+    monkeypatch.setattr("hypogoal.core.hdf5.free_memory", lambda: 10**6)
+    with pytest.raises(UserError, match=r"needs 6\.0 MB of memory, 1\.0 MB are free"):
+        open_dataset(path).labelled("one")
+
+
+@pytest.mark.parametrize(
+    "names", [["../../x"], ["/abs"], ["a/b"], [""], [".hidden"], ["a", "a"], [1], {}, "one", ["\n"]]
+)
+def test_names_of_sub_goals_become_files(tmp_path: Path, names: Any) -> None:
+    """Spec G2: a sub-goal called ../../x would be written outside --out."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path, "a") as file:
+        file.attrs["sub_goals"] = json.dumps(names)
+    with pytest.raises(UserError, match="not a hypogoal data file"):
+        open_dataset(path)
+
+
+def artefact(out: Path) -> Path:
+    config = {"sub_goals": ["one"], "members": 1}
+    with create_artefact(out, kind="meta", config=config, seed=0) as folder:
+        (folder / "a.csv").write_text("step\n1\n")
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"inputs": [{"path": 3}]}, "'inputs'"),
+        ({"inputs": [{"path": "\0", "relative": "", "kind": "", "sha256": ""}]}, "'inputs'"),
+        ({"files": {"a": 3}}, "'files'"),
+        ({"config": {"members": 10**9}}, "'members'"),
+        ({"config": {"sub_goals": ["../x"]}}, "'sub_goals'"),
+        ({"config": {"observation_shape": [10**9, 2, 3]}}, "'observation_shape'"),
+        ({"seed": -1}, "'seed'"),
+        ({"seed": True}, "'seed'"),
+        ('{"a": NaN}', "not valid JSON"),
+        ("[" * 10**6, "not valid JSON"),
+        ('{"a": ' * 40 + "1" + "}" * 40, "not valid JSON"),
+        ('{"a": "\\ud800"}', "not valid JSON"),
+        ("9" * 10_000, "not valid JSON"),
+        ("\xff", "not a JSON object|not valid JSON|UTF-8"),
+    ],
+)
+def test_hostile_manifests(tmp_path: Path, change: Any, words: str) -> None:
+    """Spec G2."""
+    path = artefact(tmp_path / "meta") / "manifest.json"
+    text = json.dumps(json.loads(path.read_text()) | change) if isinstance(change, dict) else change
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(UserError, match=words) as caught:
+        open_artefact(path.parent)
+    assert str(caught.value).isprintable()
+
+
+def test_links_and_paths_that_lead_out(tmp_path: Path) -> None:
+    """Spec G2: in an artefact, by name or through a link, nothing outside it is read."""
+    out = artefact(tmp_path / "meta")
+    (tmp_path / "secret").write_text("step\n1\n")
+    (out / "a.csv").unlink()
+    (out / "a.csv").symlink_to(tmp_path / "secret")
+    assert faults_of(out) == [f"{out}: a.csv: outside the artefact"]
+    with pytest.raises(UserError, match="outside the artefact"):
+        open_artefact(out).whole()
+    (out / "loop").symlink_to(out / "loop")
+    for name in ("../secret", "/etc/hosts", "a/../../secret", "loop", "", ".", "a\0b", "x" * 300, 3):
+        assert inside(out, name) is None, name
+    assert inside(out, "figures/a.svg") == out / "figures/a.svg"
+
+
+def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
+    """Spec G2: opening a pipe would wait for ever, reading /dev/zero never end."""
+    os.mkfifo(tmp_path / "pipe.toml")
+    for path in (tmp_path / "pipe.toml", Path("/dev/zero")):
+        with pytest.raises(UserError, match="not a regular file"):
+            read_text(path, "it is", "")
+        with pytest.raises(UserError, match="not a regular file"):
+            open_dataset(path)
+        with pytest.raises(UserError, match="not a regular file"):
+            load_tensors(path)
+    with pytest.raises(UserError, match="not a regular file"):
+        resolve(EnsembleConfig, stage="train-ensemble", preset=str(tmp_path / "pipe.toml"))
+
+
+@pytest.mark.parametrize("length", [0, 10, 2**31, 2**63, 2**64 - 1])
+def test_headers_of_safetensors(tmp_path: Path, length: int) -> None:
+    """Spec G2: a header's length is a claim, too."""
+    path = tmp_path / "a.safetensors"
+    save_file({"a": torch.zeros(4)}, path)
+    path.write_bytes(length.to_bytes(8, "little") + path.read_bytes()[8:])
+    with pytest.raises(UserError, match="the weights are damaged"):
+        load_tensors(path)
+
+
+def test_weights_are_weighed_before_a_network_is_made() -> None:
+    """Spec G2: a manifest that asks for a network of 4 TB is answered from its shapes."""
+    with pytest.raises(UserError, match="do not fit"):
+        load_fitting(lambda: torch.nn.Linear(10**6, 10**6), {"weight": torch.zeros(2)}, "here")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "[" * 100_000,
+        "a = " + "9" * 5_000,
+        "[train-ensemble]\nmembers = 1979-05-27",
+        "[train-ensemble]\nmembers = {a = 1}",
+        "[train-ensemble]\nmembers = inf",
+        "[train-ensemble]\ndiversity = [[1]]",
+        "[train-ensemble]\nmembers = " + "9" * 400,
+        "train-ensemble = 3",
+        "\0",
+        "# " + "x" * 2**20,
+    ],
+)
+def test_hostile_presets(tmp_path: Path, text: str) -> None:
+    """Spec G2: TOML of odd types, depths and sizes."""
+    path = tmp_path / "own.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        resolve(EnsembleConfig, stage="train-ensemble", preset=str(path))
+    assert len(str(caught.value)) < 1000 and str(caught.value).isprintable()
+
+
+def test_a_file_cannot_name_code_to_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6, G2: ``module:object`` is imported where the user gave it or allowed it, not because a file says so."""
+    (tmp_path / "evil.py").write_text("import pathlib; pathlib.Path(__file__).with_name('ran').touch(); DOMAIN = 1")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(UserError, match="Do you trust it"):
+        load_domain("evil:DOMAIN")
+    assert not (tmp_path / "ran").exists()
+    monkeypatch.setenv("HYPOGOAL_DOMAINS", "other:DOMAIN,evil:DOMAIN")
+    with pytest.raises(UserError, match="not a domain"):
+        load_domain("evil:DOMAIN")
+    assert (tmp_path / "ran").exists()
+
+
+def test_cells_stay_in_their_run(tmp_path: Path) -> None:
+    """Spec G2: a preset's variant that climbs out of --out is refused."""
+    with pytest.raises(UserError, match="outside the run"):
+        stage_cell(tmp_path / "a" / ".." / ".." / "x", tmp_path, ("collect",))
+
+
+def test_messages_cannot_drive_a_terminal() -> None:
+    """Spec G2: what a stranger's file says is quoted in messages."""
+    assert str(UserError("kind \x1b[2J", "\ud800")) == "kind ?[2J: ?"
+    assert lines({"kind": "meta", "path": "a", "config": {"x": "\x1b[2J"}})[-1] == "  x: ?[2J"
+    assert not plain_name("\x1b[2J") and plain_name("open-red-door")
+    with pytest.raises(UserError):
+        parse_json("[1e999]", "here", "it is", "")
