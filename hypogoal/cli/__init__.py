@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from hypogoal.cli import making, showing
-from hypogoal.cli.common import app
+from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import NumericalError, UserError
 
 __all__ = ["app", "main", "making", "showing"]
@@ -53,9 +53,11 @@ def main(arguments: list[str] | None = None) -> int:
     except NumericalError as error:
         if debug:
             raise
-        return _fail(f"training stopped: {error}", 1)
-    except KeyboardInterrupt:
-        return _fail("stopped; nothing was half-written", 130)
+        return _fail("; ".join([f"training stopped: {error}", *notes_of(error)]), 1)
+    except Interrupted as stop:
+        cause = stop.__cause__ or stop
+        number = cause.args[0] if cause.args else signal.SIGINT
+        return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)
     except Exception as error:
         code = getattr(error, "exit_code", None)
         if code is not None:
@@ -64,6 +66,11 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         return _fail(f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1)
+
+
+def notes_of(error: BaseException) -> list[str]:
+    """What those whom an error passed had to add, each once."""
+    return list(dict.fromkeys(getattr(error, "__notes__", [])))
 
 
 def _stop(signum: int, _frame: object) -> None:

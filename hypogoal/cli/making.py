@@ -44,7 +44,7 @@ def collect(
         return
     found = load_domain(domain)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_)
-    counts = stage(found, config, out, seed=seed, force=force, quiet=quiet)
+    counts = stage(found, config, out, seed=seed, force=force, resume=resume, quiet=quiet)
     if not quiet:
         for split in ("labelled", "heldout"):
             for sub_goal, row in counts[split].items():
@@ -75,7 +75,7 @@ def train_ensemble(
         return
     given = {"diversity": diversity, "members": members}
     config = resolve_for(domain_of(data, "data"), TrainEnsembleConfig, "train-ensemble", preset, set_, given)
-    stage(data, config, out, seed=seed, force=force, quiet=quiet, device=device)
+    stage(data, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)
 
 
@@ -100,7 +100,9 @@ def train_options(
         return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainOptionsConfig, "train-options", preset, set_, given)
-    print_outcome(stage(ensemble, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    print_outcome(
+        stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
+    )
     typer.echo(out)
 
 
@@ -127,7 +129,9 @@ def train_meta(
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainMetaConfig, "train-meta", preset, set_, given)
     print_outcome(
-        stage(ensemble, config, out, options=options, seed=seed, force=force, quiet=quiet, device=device),
+        stage(
+            ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
+        ),
         quiet,
     )
     typer.echo(out)
@@ -155,7 +159,7 @@ def train_baseline(
         return
     given = {"agent": agent, "layout_seed": layout_seed}
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given)
-    print_outcome(stage(domain, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    print_outcome(stage(domain, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet)
     typer.echo(out)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
+from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.progress import MetricsLog, Progress
@@ -47,6 +48,7 @@ def train_options(
     *,
     seed: int = 0,
     force: bool = False,
+    resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
@@ -58,7 +60,7 @@ def train_options(
     """
     prepare(device)
     source = open_artefact(ensemble, "ensemble")
-    claim(out, force=force)
+    claim(out, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     members = verdicts.options // len(source.config["sub_goals"])
@@ -71,14 +73,16 @@ def train_options(
         "domain_config": source.config["domain_config"],
         "setting": config.network,
     }
-    with create_artefact(out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force) as folder:
+    with create_artefact(
+        out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force, resume=resume
+    ) as folder:
         recorder = Recorder(verdicts.options)
         rng = rng_for(seed, "random-choice")
         chooser = RandomChooser(rng) if config.chooser == "random" else EvenChooser(verdicts.options, rng)
         loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0)
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:
-            play(loop, steps, log, progress)
+            play(loop, steps, log, progress, checkpoints_of(folder))
         log.close()
         recorder.write(folder, engine.images)
         if hasattr(engine, "positions") and hasattr(domain, "distance"):
