@@ -31,7 +31,7 @@ GOALS = "sub_goals=open-red-door,go-to-goal"
 QUICK = ("warm_up=100", "max_episode_steps=60", "random_episodes=5")
 DOORKEY = ("heldout_layouts=1", "unlabelled_seeds=1")
 ROOMS = ("groups=1", "states_per_room=60", "unlabelled_per_room=30", "heldout_per_room=6")
-DESCENT = ("start=room1-left", "warm_up=60", "replay=300", "environments=3", "along=0.3")
+DESCENT = ("start=1L", "warm_up=60", "replay=300", "environments=3", "along=0.3")
 
 
 def _set(*pairs: str) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ _ALL = (
         ("train-ensemble", "{data}", *_set("steps=6", "workers=2", "members=2", "schedule=sequential", GOALS)),
         ("data",),
     ),
-    Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=10", "workers=1", "members=2")), ("rooms",)),
+    Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=4", "workers=1", "members=2")), ("rooms",)),
     Stage("options", ("train-options", "{ensemble}", *_set("steps=1500", "environments=8", *QUICK)), ("ensemble",)),
     Stage(
         "meta",
@@ -72,9 +72,9 @@ _ALL = (
         ),
         ("ensemble", "options"),
     ),
-    Stage("descent", ("train-options", "{climbers}", *_set("steps=200", *DESCENT)), ("climbers",)),
-    Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=6000", *QUICK[1:]))),
-    Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=4000", *QUICK[1:]))),
+    Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
+    Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=5120", *QUICK[1:]))),
+    Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=2000", *QUICK[1:]))),
 )
 STAGES = {stage.name: stage for stage in _ALL}
 
@@ -196,7 +196,7 @@ def left_over(out: Path) -> bool:
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """Files of two outputs that are not the same bytes; of a manifest the command line is left out, which says --out."""
+    """Files of two outputs that are not the same bytes; a manifest's command line, which says --out, is left out."""
     if one.is_file():
         return [] if one.read_bytes() == other.read_bytes() else [one.name]
     names = {path.relative_to(folder).as_posix() for folder in (one, other) for path in folder.rglob("*")}

@@ -188,11 +188,14 @@ def evaluate(
 def report(
     run: Annotated[Path, typer.Argument(help="A run that was evaluated.")],
     force: Force = False,
+    resume: Resume = False,
     quiet: Quiet = False,
 ) -> None:
     """Draw RUN/report/index.html: one file, readable offline."""
     from hypogoal.stages.report import report as stage
 
+    if is_complete(run / "report", resume):
+        return
     typer.echo(stage(run, force=force))
 
 
@@ -203,7 +206,7 @@ def run(
     preset: Preset = None,
     set_: Set = None,
     force: Force = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, make the rest.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
     quiet: Quiet = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")] = False,
 ) -> None:

@@ -57,10 +57,11 @@ class Checkpoints:
         self._fixed = float(pace) if pace else None
         self._next = time.monotonic() + (FEWEST_SECONDS if self._fixed is None else self._fixed)
         self._signal: int | None = None
+        self._interrupted = False
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Checkpoints:
-        self._signal = None
+        self._signal, self._interrupted = None, False
         if threading.current_thread() is threading.main_thread():  # no other may have handlers
             for number in SIGNALS:
                 if signal.getsignal(number) is not signal.SIG_IGN:
@@ -77,9 +78,10 @@ class Checkpoints:
             raise KeyboardInterrupt(self._signal)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGINT and self._signal == signal.SIGINT:
+        if number == signal.SIGINT and self._interrupted:
             raise KeyboardInterrupt(number)
-        self._signal = number
+        self._interrupted |= number == signal.SIGINT  # the first; a run sends SIGTERM on
+        self._signal = self._signal or number
 
     @property
     def saved(self) -> bool:

@@ -56,6 +56,20 @@ def check_free(out: Path, *, force: bool, resume: bool) -> None:
             _check_unfinished(out, force=force, resume=resume)
 
 
+@contextlib.contextmanager
+def sole_writer(out: Path) -> Iterator[None]:
+    """Write into ``out`` as the only process that does; of outputs that have no draft because they grow bit by bit.
+
+    Raises:
+        UserError: another process does.
+    """
+    with _locked(out):
+        try:
+            yield
+        finally:
+            shutil.rmtree(draft_folder(out), ignore_errors=True)
+
+
 def unfinished(out: Path) -> bool:
     """Whether something was begun for ``out`` that can be gone on with."""
     folder = draft_folder(out)
