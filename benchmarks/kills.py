@@ -68,7 +68,7 @@ _ALL = (
         "meta",
         (
             *("train-meta", "{ensemble}", "--options", "{options}"),
-            *_set("steps=1500", "decisions=32", "environments=8", *QUICK),
+            *_set("steps=1500", "decisions=32", "environments=8", "initiation=learned", *QUICK),
         ),
         ("ensemble", "options"),
     ),

@@ -32,7 +32,8 @@ class TrainingStates:
         network: any of the networks that will see them (their layers decide how images are stored).
         device: where they are to be used.
         ladders: int64 (N,), at which ladder each labelled state is, where batches are drawn by them.
-        tables: whether distinct patches may be tabled; not where the images are changed before use.
+        grey: whether the shades of each state of a training batch are mapped at random.
+        jitter: by how many pixels at most each of them is moved at random; the images have that margin on every side.
 
     Raises:
         UserError: shapes that do not fit, or labels of one class only.
@@ -47,7 +48,8 @@ class TrainingStates:
         device: torch.device,
         *,
         ladders: NDArray[np.int64] | None = None,
-        tables: bool = True,
+        grey: bool = False,
+        jitter: int = 0,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
@@ -58,7 +60,9 @@ class TrainingStates:
         self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
         self.ladders, self.device = ladders, device
         images = np.concatenate([observations, unlabelled])
-        self._tables = patches.make_tables(images, network) if tables and device.type == "cpu" else None
+        self._grey, self._jitter = grey, jitter
+        tables = device.type == "cpu" and not (grey or jitter)  # of patches, which change with the images
+        self._tables = patches.make_tables(images, network) if tables else None
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
 
@@ -67,7 +71,7 @@ class TrainingStates:
         networks: Sequence[nn.Sequential],
         *groups: NDArray[np.int64],
         counted: Sequence[bool] = (),
-        greys: np.random.Generator | None = None,
+        changes: np.random.Generator | None = None,
     ) -> list[list[Tensor]]:
         """Each network's logits of groups of states.
 
@@ -78,7 +82,7 @@ class TrainingStates:
             groups: states (B,) each.
             counted: for each group whether BatchNorm's running statistics take it in, in training mode; all where
                 empty.
-            greys: where given, what every state's shades are mapped at random with.
+            changes: what the states are changed at random with, see ``grey`` and ``jitter``; None, they are not.
 
         Returns:
             For each network each group's logits (B, 2).
@@ -87,11 +91,11 @@ class TrainingStates:
         if self._tables is not None:
             batch = patches.take(self._tables, *groups)
             return [list(patches.forward(network, batch, counted).split(sizes)) for network in networks]
-        inputs = self._inputs(np.concatenate(groups), greys)
+        inputs = self._inputs(np.concatenate(groups), changes)
         return [list(_forward(network, inputs, sizes, counted).split(sizes)) for network in networks]
 
     def count_in(
-        self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], greys: np.random.Generator | None = None
+        self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
     ) -> None:
         """BatchNorm's running statistics of networks in training mode take states (B,) in; nothing else is computed."""
         with torch.no_grad():
@@ -101,16 +105,18 @@ class TrainingStates:
                 for head in heads:
                     patches.forward(head, batch)
             else:
-                inputs = self._inputs(states, greys)
+                inputs = self._inputs(states, changes)
                 for head in heads:
                     head(inputs)
 
-    def _inputs(self, states: NDArray[np.int64], greys: np.random.Generator | None) -> Tensor:
+    def _inputs(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
         assert self._images is not None
         images = self._images[torch.from_numpy(states).to(self.device)]
-        if greys is None:
+        if self._jitter:
+            images = _cut(images, self._jitter, changes)
+        if changes is None or not self._grey:
             return as_input(images)
-        maps = torch.from_numpy(grey_maps(len(states), greys)).to(self.device)
+        maps = torch.from_numpy(grey_maps(len(states), changes)).to(self.device)
         return maps.gather(1, images.flatten(start_dim=1).long()).view(images.shape).permute(0, 3, 1, 2)
 
     def targets(self, states: NDArray[np.int64]) -> Tensor:
@@ -171,6 +177,17 @@ def _shuffled(pool: NDArray[np.int64], rng: np.random.Generator) -> Iterator[np.
     """Without end: the pool's items, shuffled anew whenever it has been gone through."""
     while True:
         yield from rng.permutation(pool)
+
+
+def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor:
+    """Images (B, H, W, C) without a margin on every side, the middle or, each on its own, somewhere at random."""
+    count, height, width = images.shape[:3]
+    size = 2 * margin + 1
+    corners = np.full((count, 2), margin) if rng is None else rng.integers(size, size=(count, 2))
+    corner = torch.from_numpy(corners).to(images.device)
+    rows = corner[:, :1] + torch.arange(height - size + 1, device=images.device)
+    columns = corner[:, 1:] + torch.arange(width - size + 1, device=images.device)
+    return images[torch.arange(count)[:, None, None], rows[:, :, None], columns[:, None, :]]
 
 
 def grey_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -77,6 +77,14 @@ class EnsembleConfig:
         source=BEYOND,
         choices=("none", "grey"),
     )
+    jitter: int = setting(
+        0,
+        "the window of each state of a training batch is moved at random by up to so much (view=agent-crop)",
+        unit="pixels",
+        source=BEYOND,
+        low=0,
+        high=20,
+    )
     batch_kind: str = setting(
         "plain",
         "labelled batches: plain, as class_balance says; per-ladder, 3/8 positives, as many of each ladder",

@@ -100,13 +100,14 @@ def fit(
             on_step.restore(saved["told"])  # type: ignore[union-attr]
     networks = ensemble.networks()
     states = TrainingStates(
-        view.see(observations, positions_of(origins)),
+        view.see(observations, positions_of(origins), margin=config.jitter),
         labels,
-        view.see(unlabelled, positions_of(unlabelled_origins)),
+        view.see(unlabelled, positions_of(unlabelled_origins), margin=config.jitter),
         networks[0],
         torch.device(device),
         ladders=_ladders(config, origins),
-        tables=config.augment == "none",
+        grey=config.augment == "grey",
+        jitter=config.jitter,
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
@@ -158,6 +159,8 @@ def _view(
 ) -> FullView | AgentView:
     """What the members are to see; a localiser that learns is trained here, or where not ``fitted`` to be loaded."""
     if config.view == "full":
+        if config.jitter:
+            raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
         return FullView(observations.shape[1:])
     montezuma_only(observations.shape[1:], "view=agent-crop")
     needed(origins, POSITION, "view=agent-crop")
@@ -236,27 +239,29 @@ def _fit_members(
         fused=True,
     )
     watch = _Watch(members, len(frozen) if diverse else 0, config, steps_before, on_step)
-    greys = rng_for(seed, "greys") if config.augment == "grey" else None
+    changes = rng_for(seed, "greys")
 
     def state() -> State:
-        known = {"greys": greys.bit_generator.state} if greys else {}
-        return {"optimiser": optimiser_snapshot(optimiser), "watch": watch.snapshot(), **known}
+        return {
+            "optimiser": optimiser_snapshot(optimiser),
+            "changes": changes.bit_generator.state,
+            "watch": watch.snapshot(),
+        }
 
     if saved:
         restore_optimiser(optimiser, saved["optimiser"])
+        changes.bit_generator.state = saved["changes"]
         watch.restore(saved["watch"])
-        if greys:
-            greys.bit_generator.state = saved["greys"]
     for labelled, unlabelled in islice(states.batches(config, seed), watch.done, None):
         if diverse:
-            both = states.forward(trained, labelled, unlabelled, counted=(True, config.unlabelled_bn), greys=greys)
+            both = states.forward(trained, labelled, unlabelled, counted=(True, config.unlabelled_bn), changes=changes)
             rows = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
             pair_losses = _pair_losses(objective, [other for _, other in both], [other[rows] for other in frozen])
         else:
-            both = states.forward(trained, labelled, greys=greys)
+            both = states.forward(trained, labelled, changes=changes)
             pair_losses = torch.zeros(0, device=states.device)
             if config.unlabelled_bn and len(unlabelled):
-                states.count_in(trained, unlabelled, greys)
+                states.count_in(trained, unlabelled, changes)
         targets = states.targets(labelled)
         label_losses = torch.stack([functional.cross_entropy(own[0], targets, class_weights) for own in both])
         loss = label_losses.sum() + config.diversity_weight * pair_losses.sum()

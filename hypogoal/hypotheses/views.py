@@ -24,8 +24,11 @@ class FullView(nn.Module):
         super().__init__()
         self.shape = observation_shape
 
-    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
+    def see(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
+    ) -> NDArray[np.uint8]:
         """The observations."""
+        assert not margin, "all of it has nothing around it"
         return observations
 
 
@@ -50,18 +53,23 @@ class AgentView(nn.Module):
         self.localiser = localiser
         self.needs_positions = localiser.needs_positions
 
-    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
+    def see(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
+    ) -> NDArray[np.uint8]:
         """Windows uint8 (N, height, width, C).
 
         Args:
             observations: uint8 (N, H, W, C).
             positions: int64 (N, 3) of room, x, y, where the localiser reads them.
+            margin: so many pixels more on every side.
         """
-        seen = np.empty((len(observations), *self.shape), dtype=np.uint8)
+        height, width, channels = self.shape
+        size = height + 2 * margin, width + 2 * margin
+        seen = np.empty((len(observations), *size, channels), dtype=np.uint8)
         for start in range(0, len(observations), CHUNK):
             chunk = slice(start, start + CHUNK)
             centres = self.localiser.locate(observations[chunk], None if positions is None else positions[chunk])
-            seen[chunk] = windows(observations[chunk], centres, *self.shape[:2])
+            seen[chunk] = windows(observations[chunk], centres, *size)
         return seen
 
 

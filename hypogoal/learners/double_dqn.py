@@ -11,7 +11,13 @@ from torch import Tensor, nn
 
 
 def double_q_targets(
-    rewards: Tensor, terminal: Tensor, next_online: Tensor, next_target: Tensor, gamma: float | Tensor
+    rewards: Tensor,
+    terminal: Tensor,
+    next_online: Tensor,
+    next_target: Tensor,
+    gamma: float | Tensor,
+    *,
+    bounded: bool = False,
 ) -> Tensor:
     """Spec D2: r + gamma (1 - terminal) Q_target(s', argmax_a Q_online(s', a)).
 
@@ -21,6 +27,8 @@ def double_q_targets(
         next_online: float (..., A), the online network at s'.
         next_target: float (..., A), the target network at s'.
         gamma: discount of s', float or (...,): per step, or to the power n where s' is n steps on.
+        bounded: clip the targets to 0..1, between which the return of an option lies: 1, discounted, where it ends at
+            its sub-goal, else 0. Bootstrapped values that feed on themselves cannot grow beyond that.
 
     Returns:
         float (...,).
@@ -29,7 +37,8 @@ def double_q_targets(
     """
     best = next_online.argmax(-1, keepdim=True)
     following = next_target.gather(-1, best).squeeze(-1)
-    return rewards + gamma * following * (~terminal)
+    targets = rewards + gamma * following * (~terminal)
+    return targets.clamp(0.0, 1.0) if bounded else targets
 
 
 @torch.no_grad()

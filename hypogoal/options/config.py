@@ -26,7 +26,22 @@ class OptionConfig:
     option_timeout: int = setting(10, "an option ends after this many steps", unit="steps", source="paper", low=1)
     restart_options: bool = setting(False, "every option begins a new episode, at a start state", source="Spec D4")
     mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="Spec D6")
+    initiation: str = setting(
+        "anywhere",
+        "where options may start: anywhere, or where executions showed that they reach their sub-goal in time",
+        source="Spec D7; anywhere: paper",
+        choices=("anywhere", "learned"),
+    )
+    initiation_threshold: float = setting(
+        0.05, "an option is held back where its chance is below this (initiation=learned)", low=0.0, high=1.0
+    )
+    initiation_ignored: float = setting(
+        0.1, "share of the choices for which none is held back (initiation=learned)", low=0.0, high=1.0
+    )
     bootstrap_timeout: bool = setting(True, "an option's timeout is not a terminal state", source="Spec D2")
+    bounded_values: bool = setting(
+        True, "values are learned from targets clipped to 0..1, what an option can return", source="ours; paper: false"
+    )
     option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
     environments: int = setting(16, "environments stepped together", low=1, high=4096)
     replay: int = setting(100_000, "transitions kept", source="Table 4", low=100)

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Step
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 NONE = -1
-RUNNING = ("option", "age", "inside", "returns", "episode_reward", "episode_length", "counts")
+RUNNING = ("option", "began", "age", "inside", "returns", "episode_reward", "episode_length", "counts")
 
 
 @dataclass(frozen=True)
@@ -188,6 +189,7 @@ class OptionLoop:
         recorder: episodes and choices are told to it.
         config: timeouts, masks, whether options begin at start states.
         gamma: the meta-level's discount per environment step (E1).
+        initiation: holds options back where they do not reach their sub-goals (D7); None, it holds none back.
 
     Raises:
         UserError: options are to begin at start states, and the engine cannot begin an episode when asked.
@@ -202,7 +204,9 @@ class OptionLoop:
         recorder: Recorder,
         config: OptionConfig,
         gamma: float,
+        initiation: Initiation | None = None,
     ):
+        self.initiation = initiation
         self.engine, self.verdicts, self.learner, self.chooser = engine, verdicts, learner, chooser
         self.recorder, self.config, self.gamma = recorder, config, gamma
         if config.restart_options and not hasattr(engine, "restart"):
@@ -213,6 +217,7 @@ class OptionLoop:
             )
         count = engine.count
         self.option = np.full(count, NONE, dtype=np.int64)
+        self.began = np.zeros(count, dtype=np.int64)  # the states in which the running options were chosen
         self.age = np.zeros(count, dtype=np.int64)
         self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
@@ -249,6 +254,8 @@ class OptionLoop:
         if learn:
             numbers |= self.learner.learn()
             numbers |= self.chooser.learn()
+            if self.initiation:
+                numbers |= self.initiation.learn()
         return numbers
 
     def _reached(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -264,8 +271,10 @@ class OptionLoop:
         ids = self.engine.ids[free]
         verdicts = self.verdicts.of(ids)
         offered = offered_options(verdicts, self.config.mask_reached)
+        if self.initiation:
+            offered = self.initiation.narrow(ids, offered)
         chosen = self.chooser.choose(free, ids, offered)
-        self.option[free] = chosen
+        self.option[free], self.began[free] = chosen, ids
         if self.config.restart_options and len(self.on_the_way):
             self.counts[free] = ~self.on_the_way[ids]
         self.inside[free] = verdicts[np.arange(len(free)), chosen]
@@ -278,6 +287,10 @@ class OptionLoop:
         if not len(done):
             return
         next_ids = step.next_ids[done]
+        if self.initiation:
+            out_of_time = (self.age[done] >= self.config.option_timeout) & ~step.terminated[done]
+            known = done[reached[done] | out_of_time]  # of those that the episode's end cut short nobody knows
+            self.initiation.record(self.began[known], self.option[known], reached[known])
         self.recorder.finished(
             self.option[done],
             self.age[done],
@@ -333,5 +346,5 @@ class OptionLoop:
             setattr(self, name, values)
 
     def _parts(self) -> dict[str, Any]:
-        names = ("engine", "verdicts", "learner", "chooser", "recorder")
+        names = ("engine", "verdicts", "learner", "chooser", "recorder", *(("initiation",) if self.initiation else ()))
         return {name: getattr(self, name) for name in names}

@@ -213,6 +213,7 @@ class LightLearner:
                 next_online,
                 next_target,
                 self.config.option_gamma**ahead,
+                bounded=self.config.bounded_values,
             )
         actions = torch.from_numpy(batch["a"].astype(np.int64))[:, None, None].expand(-1, self.options, 1)
         error = values.gather(2, actions).squeeze(2) - goal

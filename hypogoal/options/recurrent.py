@@ -221,6 +221,7 @@ class RecurrentLearner:
             values[pick, after].detach(),
             next_target[pick, after],
             config.option_gamma,
+            bounded=config.bounded_values,
         )
         taken = values[pick, here, torch.from_numpy(data["a"][indices].astype(np.int64))]
         error = taken - goal

@@ -25,6 +25,7 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
+from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 
 
@@ -94,7 +95,10 @@ def train_meta(
             recorder.start_at(trained.config["steps"])
         policy = MetaPolicy(engine, verdicts.options, config, seed) if config.chooser == "ppo" else None
         chooser: Chooser = policy or RandomChooser(rng_for(seed, "random-choice"))
-        loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=config.gamma)
+        initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        loop = OptionLoop(
+            engine, verdicts, learner, chooser, recorder, config, gamma=config.gamma, initiation=initiation
+        )
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             play(loop, config.steps, log, progress, checkpoints_of(folder))

@@ -17,6 +17,7 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
 from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
+from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 
 
@@ -79,7 +80,8 @@ def train_options(
         recorder = Recorder(verdicts.options)
         rng = rng_for(seed, "random-choice")
         chooser = RandomChooser(rng) if config.chooser == "random" else EvenChooser(verdicts.options, rng)
-        loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0)
+        initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0, initiation=initiation)
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:
             play(loop, steps, log, progress, checkpoints_of(folder))

@@ -276,14 +276,30 @@ def test_all_of_a_state_is_mapped_alike() -> None:
     images = np.random.default_rng(0).integers(256, size=(6, 8, 8, 4), dtype=np.uint8)
     network = torch.nn.Sequential(torch.nn.Flatten())
     labels = np.arange(6) < 3
-    states = TrainingStates(images, labels, images, network, torch.device("cpu"), tables=False)
-    mapped = states.forward([network], np.arange(6), greys=np.random.default_rng(1))[0][0].numpy()
+    states = TrainingStates(images, labels, images, network, torch.device("cpu"), grey=True)
+    mapped = states.forward([network], np.arange(6), changes=np.random.default_rng(1))[0][0].numpy()
     plain = states.forward([network], np.arange(6))[0][0].numpy()
     for shades, shown in zip(plain, mapped, strict=True):
         order = np.argsort(shades, kind="stable")
         assert (np.diff(shown[order]) >= 0).all()
         assert len(np.unique(shown)) == len(np.unique(shades))
     assert np.abs(mapped - plain).max() > 0.1
+
+
+def test_windows_are_moved_at_random_within_their_margin() -> None:
+    """Beyond the paper: each state on its own, by 0 to 2 times the margin; unchanged states show the middle."""
+    images = np.arange(8 * 9, dtype=np.uint8).reshape(1, 8, 9, 1).repeat(40, axis=0)
+    network = torch.nn.Sequential(torch.nn.Flatten())
+    states = TrainingStates(images, np.arange(40) < 3, images, network, torch.device("cpu"), jitter=2)
+    plain = states.forward([network], np.arange(40))[0][0].mul(255).round().view(40, 4, 5).numpy()
+    moved = states.forward([network], np.arange(40), changes=np.random.default_rng(0))[0][0]
+    moved = moved.mul(255).round().view(40, 4, 5).numpy()
+    np.testing.assert_array_equal(plain, images[:, 2:6, 2:7, 0])
+    corners = moved[:, 0, 0].astype(int)
+    assert set(corners // 9) == set(range(5)) and set(corners % 9) == set(range(5))
+    for window, corner in zip(moved, corners, strict=True):
+        row, column = divmod(corner, 9)
+        np.testing.assert_array_equal(window, images[0, row : row + 4, column : column + 5, 0])
 
 
 def test_grey_maps_change_what_is_learned_from() -> None:

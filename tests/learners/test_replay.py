@@ -66,6 +66,14 @@ def test_double_q_targets_by_hand() -> None:
     torch.testing.assert_close(targets, torch.tensor([0.5 + 0.9 * 2.0, 1.0]))
 
 
+def test_bounded_targets_lie_between_0_and_1() -> None:
+    """Spec D2: an option returns 1 at most, discounted, and no less than 0: values fed on themselves cannot grow."""
+    values = torch.tensor([[4.0, 0.0], [-3.0, -5.0], [0.5, 0.2]])
+    rewards, terminal = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([False, False, False])
+    targets = double_q_targets(rewards, terminal, values, values, 0.9, bounded=True)
+    torch.testing.assert_close(targets, torch.tensor([1.0, 0.0, 0.45]))
+
+
 def test_follow_moves_or_copies_everything() -> None:
     """Spec D2: a full target copy, batch statistics included (the authors copy only the head)."""
     online = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))

@@ -1,0 +1,119 @@
+"""Initiation sets learned from executions: where an option probably reaches its sub-goal in time (Spec D7).
+
+Beyond the paper, in which every option may start wherever its sub-goal does not hold yet. Source of the idea: the
+initiation classifiers of skill chaining (Konidaris and Barto 2009); here it is one probability per option, learned for
+all together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
+from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.domains.base import Engine
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.memory import remembered
+from hypogoal.options.networks import LightQNetwork, apply_to_states
+
+KEPT = 8_192  # last executions; options change while they learn, so older ones are forgotten
+FEWEST = 100  # executions of an option before it is ever held back
+KNOWN = ("states", "option", "reached", "executions", "count")
+BATCH, EXECUTIONS_PER_UPDATE, LEARNING_RATE = 128, 32, 1e-3
+
+
+class Initiation:
+    """The probability that an option reaches its sub-goal before its time is up, and which options it lets start.
+
+    Args:
+        engine: gives observations of state ids.
+        options: O.
+        config: ``initiation_threshold`` and ``initiation_ignored``.
+        seed: of weights and draws.
+    """
+
+    def __init__(self, engine: Engine, options: int, config: OptionConfig, seed: int):
+        self.engine, self.options, self.config = engine, options, config
+        self.rng = rng_for(seed, "initiation")
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed_for(seed, "initiation-weights"))
+            self.network = LightQNetwork(engine.observation_shape, options, actions=1)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=LEARNING_RATE, fused=True)
+        self.states, self.option = np.zeros((2, KEPT), dtype=np.int64)
+        self.reached = np.zeros(KEPT, dtype=np.bool_)
+        self.executions = np.zeros(options, dtype=np.int64)
+        self.count = self._due = 0
+
+    def chances(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
+        """P(sub-goal reached before the timeout | state, option), float32 (n, O)."""
+        with torch.no_grad():
+            found: NDArray[np.float32] = apply_to_states(self.network, self.engine, ids)[:, :, 0].sigmoid().numpy()
+        return found
+
+    def narrow(self, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Of the options offered in states (n,), those that will probably get there; all where none would be left.
+
+        For a share of the states all are left, so that an option that has learned since is found out.
+
+        Args:
+            ids: int64 (n,).
+            offered: bool (n, O).
+        """
+        likely = (self.chances(ids) >= self.config.initiation_threshold) | (self.executions < FEWEST)
+        narrowed = offered & likely
+        ignored = self.rng.random(len(ids)) < self.config.initiation_ignored
+        narrowed[ignored | ~narrowed.any(1)] = offered[ignored | ~narrowed.any(1)]
+        return narrowed
+
+    def record(self, ids: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
+        """Executions that ended, (n,) each: where they began, of which options, whether these got there."""
+        places = (self.count + np.arange(len(ids))) % KEPT
+        self.states[places], self.option[places], self.reached[places] = ids, options, reached
+        np.add.at(self.executions, options, 1)
+        self.count += len(ids)
+        self._due += len(ids)
+
+    def learn(self) -> dict[str, float]:
+        """As many updates as are due; the last one's loss, nothing where none was."""
+        numbers: dict[str, float] = {}
+        while self._due >= EXECUTIONS_PER_UPDATE:
+            self._due -= EXECUTIONS_PER_UPDATE
+            drawn = self.rng.integers(min(self.count, KEPT), size=BATCH)
+            drawn = drawn[remembered(self.engine, self.states[drawn])]
+            if len(drawn):
+                numbers = self._update(drawn)
+        return numbers
+
+    def _update(self, drawn: NDArray[np.int64]) -> dict[str, float]:
+        logits = apply_to_states(self.network, self.engine, self.states[drawn])[:, :, 0]
+        own = logits.gather(1, torch.from_numpy(self.option[drawn])[:, None])[:, 0]
+        reached = torch.from_numpy(self.reached[drawn]).float()
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(own, reached)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimiser.step()
+        return {"initiation_loss": float(loss.detach())}
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "network": self.network.state_dict(),
+            "optimiser": optimiser_snapshot(self.optimiser),
+            "rng": self.rng.bit_generator.state,
+            "known": {name: getattr(self, name) for name in KNOWN},
+            "due": self._due,
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of one made with the same arguments."""
+        self.network.load_state_dict(snapshot["network"])
+        restore_optimiser(self.optimiser, snapshot["optimiser"])
+        self.rng.bit_generator.state = snapshot["rng"]
+        for name, value in snapshot["known"].items():
+            setattr(self, name, value)
+        self._due = snapshot["due"]

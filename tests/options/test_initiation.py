@@ -1,0 +1,84 @@
+"""Initiation sets learned from executions (Spec D7)."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from hypogoal.core.seeding import rng_for
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import OptionLoop, RandomChooser
+from hypogoal.options.initiation import FEWEST, Initiation
+from hypogoal.options.recording import Recorder
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from corridor import LENGTH, Corridor
+
+ALWAYS_LEFT = 0
+
+
+class Walker:
+    """A learner that always plays one action."""
+
+    def act(self, ids, options, age, *, explore=True):
+        return np.full(len(ids), ALWAYS_LEFT)
+
+    def observe(self, *arrays, **flags):
+        pass
+
+    def learn(self):
+        return {}
+
+
+def loop_with_initiation(**changes) -> OptionLoop:
+    engine = Corridor(4)
+    config = OptionConfig(
+        initiation="learned", **{"option_timeout": 2, "mask_reached": False, "initiation_ignored": 0.0, **changes}
+    )
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    initiation = Initiation(engine, 2, config, seed=0)
+    chooser = RandomChooser(rng_for(0, "random"))
+    return OptionLoop(engine, verdicts, Walker(), chooser, Recorder(2), config, gamma=0.9, initiation=initiation)
+
+
+def test_an_option_that_never_gets_there_is_held_back_and_one_that_does_is_not() -> None:
+    """Spec D7: who always walks left reaches the left end from cells 0 to 2 in two steps, the right end never."""
+    loop = loop_with_initiation()
+    for _ in range(1_500):
+        loop.step()
+    chances = loop.initiation.chances(np.arange(3))
+    assert (chances[:, 0] > 0.9).all() and (chances[:, 1] < 0.1).all()
+    offered = loop.initiation.narrow(np.arange(3), np.ones((3, 2), dtype=np.bool_))
+    np.testing.assert_array_equal(offered, [[True, False]] * 3)
+
+
+def test_where_none_would_be_left_and_for_a_share_of_the_choices_all_are_offered() -> None:
+    """Spec D7: nobody stands without options, and an option can show that it has learned since."""
+    loop = loop_with_initiation(initiation_threshold=1.0)
+    loop.initiation.executions[:] = FEWEST
+    offered = np.array([[True, False], [True, True]])
+    np.testing.assert_array_equal(loop.initiation.narrow(np.array([1, 2]), offered), offered)
+
+    loop = loop_with_initiation(initiation_ignored=0.25)
+    loop.initiation.executions[:] = FEWEST
+    loop.initiation.chances = lambda ids: np.tile(np.array([[1.0, 0.0]], np.float32), (len(ids), 1))
+    wide = loop.initiation.narrow(np.zeros(4_000, dtype=np.int64), np.ones((4_000, 2), dtype=np.bool_))
+    assert wide[:, 0].all() and 0.2 < wide[:, 1].mean() < 0.3
+
+
+def test_an_option_is_not_held_back_before_it_was_tried() -> None:
+    """Spec D7: fewer than FEWEST executions say nothing."""
+    loop = loop_with_initiation(initiation_threshold=1.0)
+    loop.initiation.executions[:] = (FEWEST, FEWEST - 1)
+    narrowed = loop.initiation.narrow(np.array([1]), np.ones((1, 2), dtype=np.bool_))
+    np.testing.assert_array_equal(narrowed, [[False, True]])
+
+
+def test_executions_that_the_end_of_the_episode_cut_short_say_nothing() -> None:
+    """Spec D7: of an episode's last option, not out of time and not at its sub-goal, nobody knows."""
+    loop = loop_with_initiation(option_timeout=LENGTH)
+    loop.engine.max_steps = 1
+    for _ in range(5):
+        loop.step()
+    assert loop.initiation.count == 0
