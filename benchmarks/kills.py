@@ -63,18 +63,18 @@ _ALL = (
         ("data",),
     ),
     Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=4", "workers=1", "members=2")), ("rooms",)),
-    Stage("options", ("train-options", "{ensemble}", *_set("steps=1500", "environments=8", *QUICK)), ("ensemble",)),
+    Stage("options", ("train-options", "{ensemble}", *_set("steps=1000", "environments=8", *QUICK)), ("ensemble",)),
     Stage(
         "meta",
         (
             *("train-meta", "{ensemble}", "--options", "{options}"),
-            *_set("steps=1500", "decisions=32", "environments=8", "initiation=learned", *QUICK),
+            *_set("steps=1000", "decisions=32", "environments=8", "initiation=learned", *QUICK),
         ),
         ("ensemble", "options"),
     ),
     Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
-    Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=5120", *QUICK[1:]))),
-    Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=2000", *QUICK[1:]))),
+    Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),
+    Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=1600", *QUICK[1:]))),
 )
 STAGES = {stage.name: stage for stage in _ALL}
 

@@ -1,5 +1,6 @@
 """Spec G1, G3: a state on disk is the state, the last good one stays, and signals wait until it is whole."""
 
+import itertools
 import os
 import resource
 import signal
@@ -108,29 +109,38 @@ def test_they_are_paced_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert saved == [110.0, 172.0, 234.0]
 
 
+def work(checkpoints: Checkpoints, number: int) -> None:
+    """Step after step, with a signal in the third."""
+    with checkpoints:
+        for steps in itertools.count(1):
+            if steps == 3:
+                os.kill(os.getpid(), number)
+            checkpoints.offer(lambda steps=steps: {"steps": steps})  # type: ignore[misc]
+
+
+def hear(passed: list[int], *numbers: int) -> None:
+    """Signals, one after the other, and which of them let go on."""
+    with Checkpoints(None):
+        for number in numbers:
+            os.kill(os.getpid(), number)
+            passed.append(number)
+
+
 def test_signals_wait_for_a_whole_state(tmp_path: Path) -> None:
     """Spec G1: Ctrl-C and SIGTERM save and stop; a second Ctrl-C does not wait."""
     for number in (signal.SIGINT, signal.SIGTERM):
         before = signal.getsignal(number)
         checkpoints = Checkpoints(tmp_path / f"{number}.safetensors")
-        steps = 0
-        with pytest.raises(KeyboardInterrupt) as caught, checkpoints:
-            while True:
-                steps += 1
-                if steps == 3:
-                    os.kill(os.getpid(), number)
-                checkpoints.offer(lambda steps=steps: {"steps": steps})  # type: ignore[misc]
+        with pytest.raises(KeyboardInterrupt) as caught:
+            work(checkpoints, number)
         assert caught.value.args == (number,) and checkpoints.load() == {"steps": 3}
         assert signal.getsignal(number) == before
-    with pytest.raises(KeyboardInterrupt), Checkpoints(None):
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGTERM)
-        steps = -1
-        os.kill(os.getpid(), signal.SIGINT)
-        steps = -2
-    assert steps == -1
-    with pytest.raises(KeyboardInterrupt), Checkpoints(None):
-        os.kill(os.getpid(), signal.SIGTERM)  # and nothing is offered any more
+    passed: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        hear(passed, signal.SIGINT, signal.SIGTERM, signal.SIGINT)
+    assert passed == [signal.SIGINT, signal.SIGTERM]
+    with pytest.raises(KeyboardInterrupt):
+        hear(passed, signal.SIGTERM)  # and nothing is offered any more
 
 
 def test_the_pace_is_set_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
