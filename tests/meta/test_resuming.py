@@ -9,6 +9,7 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.errors import NumericalError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.meta import playing
@@ -109,6 +110,31 @@ def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.Mo
     weights = unbroken.learner.state()  # type: ignore[attr-defined]
     fresh = loop_of(case).learner.state()  # type: ignore[attr-defined]
     assert any(not torch.equal(value, fresh[name]) for name, value in weights.items()), "nothing was learned"
+
+
+class Poisoned(Checkpoints):
+    """Saves after every step, and from the 40th on a weight is NaN."""
+
+    def __init__(self, path: Path):
+        super().__init__(path)
+        self.steps = 0
+
+    def offer(self, state: Callable[[], State]) -> None:
+        self.steps += 1
+        now = state()
+        if self.steps >= 40:
+            now["loop"]["learner"]["online"]["heads.bias"][0] = torch.nan  # the state is the network's own
+        self.save(now)
+
+
+def test_nan_stops_and_the_last_good_checkpoint_stays(tmp_path: Path) -> None:
+    """Spec G3."""
+    checkpoints = Poisoned(tmp_path / "checkpoint.safetensors")
+    with pytest.raises(NumericalError, match="nan"):
+        run("light, shared, gaussian", tmp_path, checkpoints)
+    saved = checkpoints.load()
+    assert saved is not None and saved["loop"]["recorder"]["steps"][0] == 39 * 3
+    assert all(torch.isfinite(value).all() for value in saved["loop"]["learner"]["online"].values())
 
 
 class Plain(Corridor):
