@@ -149,10 +149,9 @@ def broken(stage: Stage, folder: Path, kills: int, seconds: float, rng: random.R
     while tally.kills < kills:
         out = folder / f"broken-{stage.name}{stage.suffix}"
         log = folder / f"broken-{stage.name}.log"
-        pace = rng.choice(PACES)
         patience = rng.choice((0.3, 0.6, 1.0))
         while not out.exists():
-            process = begin([*stage.arguments(folder), "--out", str(out), "--resume", "-q"], log, pace)
+            process = begin([*stage.arguments(folder), "--out", str(out), "--resume", "-q"], log, rng.choice(PACES))
             # Less and less hurry, so that a stage that begins slowly gets on: of each time it needs about a third.
             patience *= 1.1
             moment = time.monotonic() + rng.uniform(0, patience * seconds) if tally.kills < kills else float("inf")

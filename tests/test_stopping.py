@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.kills import STAGES, needed
 from hypogoal.cli import main
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.drafts import draft_folder, unfinished
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,6 +75,28 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.Captu
         assert main([*arguments, *given]) == 2
         err = capsys.readouterr().err
         assert line in err and err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_workers_save_when_their_stage_is_stopped(tmp_path: Path) -> None:
+    """Spec G1: SIGTERM goes on to the processes that train a sub-goal each, and each of them saves."""
+    data, out = tmp_path / "data.h5", tmp_path / "ensemble"
+    small = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1", "-q"]
+    assert main(["collect", "doorkey", "--out", str(data), *small]) == 0
+    long = ["--set", "steps=1000000", "--set", "workers=2", "--set", "sub_goals=open-red-door,go-to-goal"]
+    command = [sys.executable, "-m", "hypogoal", "train-ensemble", str(data), "--out", str(out), *long]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        until = time.monotonic() + WAIT_SECONDS
+        logs = [draft_folder(out) / "checkpoint" / f"{name}.jsonl" for name in ("open-red-door", "go-to-goal")]
+        while not all(log.exists() and log.stat().st_size for log in logs):
+            assert process.poll() is None and time.monotonic() < until
+            time.sleep(0.05)
+        process.terminate()
+        _, words = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert words.count("hypogoal: stopped; the last checkpoint is kept") == 1 and "Traceback" not in words
+    saved = [Checkpoints(log.with_suffix(".safetensors")).load() for log in logs]
+    assert all(state and state["part"]["watch"]["done"] > 0 for state in saved)
 
 
 SLEEPERS = """

@@ -40,7 +40,7 @@ def collect(
     from hypogoal.domains.base import load_domain
     from hypogoal.stages.collect import collect as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "data"):
         return
     found = load_domain(domain)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_)
@@ -71,7 +71,7 @@ def train_ensemble(
     from hypogoal.stages.train_ensemble import TrainEnsembleConfig
     from hypogoal.stages.train_ensemble import train_ensemble as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "ensemble"):
         return
     given = {"diversity": diversity, "members": members}
     config = resolve_for(domain_of(data, "data"), TrainEnsembleConfig, "train-ensemble", preset, set_, given)
@@ -96,7 +96,7 @@ def train_options(
     from hypogoal.stages.train_options import TrainOptionsConfig
     from hypogoal.stages.train_options import train_options as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "options"):
         return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainOptionsConfig, "train-options", preset, set_, given)
@@ -124,7 +124,7 @@ def train_meta(
     from hypogoal.stages.train_meta import TrainMetaConfig
     from hypogoal.stages.train_meta import train_meta as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "meta"):
         return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainMetaConfig, "train-meta", preset, set_, given)
@@ -155,7 +155,7 @@ def train_baseline(
     from hypogoal.stages.train_baseline import BaselineConfig
     from hypogoal.stages.train_baseline import train_baseline as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "baseline"):
         return
     given = {"agent": agent, "layout_seed": layout_seed}
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given)
@@ -176,7 +176,7 @@ def evaluate(
     from hypogoal.stages.evaluate import summary_table
 
     out = out or run / "evaluation"
-    if is_complete(out, resume):
+    if is_complete(out, resume, "evaluation"):
         return
     metrics = stage(run, out, force=force, quiet=quiet)
     if not quiet:
@@ -194,7 +194,7 @@ def report(
     """Draw RUN/report/index.html: one file, readable offline."""
     from hypogoal.stages.report import report as stage
 
-    if is_complete(run / "report", resume):
+    if is_complete(run / "report", resume, "report"):
         return
     typer.echo(stage(run, force=force))
 
