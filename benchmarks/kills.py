@@ -26,8 +26,9 @@ from pathlib import Path
 from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
 from hypogoal.core.drafts import draft_folder
 
-PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step, so that most kills fall into one
+PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
 GOALS = "sub_goals=open-red-door,go-to-goal"
+WHILE_WRITING = 0.4  # share of the kills that wait until a checkpoint is being written
 QUICK = ("warm_up=100", "max_episode_steps=60", "random_episodes=5")
 DOORKEY = ("heldout_layouts=1", "unlabelled_seeds=1")
 ROOMS = ("groups=1", "states_per_room=60", "unlabelled_per_room=30", "heldout_per_room=6")
@@ -155,13 +156,16 @@ def broken(stage: Stage, folder: Path, kills: int, seconds: float, rng: random.R
             # Less and less hurry, so that a stage that begins slowly gets on: of each time it needs about a third.
             patience *= 1.1
             moment = time.monotonic() + rng.uniform(0, patience * seconds) if tally.kills < kills else float("inf")
-            while (code := ended(process)) is None and time.monotonic() < moment:
-                time.sleep(0.001)
+            awaited = rng.random() < WHILE_WRITING
+            while (code := ended(process)) is None and (
+                time.monotonic() < moment or (awaited and not half_written(out))
+            ):
+                time.sleep(0.0005)
             if code is None:
                 os.kill(process, signal.SIGKILL)
                 os.waitpid(process, 0)
                 tally.kills += 1
-                tally.writing += any(draft_folder(out).glob(f"{FOLDER}/*.new"))
+                tally.writing += half_written(out)
                 tally.losses += unreadable(out)
             elif code:
                 tally.losses += 1
@@ -174,6 +178,11 @@ def broken(stage: Stage, folder: Path, kills: int, seconds: float, rng: random.R
             tally.losses += draft_folder(out).exists() and not left_over(out)
             _remove(out)
     return tally
+
+
+def half_written(out: Path) -> bool:
+    """Whether a checkpoint is being written, or was when its process was killed."""
+    return any(draft_folder(out).glob(f"{FOLDER}/*.new"))
 
 
 def unreadable(out: Path) -> int:
