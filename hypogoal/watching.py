@@ -16,7 +16,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from hypogoal.core.artefacts import MANIFEST, PARTIAL
+from hypogoal.core.artefacts import MANIFEST
+from hypogoal.core.checkpoints import FOLDER
+from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError
 
 LOG = "metrics.jsonl"
@@ -84,7 +86,8 @@ def read_progress(run: Path) -> list[Progressing]:
     """
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'hypogoal run' or a stage writes into.")
-    found = [_read(log, run) for log in sorted(run.rglob(LOG))]
+    logs = [*run.rglob(LOG), *run.rglob(f".*{PARTIAL}/{FOLDER}/*.jsonl")]  # an ensemble's sub-goals have one each
+    found = [_read(log, run) for log in sorted(logs)]
     if not found:
         raise UserError(f"nothing to watch: no {LOG}", run, "Training stages write it as they go; is one running?")
     return sorted(found, key=lambda row: (row.seconds is None, row.name))
@@ -93,16 +96,15 @@ def read_progress(run: Path) -> list[Progressing]:
 def _read(log: Path, run: Path) -> Progressing:
     lines = _lines(log)
     last = lines[-1] if lines else {}
-    folder = log.parent
-    partial = re.fullmatch(rf"\.(.+){re.escape(PARTIAL)}-\d+", folder.name)
-    place = folder.with_name(partial[1]) if partial else folder
+    draft = next((folder for folder in log.parents if re.fullmatch(rf"\..+{re.escape(PARTIAL)}", folder.name)), None)
+    place = draft.with_name(draft.name[1 : -len(PARTIAL)]) if draft else log.parent
     name = place.relative_to(run).as_posix() if place != run else place.name
     if "sub_goal" in last:
         name = f"{name}: {last['sub_goal']}"
         lines = [line for line in lines if line.get("sub_goal") == last["sub_goal"]]
     watched = next((key for key in WATCHED if key in last), "")
     series = tuple(float(line[watched]) for line in lines if isinstance(line.get(watched), int | float))
-    whole = not partial and (folder / MANIFEST).is_file()
+    whole = draft is None and (place / MANIFEST).is_file()
     try:
         seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
     except OSError:  # renamed since: it has just become complete

@@ -1,7 +1,7 @@
 """A corridor with the engine's interface: small enough to learn in seconds, with states that look alike."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -40,6 +40,12 @@ class Corridor:
         self.ids = np.where(over, 2, following)
         self.elapsed = np.where(over, 0, self.elapsed)
         return Step(following, terminated.astype(np.float32), terminated, truncated & ~terminated)
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"ids": self.ids.copy(), "elapsed": self.elapsed.copy()}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        self.ids, self.elapsed = snapshot["ids"], snapshot["elapsed"]
 
     def images(self, ids: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         images = np.zeros((len(ids), *self.observation_shape), dtype=np.uint8) if out is None else out
@@ -118,6 +124,15 @@ class LongCorridor(Corridor):
         self.ids = ids.copy()
         self.restart(terminated | truncated)
         return Step(ids, np.zeros(self.count, np.float32), terminated, truncated)
+
+    def snapshot(self) -> dict[str, Any]:
+        return {**super().snapshot(), "rng": self.rng.bit_generator.state, "cell": list(self.cell)}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        super().restore(snapshot)
+        self.rng.bit_generator.state = snapshot["rng"]
+        self.cell = snapshot["cell"]
+        self.n_states = len(self.cell)
 
     def images(self, ids: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         if ((ids >= len(self.starts)) & (ids < self.oldest)).any():

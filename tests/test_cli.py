@@ -145,6 +145,8 @@ def test_resume_keeps_what_is_complete(made: Path, capsys: pytest.CaptureFixture
     assert main(["train-ensemble", str(made / "data.h5"), "--out", str(made / "ensemble"), "--resume"]) == 0
     assert (made / "ensemble" / "manifest.json").read_bytes() == before
     assert capsys.readouterr().out.strip().endswith("ensemble")
+    line = one_line(capsys, ["train-meta", str(made / "ensemble"), "--out", str(made / "options"), "--resume"])
+    assert "'options' artefact, but meta is needed" in line
 
 
 def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:

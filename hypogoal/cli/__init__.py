@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from hypogoal.cli import making, showing
-from hypogoal.cli.common import app
+from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import NumericalError, UserError
 
 __all__ = ["app", "main", "making", "showing"]
@@ -56,13 +56,16 @@ def main(arguments: list[str] | None = None) -> int:
     except NumericalError as error:
         if debug:
             raise
-        return _fail(f"training stopped: {error}", 1)
+        return _fail("; ".join([f"training stopped: {error}", *notes_of(error)]), 1)
     except OSError as error:
         if debug:
             raise
-        return _fail(*_refused(error))
-    except KeyboardInterrupt:
-        return _fail("stopped; nothing was half-written", 130)
+        message, code = _refused(error)
+        return _fail("; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message, code)
+    except Interrupted as stop:
+        cause = stop.__cause__ or stop
+        number = cause.args[0] if cause.args else signal.SIGINT
+        return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)
     except Exception as error:
         code = getattr(error, "exit_code", None)
         if code is not None:
@@ -91,6 +94,11 @@ def _refused(error: OSError) -> tuple[str, int]:
     if code in known:
         return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
     return f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1
+
+
+def notes_of(error: BaseException) -> list[str]:
+    """What those whom an error passed had to add, each once."""
+    return list(dict.fromkeys(getattr(error, "__notes__", [])))
 
 
 def _stop(signum: int, _frame: object) -> None:

@@ -7,10 +7,25 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
+from typer.core import TyperGroup
 
 T = TypeVar("T")
 
+
+class Interrupted(Exception):
+    """Ctrl-C or SIGTERM; its cause is the ``KeyboardInterrupt``, of which typer would make an exit code."""
+
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise Interrupted from error
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Transferable sub-goals by hypothesising which features generalise.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -25,7 +40,9 @@ Set = Annotated[
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything that is random.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what stands at --out.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Keep a complete --out as it is; otherwise make it.")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with what was begun; keep a complete --out as it is; else begin.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
@@ -70,18 +87,24 @@ def domain_of(artefact: Path, kind: str) -> str:
     return str(open_artefact(artefact, kind).config["domain"])
 
 
-def is_complete(out: Path, resume: bool) -> bool:
-    """Whether ``--resume`` was given and ``out`` is complete; then the stage has nothing to do."""
-    if not resume or not out.exists():
-        return False
-    if out.is_dir():
-        from hypogoal.core.artefacts import open_artefact
+def is_complete(out: Path, resume: bool, kind: str) -> bool:
+    """Whether ``--resume`` was given and ``out`` is complete; then the stage has nothing to do.
 
-        open_artefact(out)
-    else:
+    Raises:
+        UserError: it is something else than the stage makes.
+    """
+    from hypogoal.core.drafts import unfinished
+
+    if not resume or not out.exists() or unfinished(out):
+        return False
+    if kind == "data":
         from hypogoal.dataset import open_dataset
 
         open_dataset(out)
+    else:
+        from hypogoal.core.artefacts import open_artefact
+
+        open_artefact(out, kind)
     typer.echo(f"{out} is complete already", err=True)
     typer.echo(out)
     return True

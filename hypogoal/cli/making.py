@@ -40,11 +40,11 @@ def collect(
     from hypogoal.domains.base import load_domain
     from hypogoal.stages.collect import collect as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "data"):
         return
     found = load_domain(domain, given=True)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
-    counts = stage(found, config, out, seed=seed, force=force, quiet=quiet)
+    counts = stage(found, config, out, seed=seed, force=force, resume=resume, quiet=quiet)
     if not quiet:
         for split in ("labelled", "heldout"):
             for sub_goal, row in counts[split].items():
@@ -71,11 +71,11 @@ def train_ensemble(
     from hypogoal.stages.train_ensemble import TrainEnsembleConfig
     from hypogoal.stages.train_ensemble import train_ensemble as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "ensemble"):
         return
     given = {"diversity": diversity, "members": members}
     config = resolve_for(domain_of(data, "data"), TrainEnsembleConfig, "train-ensemble", preset, set_, given)
-    stage(data, config, out, seed=seed, force=force, quiet=quiet, device=device)
+    stage(data, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)
 
 
@@ -96,11 +96,13 @@ def train_options(
     from hypogoal.stages.train_options import TrainOptionsConfig
     from hypogoal.stages.train_options import train_options as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "options"):
         return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainOptionsConfig, "train-options", preset, set_, given)
-    print_outcome(stage(ensemble, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    print_outcome(
+        stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
+    )
     typer.echo(out)
 
 
@@ -122,12 +124,14 @@ def train_meta(
     from hypogoal.stages.train_meta import TrainMetaConfig
     from hypogoal.stages.train_meta import train_meta as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "meta"):
         return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainMetaConfig, "train-meta", preset, set_, given)
     print_outcome(
-        stage(ensemble, config, out, options=options, seed=seed, force=force, quiet=quiet, device=device),
+        stage(
+            ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
+        ),
         quiet,
     )
     typer.echo(out)
@@ -151,11 +155,11 @@ def train_baseline(
     from hypogoal.stages.train_baseline import BaselineConfig
     from hypogoal.stages.train_baseline import train_baseline as stage
 
-    if is_complete(out, resume):
+    if is_complete(out, resume, "baseline"):
         return
     given = {"agent": agent, "layout_seed": layout_seed}
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given, own=True)
-    print_outcome(stage(domain, config, out, seed=seed, force=force, quiet=quiet, device=device), quiet)
+    print_outcome(stage(domain, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet)
     typer.echo(out)
 
 
@@ -172,7 +176,7 @@ def evaluate(
     from hypogoal.stages.evaluate import summary_table
 
     out = out or run / "evaluation"
-    if is_complete(out, resume):
+    if is_complete(out, resume, "evaluation"):
         return
     metrics = stage(run, out, force=force, quiet=quiet)
     if not quiet:
@@ -191,6 +195,7 @@ def report(
         int, typer.Option(min=0, help="Also so many episodes of the policy over options, as RUN/report/videos/*.gif.")
     ] = 0,
     force: Force = False,
+    resume: Resume = False,
     quiet: Quiet = False,
 ) -> None:
     """Draw RUN/report/index.html: one file, readable offline."""
@@ -198,6 +203,8 @@ def report(
     from hypogoal.stages.report import report as stage
 
     if figures is None:
+        if is_complete(run / "report", resume, "report"):
+            return
         typer.echo(stage(run, videos=videos, force=force))
         return
     written, missing = draw_figures(run, figures, format_, force=force)
@@ -228,7 +235,7 @@ def run(
     preset: Preset = None,
     set_: Set = None,
     force: Force = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, make the rest.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
     quiet: Quiet = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")] = False,
 ) -> None:

@@ -11,8 +11,6 @@ import hashlib
 import json
 import os
 import platform
-import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -20,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import as_dict
+from hypogoal.core.drafts import check_free, draft, put_in_place, unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, read_manifest
@@ -37,7 +36,6 @@ PACKAGES = (
     "safetensors",
     "stable-baselines3",
 )
-PARTIAL = ".partial"
 
 
 @dataclass(frozen=True)
@@ -116,15 +114,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-def claim(out: Path, *, force: bool = False) -> Path:
+def claim(out: Path, *, force: bool = False, resume: bool = False) -> Path:
     """Check, before any work is done, that ``out`` may be written; nothing is made yet.
 
     Raises:
-        UserError: it exists and ``force`` is false, or it exists and is not ours to replace.
+        UserError: it exists and ``force`` is false, or it exists and is not ours to replace, or another process writes
+            it, or something unfinished is there and neither ``force`` nor ``resume`` says what to do with it.
     """
     if out.exists():
         ours = (out / MANIFEST).is_file() or (out.is_dir() and not any(out.iterdir()))
-        if not force:
+        if not force and not (resume and unfinished(out)):  # what is unfinished was begun with --force
             raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
         if not ours and out.is_dir():
             raise UserError("--force replaces only artefacts, and this folder has no manifest", out, "Move it away.")
@@ -133,14 +132,22 @@ def claim(out: Path, *, force: bool = False) -> Path:
         raise UserError("the output's folder cannot be made, a file is in the way", parent, "Choose another --out.")
     if not os.access(parent, os.W_OK):
         raise UserError("no permission to write", parent, "Choose another --out.")
+    check_free(out, force=force, resume=resume)
     return out
 
 
 @contextlib.contextmanager
 def create_artefact(
-    out: Path, *, kind: str, config: Any, seed: int, inputs: Sequence[Path] = (), force: bool = False
+    out: Path,
+    *,
+    kind: str,
+    config: Any,
+    seed: int,
+    inputs: Sequence[Path] = (),
+    force: bool = False,
+    resume: bool = False,
 ) -> Iterator[Path]:
-    """A fresh folder to fill; at the end its manifest is written and it is renamed to ``out``.
+    """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
 
     Args:
         out: the artefact's final folder.
@@ -148,46 +155,35 @@ def create_artefact(
         config: the resolved configuration, a dataclass or a dict.
         seed: the seed that makes it.
         inputs: artefact folders or data files that were read.
-        force: replace an existing artefact.
+        force: replace an existing artefact, begin anew what is unfinished.
+        resume: go on with what is unfinished, where there is something.
 
     Yields:
-        The folder to write into. When the block raises, the folder is removed and ``out`` is as it was.
+        The folder to write into; ``checkpoints_of`` knows where the checkpoints beside it are. When the block raises,
+        ``out`` is as it was, and the folder is removed unless it has a checkpoint.
+
+    Raises:
+        UserError: as of ``claim``, or what is unfinished was begun with another configuration, seed or inputs.
     """
-    claim(out, force=force)
-    partial = out.with_name(f".{out.name}{PARTIAL}-{os.getpid()}")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        manifest = {
-            "kind": kind,
-            "format": FORMAT_VERSION,
-            "config": config if isinstance(config, dict) else as_dict(config),
-            "seed": seed,
-            "inputs": [_input_entry(Path(path), out) for path in inputs],
-            "files": {
-                str(file.relative_to(partial)): sha256_of(file) for file in sorted(partial.rglob("*")) if file.is_file()
-            },
-            "versions": versions(),
-            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+    claim(out, force=force, resume=resume)
+    about = {
+        "kind": kind,
+        "format": FORMAT_VERSION,
+        "config": config if isinstance(config, dict) else as_dict(config),
+        "seed": seed,
+    }
+    entries = [_input_entry(Path(path), out) for path in inputs]
+    identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
+    with draft(out, identity, force=force, resume=resume) as work:
+        yield work.files
+        files = {
+            str(file.relative_to(work.files)): sha256_of(file)
+            for file in sorted(work.files.rglob("*"))
+            if file.is_file()
         }
-        (partial / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        _replace(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _replace(partial: Path, out: Path) -> None:
-    """Rename ``partial`` to ``out``; an old artefact there is moved aside first and removed last."""
-    old = out.with_name(f".{out.name}.old-{os.getpid()}")
-    if out.exists():
-        out.rename(old)
-    partial.rename(out)
-    if old.is_dir():
-        shutil.rmtree(old)
-    elif old.exists():
-        old.unlink()
+        manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
+        (work.files / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        put_in_place(work.files, out)
 
 
 def _input_entry(path: Path, out: Path) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -17,7 +18,7 @@ class Progress:
 
     def __init__(self, title: str, total: int, quiet: bool = False):
         self.title, self.total, self.quiet = title, total, quiet
-        self.done = 0
+        self.done = self._before = 0
         self._start = self._last = time.monotonic()
         self._bar: Any = None
         self._task: Any = None
@@ -54,6 +55,11 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, total=total)
 
+    def resume(self, done: int) -> None:
+        """``done`` units were done before this."""
+        self._before = done
+        self.update(done)
+
     def advance(self, n: int = 1, **numbers: float) -> None:
         """``n`` more units are done; ``numbers`` are shown beside the bar."""
         self.update(self.done + n, **numbers)
@@ -72,7 +78,7 @@ class Progress:
     def _line(self, text: str) -> None:
         self._last = time.monotonic()
         seconds = max(self._last - self._start, 1e-9)
-        rate = self.done / seconds
+        rate = (self.done - self._before) / seconds
         left = max(self.total - self.done, 0) / rate if rate > 0 else 0.0
         tail = f", {text}" if text else ""
         print(
@@ -92,6 +98,15 @@ class MetricsLog:
         """Append one line."""
         self._file.write(json.dumps(numbers) + "\n")
         self._file.flush()
+
+    def snapshot(self) -> int:
+        """How long the file is, in bytes, all of them on the disk."""
+        os.fsync(self._file.fileno())
+        return os.fstat(self._file.fileno()).st_size
+
+    def restore(self, snapshot: int) -> None:
+        """Forget what was written after the ``snapshot``; 0, all of it."""
+        self._file.truncate(snapshot)
 
     def close(self) -> None:
         """Close the file; further writes fail."""

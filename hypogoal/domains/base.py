@@ -39,7 +39,11 @@ class Step(NamedTuple):
 
 
 class Engine(Protocol):
-    """Many environments of one layout, stepped together; every distinct state has an integer id."""
+    """Many environments of one layout, stepped together; every distinct state has an integer id.
+
+    It may also have ``snapshot`` (all that it is, nested dicts of arrays and JSON values) and ``restore``, which on an
+    engine made with the same arguments continues from one; without them what is played on it cannot be resumed.
+    """
 
     n_actions: int
     count: int
@@ -73,8 +77,9 @@ class Domain(Protocol):
     ``distance`` (positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
     sub-goal holds), ``picture`` (room -> uint8 (height, width, 3)) and ``pixel`` (positions -> column and row in that
     picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``),
-    ``collected_bytes`` (config -> bytes of observations that ``collect`` will make, at the most) and ``defaults`` (see
-    ``defaults_of``).
+    ``collected_bytes`` (config -> bytes of observations that ``collect`` will make, at the most), ``defaults`` (see
+    ``defaults_of``) and ``resumes``: where that is true, ``collect`` also takes ``kept``, a function from a name to the
+    ``Checkpoints`` in which the part of that name is kept until all are there.
     """
 
     name: str

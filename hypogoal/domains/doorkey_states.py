@@ -208,18 +208,21 @@ class DoorKeyStates:
         """All ids given so far, as arrays: ``restore`` on fresh states of the layout gives the same ids."""
         return {
             "configurations": np.array(self._configurations, np.uint8),
-            "sites": self._site[: self.n_states].copy(),
+            "sites": self._met().copy(),
         }
 
+    def _met(self) -> NDArray[np.int64]:
+        return self._site[: self.n_states]
+
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of the same layout.
+        """Continue from a ``snapshot`` of the same layout, of states that were met in the order of these.
 
         Raises:
-            ValueError: states were met already, or the snapshot is of another layout.
+            ValueError: states were met that the snapshot does not begin with, or it is of another layout.
         """
-        first = [tuple(configuration) for configuration in snapshot["configurations"][:1].tolist()]
-        if self.n_states != 1 or first != self._configurations or snapshot["sites"][0] != self._site[0]:
-            raise ValueError("a snapshot is restored onto the fresh states of its own layout")
+        begun = [tuple(known) for known in snapshot["configurations"][: len(self._configurations)].tolist()]
+        if begun != self._configurations or snapshot["sites"][: self.n_states].tolist() != self._met().tolist():
+            raise ValueError("a snapshot is restored onto states of its own layout, met in the same order")
         for door, *keys in snapshot["configurations"].tolist():
             self._index_of((door, keys[0], keys[1], keys[2]))
         for site in snapshot["sites"].tolist():

@@ -8,11 +8,8 @@ and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``mon
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
-import signal
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -20,8 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
+from hypogoal.core.workers import in_processes
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
 from hypogoal.domains.montezuma_engine import MontezumaEngine
@@ -106,7 +105,9 @@ class _Task:
         )
 
 
-def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
+def collect(
+    config: MontezumaConfig, seed: int, progress: Any, kept: Callable[[str], Checkpoints] | None = None
+) -> Collected:
     """Spec B5: labelled, unlabelled and held-out states, each with its origin.
 
     Labelled are the rooms of the first N ladder groups; held out are states of all 24 rooms, the same ones for every
@@ -117,6 +118,7 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         config: see ``MontezumaConfig``.
         seed: of the rollouts; each room of each set has a stream of its own.
         progress: told how many states there will be, and of each room that is done.
+        kept: by name, where each room's states are kept until all are there; what is there is not gathered again.
 
     Returns:
         Labels of all three sets (those of the unlabelled are for tests only). Origins: see
@@ -143,8 +145,20 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         whole[task.name].put(task.begin, states)
         progress.advance(task.wanted)
 
+    def done(number: int, states: RoomStates) -> None:
+        task, place = left[number]
+        place.save(vars(states))
+        put(task, states)
+
     progress.expect(sum(task.wanted for task in tasks))
-    _play(tasks, config.workers or len(os.sched_getaffinity(0)), put)
+    left: list[tuple[_Task, Checkpoints]] = []
+    for task in tasks:
+        place = kept(f"{task.name}-{task.room}") if kept else Checkpoints(None)
+        if states := place.load():
+            put(task, RoomStates(**states))
+        else:
+            left.append((task, place))
+    in_processes([task.gather for task, _ in left], config.workers or len(os.sched_getaffinity(0)), done)
     heldout = _states_of(whole["heldout"])
     seen = np.full(len(heldout.labels), SEEN_NOWHERE)
     seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
@@ -176,30 +190,6 @@ def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
     return (left[0], UNLABELLED_OTHER_ROOMS[0]) if left else UNLABELLED_OTHER_ROOMS
 
 
-def _play(tasks: Sequence[_Task], workers: int, put: Callable[[_Task, RoomStates], None]) -> None:
-    """Gather every task's states, ``workers`` at once, and ``put`` each as soon as it is there."""
-    if workers == 1:
-        for task in tasks:
-            put(task, task.gather())
-        return
-    before = set(multiprocessing.active_children())
-    # Started anew rather than forked: a fork takes along whatever threads and locks the caller has. Ctrl-C is for the
-    # caller alone.
-    pool = ProcessPoolExecutor(
-        min(workers, len(tasks)), multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
-    )
-    try:
-        futures = {pool.submit(task.gather): task for task in tasks}
-        for future in as_completed(list(futures)):
-            put(futures.pop(future), future.result())
-    except BaseException:  # what was begun would otherwise be waited for
-        for process in set(multiprocessing.active_children()) - before:
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def _states_of(states: RoomStates) -> States:
     return States(states.observations, labels_of(states.ram)[:, None], origins_of(states))
 
@@ -210,6 +200,7 @@ class MontezumaDomain:
     Attributes:
         starts: the ladders at whose tops episodes can begin.
         kinds: what the values of the origin ``kind`` mean.
+        resumes: collecting goes on where it was.
         defaults: per stage, this domain's own: Table 1; for options, what lets them learn on a laptop.
     """
 
@@ -220,6 +211,7 @@ class MontezumaDomain:
     env_id = ENV_ID
     starts: tuple[str, ...] = tuple(ladder.name for ladder in LADDERS)
     kinds = KINDS
+    resumes = True
     defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         {
             "train-ensemble": {
@@ -256,9 +248,11 @@ class MontezumaDomain:
         each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
         return ROOMS * each * math.prod(self.observation_shape)
 
-    def collect(self, config: MontezumaConfig, seed: int, progress: Any) -> Collected:
+    def collect(
+        self, config: MontezumaConfig, seed: int, progress: Any, kept: Callable[[str], Checkpoints] | None = None
+    ) -> Collected:
         """See ``collect``."""
-        return collect(config, seed, progress)
+        return collect(config, seed, progress, kept)
 
     def make_engine(
         self,

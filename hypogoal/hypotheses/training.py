@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, islice
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hypogoal.core.checkpoints import Checkpoints, State, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.diversity import load_objective
@@ -51,6 +53,7 @@ def fit(
     origins: Origins | None = None,
     unlabelled_origins: Origins | None = None,
     device: torch.device | str = "cpu",
+    checkpoints: Checkpoints | None = None,
 ) -> Ensemble:
     """Eq. (1): the trained members of one sub-goal. On one CPU the same arguments give the same bytes.
 
@@ -68,6 +71,7 @@ def fit(
         unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram,
             ``action``, ``previous_action`` for localiser=learned.
         device: where to train; the ensemble stays there.
+        checkpoints: spec G1; ``on_step`` is part of them where it has ``snapshot`` and ``restore``.
 
     Returns:
         The ensemble, in evaluation mode.
@@ -82,10 +86,18 @@ def fit(
             raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
         if config.threshold == QUANTILE:
             raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
-    view = _view(observations, unlabelled, config, seed_for(seed, "localiser"), origins, unlabelled_origins)
+    checkpoints = checkpoints or Checkpoints(None)
+    saved = checkpoints.load() or {}
+    view = _view(
+        observations, unlabelled, config, seed_for(seed, "localiser"), origins, unlabelled_origins, fitted=not saved
+    )
     generator = torch_generator(seed, "weights")
     ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)
     ensemble.to(device)
+    if saved:
+        ensemble.load_state_dict(saved["ensemble"])
+        if "told" in saved:
+            on_step.restore(saved["told"])  # type: ignore[union-attr]
     networks = ensemble.networks()
     states = TrainingStates(
         view.see(observations, positions_of(origins), margin=config.jitter),
@@ -98,12 +110,30 @@ def fit(
         jitter=config.jitter,
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
-    for done, members in enumerate(rounds):
-        _fit_members(networks, members, states, config, seed_for(seed, "batches", done), done * config.steps, on_step)
+
+    def state(number: int, part: State) -> State:
+        told = {"told": on_step.snapshot()} if on_step and hasattr(on_step, "snapshot") else {}
+        return {"round": number, "part": part, "ensemble": ensemble.state_dict(), **told}
+
+    first = saved.get("round", 0)
+    with checkpoints:
+        for number, members in enumerate(rounds[first:], start=first):
+            _fit_members(
+                networks,
+                members,
+                states,
+                config,
+                seed_for(seed, "batches", number),
+                number * config.steps,
+                on_step,
+                saved["part"] if number == first and saved else {},
+                lambda part, number=number: checkpoints.offer(lambda: state(number, part())),  # type: ignore[misc]
+            )
     ensemble.eval()
     if config.threshold == QUANTILE:
         probabilities = ensemble.predict(unlabelled, positions_of(unlabelled_origins))
         ensemble.set_thresholds(quantile_thresholds(probabilities))
+    checkpoints.save(state(len(rounds), {}))
     return ensemble
 
 
@@ -124,8 +154,10 @@ def _view(
     seed: int,
     origins: Origins | None,
     unlabelled_origins: Origins | None,
+    *,
+    fitted: bool,
 ) -> FullView | AgentView:
-    """What the members are to see; a localiser that learns is trained here."""
+    """What the members are to see; a localiser that learns is trained here, or where not ``fitted`` to be loaded."""
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
@@ -136,6 +168,8 @@ def _view(
         needed(unlabelled_origins, POSITION if config.localiser == "ram" else ACTIONS, f"localiser={config.localiser}")
     if config.localiser == "ram":
         localiser: Localiser = RamLocaliser(observations.shape[1:])
+    elif not fitted:
+        localiser = LearnedLocaliser(observations.shape[1:])
     else:
         localiser = _learned(observations, unlabelled, seed, origins or {}, unlabelled_origins or {})
     return AgentView(observations.shape[1:], config.crop_height, config.crop_width, localiser)
@@ -182,8 +216,13 @@ def _fit_members(
     seed: int,
     steps_before: int,
     on_step: OnStep | None,
+    saved: State,
+    offer: Callable[[Callable[[], State]], None],
 ) -> None:
-    """Train ``members`` against each other and against those before them, which are frozen."""
+    """Train ``members`` against each other and against those before them, which are frozen.
+
+    After each step the state of this training is offered; where one is ``saved``, it goes on from there.
+    """
     trained = [networks[member].train() for member in members]
     diverse = _diverse(config)
     frozen = states.unlabelled_logits(networks[: members[0]]) if diverse else []
@@ -201,7 +240,19 @@ def _fit_members(
     )
     watch = _Watch(members, len(frozen) if diverse else 0, config, steps_before, on_step)
     changes = rng_for(seed, "greys")
-    for labelled, unlabelled in states.batches(config, seed):
+
+    def state() -> State:
+        return {
+            "optimiser": optimiser_snapshot(optimiser),
+            "changes": changes.bit_generator.state,
+            "watch": watch.snapshot(),
+        }
+
+    if saved:
+        restore_optimiser(optimiser, saved["optimiser"])
+        changes.bit_generator.state = saved["changes"]
+        watch.restore(saved["watch"])
+    for labelled, unlabelled in islice(states.batches(config, seed), watch.done, None):
         if diverse:
             both = states.forward(trained, labelled, unlabelled, counted=(True, config.unlabelled_bn), changes=changes)
             rows = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
@@ -218,6 +269,7 @@ def _fit_members(
         loss.backward()
         optimiser.step()
         watch.step(loss.detach(), label_losses.detach(), pair_losses.detach())
+        offer(state)
     watch.weights(trained)
 
 
@@ -255,20 +307,20 @@ class _Watch:
         self._members, self._config = members, config
         self._before, self._on_step = steps_before, on_step
         self._rows: list[Tensor] = []
-        self._done = 0
+        self.done = 0
 
     def step(self, loss: Tensor, label_losses: Tensor, pair_losses: Tensor) -> None:
         """One more step is done, with these losses."""
         self._rows.append(torch.cat([label_losses, pair_losses]))
-        self._done += 1
-        if self._done % REPORT_EVERY and self._done != self._config.steps:
+        self.done += 1
+        if self.done % REPORT_EVERY and self.done != self._config.steps:
             return
         losses = torch.stack(self._rows).cpu()
         self._rows.clear()
         faults = (~losses.isfinite()).nonzero().tolist()
         if faults:
             row, column = faults[0]
-            step = self._before + self._done - len(losses) + row + 1
+            step = self._before + self.done - len(losses) + row + 1
             raise NumericalError(f"{self._names[column]} is {losses[row, column].item()} at step {step}")
         if self._on_step is not None:
             numbers = {
@@ -276,12 +328,19 @@ class _Watch:
                 "labelled": float(label_losses.mean()),
                 "diversity": float(pair_losses.sum()),
             }
-            self._on_step(self._before + self._done, numbers)
+            self._on_step(self._before + self.done, numbers)
+
+    def snapshot(self) -> State:
+        """The steps done, and the losses that were not looked at yet; as arrays, which may hold NaN."""
+        return {"done": self.done, "rows": [row.cpu().numpy() for row in self._rows]}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of the same training."""
+        self.done = snapshot["done"]
+        self._rows = [torch.from_numpy(row) for row in snapshot["rows"]]
 
     def weights(self, networks: Sequence[nn.Sequential]) -> None:
         """Check that the last step left finite weights."""
         for member, network in zip(self._members, networks, strict=True):
             if not all(bool(value.isfinite().all()) for value in network.state_dict().values()):
-                raise NumericalError(
-                    f"a weight of member {member} is NaN or Inf after step {self._before + self._done}"
-                )
+                raise NumericalError(f"a weight of member {member} is NaN or Inf after step {self._before + self.done}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,3 +54,11 @@ class StepsAhead:
         sequence, from_s, by_a, over = np.array(rows, dtype=np.int64).reshape(-1, 4).T
         last = {name: values[sequence] for name, values in columns.items()}
         return {"s": from_s, "a": by_a, "next": following[sequence], "steps": over, **last}
+
+    def snapshot(self) -> list[list[tuple[int, int]]]:
+        """The steps whose transitions are not complete, by sequence."""
+        return [list(steps) for steps in self._open]
+
+    def restore(self, snapshot: Sequence[Sequence[Sequence[int]]]) -> None:
+        """Continue from a ``snapshot`` of as many sequences."""
+        self._open = [[(state, action) for state, action in steps] for steps in snapshot]

@@ -98,3 +98,21 @@ class PrioritisedReplay:
         priorities = np.asarray(priorities, dtype=np.float64) + 1e-3
         self._largest = max(self._largest, float(priorities.max()))
         self.tree.set(indices, priorities**self.alpha)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "data": {name: values[: self.size].copy() for name, values in self.data.items()},
+            "priorities": self.tree.nodes[self.tree.leaves : self.tree.leaves + self.size].copy(),
+            "largest": self._largest,
+            "next": self._next,
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue, on a fresh replay, from a ``snapshot`` of one of the same capacity and fields."""
+        for name, values in snapshot["data"].items():
+            self.data[name][: len(values)] = values
+        self.size = len(snapshot["priorities"])
+        if self.size:
+            self.tree.set(np.arange(self.size), snapshot["priorities"])
+        self._largest, self._next = snapshot["largest"], snapshot["next"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
@@ -99,25 +100,48 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
 
-def play(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress) -> None:
-    """Step ``loop`` until ``steps`` more environment steps were taken, logging as it goes (``metrics.jsonl``)."""
+def play(
+    loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, checkpoints: Checkpoints | None = None
+) -> None:
+    """Step ``loop`` until ``steps`` more environment steps were taken, logging as it goes (``metrics.jsonl``).
+
+    Args:
+        loop: as it was when ``steps`` began; where there is a checkpoint, it goes on from there.
+        steps: environment steps.
+        log, progress: are told of every ``LOG_INTERVAL`` steps.
+        checkpoints: spec G1; of no use where the engine has no ``snapshot``.
+    """
     recorder = loop.recorder
     end = recorder.steps + steps
     logged = begin = recorder.steps
     numbers: dict[str, float] = {}
-    while recorder.steps < end:
-        numbers |= loop.step()
-        if recorder.steps - logged >= LOG_INTERVAL or recorder.steps >= end:
-            logged = recorder.steps
-            shown = recorder.recent(restarted=loop.config.restart_options)
-            log.write(
-                step=recorder.steps,
-                episodes=len(recorder.episodes),
-                states=loop.engine.n_states,
-                **shown,
-                **numbers,
-            )
-            progress.update(min(recorder.steps - begin, steps), **shown)
+    if checkpoints is None or not hasattr(loop.engine, "snapshot"):
+        checkpoints = Checkpoints(None)
+
+    def state() -> dict[str, Any]:
+        return {"loop": loop.snapshot(), "log": log.snapshot(), "logged": logged, "numbers": numbers}
+
+    saved = checkpoints.load()
+    log.restore(saved["log"] if saved else 0)
+    if saved:
+        loop.restore(saved["loop"])
+        logged, numbers = saved["logged"], saved["numbers"]
+        progress.resume(recorder.steps - begin)
+    with checkpoints:
+        while recorder.steps < end:
+            numbers |= loop.step()
+            if recorder.steps - logged >= LOG_INTERVAL or recorder.steps >= end:
+                logged = recorder.steps
+                shown = recorder.recent(restarted=loop.config.restart_options)
+                log.write(
+                    step=recorder.steps,
+                    episodes=len(recorder.episodes),
+                    states=loop.engine.n_states,
+                    **shown,
+                    **numbers,
+                )
+                progress.update(min(recorder.steps - begin, steps), **shown)
+            checkpoints.offer(state)
 
 
 def layout_facts(engine: Any, config: PlayConfig, seed: int) -> dict[str, Any]:

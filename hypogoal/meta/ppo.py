@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.domains.base import Engine
@@ -173,6 +176,47 @@ class MetaPolicy:
             module.load_state_dict(
                 {name[len(part) + 1 :]: value for name, value in state.items() if name.startswith(f"{part}.")}
             )
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "network": self.network.state_dict(),
+            "head": self.head.state_dict(),
+            "optimiser": optimiser_snapshot(self.optimiser),
+            "generator": self.generator.get_state(),
+            "rng": self.rng.bit_generator.state,
+            "environments": list(self._open),
+            "open": _columns(list(self._open.values())),
+            "lengths": [len(sequence) for sequence in self._finished],
+            "finished": _columns([decision for sequence in self._finished for decision in sequence]),
+            "counts": [self._count, self.updates],
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of a policy made with the same arguments."""
+        self.network.load_state_dict(snapshot["network"])
+        self.head.load_state_dict(snapshot["head"])
+        restore_optimiser(self.optimiser, snapshot["optimiser"])
+        self.generator.set_state(snapshot["generator"])
+        self.rng.bit_generator.state = snapshot["rng"]
+        self._open = dict(zip(snapshot["environments"], _decisions(snapshot["open"]), strict=True))
+        finished = iter(_decisions(snapshot["finished"]))
+        self._finished = [[next(finished) for _ in range(length)] for length in snapshot["lengths"]]
+        self._count, self.updates = snapshot["counts"]
+
+
+def _columns(decisions: Sequence[_Decision]) -> dict[str, NDArray[Any]]:
+    """Decisions as arrays (n, ...), one for each of their fields; none where there are none."""
+    if not decisions:
+        return {}
+    names = [field.name for field in fields(_Decision)]
+    rows = [[getattr(decision, name) for name in names] for decision in decisions]
+    return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+
+
+def _decisions(columns: Mapping[str, NDArray[Any]]) -> list[_Decision]:
+    values = [column if column.ndim > 1 else column.tolist() for column in columns.values()]
+    return [_Decision(*row) for row in zip(*values, strict=True)]
 
 
 def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:

@@ -97,6 +97,14 @@ class _Onlooker:
         """Nothing."""
         return {}
 
+    def snapshot(self) -> dict[str, Any]:
+        """As the learner's own."""
+        return self.learner.snapshot()
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """As the learner's own."""
+        self.learner.restore(snapshot)
+
     def _see(self, ids: NDArray[np.int64], option: int, age: int, ended: str, *, arrived: bool = False) -> None:
         assert self.loop is not None
         says_yes = bool(self.loop.verdicts.of(ids)[0, option])

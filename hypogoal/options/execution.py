@@ -8,8 +8,9 @@ also that of its episode.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 NONE = -1
+RUNNING = ("option", "began", "age", "inside", "returns", "episode_reward", "episode_length", "counts")
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,10 @@ class Learner(Protocol):
 
     def learn(self) -> dict[str, float]: ...
 
+    def snapshot(self) -> dict[str, Any]: ...
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None: ...
+
 
 class Chooser(Protocol):
     """Chooses options: uniformly (:class:`RandomChooser`) or by the meta-policy."""
@@ -87,6 +93,10 @@ class Chooser(Protocol):
     def record(self, outcome: Outcome) -> None: ...
 
     def learn(self) -> dict[str, float]: ...
+
+    def snapshot(self) -> dict[str, Any]: ...
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None: ...
 
 
 class RandomChooser:
@@ -107,6 +117,14 @@ class RandomChooser:
     def learn(self) -> dict[str, float]:
         """Nothing to learn."""
         return {}
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {"rng": self.rng.bit_generator.state}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of one of as many options."""
+        self.rng.bit_generator.state = snapshot["rng"]
 
 
 class EvenChooser(RandomChooser):
@@ -140,6 +158,15 @@ class EvenChooser(RandomChooser):
         """The steps that the options took."""
         for environment, duration in zip(outcome.environments, outcome.durations, strict=True):
             self.steps[self._running.pop(int(environment))] += int(duration) - 1
+
+    def snapshot(self) -> dict[str, Any]:
+        """As of :class:`RandomChooser`."""
+        return {**super().snapshot(), "steps": self.steps.copy(), "running": list(self._running.items())}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """As of :class:`RandomChooser`."""
+        super().restore(snapshot)
+        self.steps[:], self._running = snapshot["steps"], dict(snapshot["running"])
 
 
 def offered_options(verdicts: NDArray[np.bool_], mask_reached: bool) -> NDArray[np.bool_]:
@@ -309,3 +336,19 @@ class OptionLoop:
             )
         self.episode_reward[over] = 0.0
         self.episode_length[over] = 0
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly: this loop and all that takes part in it."""
+        parts = {name: part.snapshot() for name, part in self._parts().items()}
+        return {**parts, "running": {name: getattr(self, name) for name in RUNNING}}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of a loop made with the same arguments."""
+        for name, part in self._parts().items():
+            part.restore(snapshot[name])
+        for name, values in snapshot["running"].items():
+            setattr(self, name, values)
+
+    def _parts(self) -> dict[str, Any]:
+        names = ("engine", "verdicts", "learner", "chooser", "recorder", *(("initiation",) if self.initiation else ()))
+        return {name: getattr(self, name) for name in names}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -101,3 +102,11 @@ class Exploration:
         random = self._left > 0
         self._left[random] -= 1
         return np.where(random, self._kept, policy)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly, but for the generator, which is its owner's."""
+        return {"kept": self._kept.copy(), "left": self._left.copy()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of as many environments."""
+        self._kept[:], self._left[:] = snapshot["kept"], snapshot["left"]

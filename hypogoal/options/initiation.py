@@ -7,10 +7,14 @@ all together.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.base import Engine
@@ -20,6 +24,7 @@ from hypogoal.options.networks import LightQNetwork, apply_to_states
 
 KEPT = 8_192  # last executions; options change while they learn, so older ones are forgotten
 FEWEST = 100  # executions of an option before it is ever held back
+KNOWN = ("states", "option", "reached", "executions", "count")
 BATCH, EXECUTIONS_PER_UPDATE, LEARNING_RATE = 128, 32, 1e-3
 
 
@@ -98,3 +103,22 @@ class Initiation:
         loss.backward()
         self.optimiser.step()
         return {"initiation_loss": float(loss.detach())}
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "network": self.network.state_dict(),
+            "optimiser": optimiser_snapshot(self.optimiser),
+            "rng": self.rng.bit_generator.state,
+            "known": {name: getattr(self, name) for name in KNOWN},
+            "due": self._due,
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of one made with the same arguments."""
+        self.network.load_state_dict(snapshot["network"])
+        restore_optimiser(self.optimiser, snapshot["optimiser"])
+        self.rng.bit_generator.state = snapshot["rng"]
+        for name, value in snapshot["known"].items():
+            setattr(self, name, value)
+        self._due = snapshot["due"]

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -33,6 +34,7 @@ from hypogoal.options.verdicts import Verdicts
 
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
+COUNTS = ("positives", "option_steps", "steps_since_positive", "steps", "updates")
 
 
 class LightLearner:
@@ -274,3 +276,32 @@ class LightLearner:
         self.target.load_state_dict(weights)
         self.option_steps[:] = state["option_steps"].numpy()
         self.steps_since_positive[:] = state["steps_since_positive"].numpy()
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "online": self.online.state_dict(),
+            "target": self.target.state_dict(),
+            "optimiser": optimiser_snapshot(self.optimiser),
+            "replay": self.replay.snapshot(),
+            "ahead": self.ahead.snapshot(),
+            "exploration": self.exploration.snapshot(),
+            "rng": self.rng.bit_generator.state,
+            "positive": self.positive,
+            "counts": {name: getattr(self, name) for name in COUNTS},
+            "due": self._due,
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of a learner made with the same arguments."""
+        self.online.load_state_dict(snapshot["online"])
+        self.target.load_state_dict(snapshot["target"])
+        restore_optimiser(self.optimiser, snapshot["optimiser"])
+        self.replay.restore(snapshot["replay"])
+        self.ahead.restore(snapshot["ahead"])
+        self.exploration.restore(snapshot["exploration"])
+        self.rng.bit_generator.state = snapshot["rng"]
+        self.positive = dict(snapshot["positive"])
+        for name, value in snapshot["counts"].items():
+            setattr(self, name, value)
+        self._due = snapshot["due"]

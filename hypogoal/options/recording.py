@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +166,36 @@ class Recorder:
             )
         self._window_start = self.steps
         self._clear()
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "steps": [self.steps, self._window_start],
+            "episodes": np.array(self.episodes, np.float64).reshape(-1, len(EPISODE_COLUMNS)),
+            "choices": np.array(self.choices, np.float64).reshape(-1, len(CHOICE_COLUMNS)),
+            "stops": [list(stops) for stops in self.stops],
+            "executions": [[list(row) for row in rows] for rows in self.executions],
+            "pictures": [np.stack(kept) if kept else None for kept in self._pictures],
+            "window": [self._offered, self._chosen, self._expected, self._reached, self._duration],
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of a recorder of as many options."""
+        self.steps, self._window_start = snapshot["steps"]
+        rows = snapshot["episodes"].tolist()
+        self.episodes = [(int(row[0]), int(row[1]), row[2], int(row[3])) for row in rows]
+        rows = snapshot["choices"].tolist()
+        self.choices = [
+            (int(step), int(option), int(offered), int(chosen), expected, int(reached), int(duration))
+            for step, option, offered, chosen, expected, reached, duration in rows
+        ]
+        for kept, stops in zip(self.stops, snapshot["stops"], strict=True):
+            kept.extend(stops)
+        for executions, ended in zip(self.executions, snapshot["executions"], strict=True):
+            executions.extend(Execution(*row) for row in ended)
+        for pictures, shown in zip(self._pictures, snapshot["pictures"], strict=True):
+            pictures.extend(() if shown is None else shown)
+        self._offered, self._chosen, self._expected, self._reached, self._duration = snapshot["window"]
 
     def write(self, folder: Path, images: Callable[[NDArray[np.int64]], NDArray[np.uint8]]) -> None:
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""

@@ -7,12 +7,15 @@ learning samples a step and replays the option's execution up to it. Every membe
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -31,6 +34,7 @@ FIELDS = {
     "place": np.int16,  # steps since the option began
     "execution": np.int32,
 }  # fmt: skip
+COUNTS = ("steps", "updates", "due", "positives", "steps_since_positive", "executions")
 
 
 class Member:
@@ -44,6 +48,25 @@ class Member:
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
         self.steps = self.updates = self.due = self.positives = self.steps_since_positive = self.executions = 0
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "online": self.online.state_dict(),
+            "target": self.target.state_dict(),
+            "optimiser": optimiser_snapshot(self.optimiser),
+            "replay": self.replay.snapshot(),
+            "counts": {name: getattr(self, name) for name in COUNTS},
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of a member made with the same arguments."""
+        self.online.load_state_dict(snapshot["online"])
+        self.target.load_state_dict(snapshot["target"])
+        restore_optimiser(self.optimiser, snapshot["optimiser"])
+        self.replay.restore(snapshot["replay"])
+        for name, value in snapshot["counts"].items():
+            setattr(self, name, value)
 
 
 class RecurrentLearner:
@@ -242,3 +265,22 @@ class RecurrentLearner:
             member.steps = int(state["option_steps"][option])
             member.steps_since_positive = int(state["steps_since_positive"][option])
             member.positives = int(member.steps_since_positive > 0)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        return {
+            "members": [member.snapshot() for member in self.members],
+            "hidden": self.hidden,
+            "running": self.running,
+            "exploration": self.exploration.snapshot(),
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of a learner made with the same arguments."""
+        for member, known in zip(self.members, snapshot["members"], strict=True):
+            member.restore(known)
+        self.hidden.copy_(snapshot["hidden"])
+        self.running = [[tuple(step) for step in steps] for steps in snapshot["running"]]
+        self.exploration.restore(snapshot["exploration"])
+        self.rng.bit_generator.state = snapshot["rng"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -54,6 +54,15 @@ class MemberVerdicts(Verdicts):
             chance = self._networks[option](as_input(torch.from_numpy(seen))).softmax(-1)[:, 1]
             says_yes: NDArray[np.bool_] = (chance > ensemble.thresholds[member]).numpy()
         return says_yes
+
+    def snapshot(self) -> dict[str, Any]:
+        """As of :class:`Verdicts`."""
+        return {**super().snapshot(), "asked": self._asked.copy(), "said": self._said.copy()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """As of :class:`Verdicts`."""
+        super().restore(snapshot)
+        self._asked, self._said = snapshot["asked"].copy(), snapshot["said"].copy()
 
 
 def running_verdicts(verdicts: Verdicts, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,3 +80,11 @@ class Verdicts:
             self._rows[fresh] = self.classify(fresh)
             self._known[fresh] = True
         return self._rows[ids]
+
+    def snapshot(self) -> dict[str, Any]:
+        """What was said so far. A verdict at the edge may depend on which states were judged together."""
+        return {"known": self._known.copy(), "rows": self._rows.copy()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Stand by what was said in a ``snapshot``."""
+        self._known, self._rows = snapshot["known"].copy(), snapshot["rows"].copy()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim
+from hypogoal.core.artefacts import claim, versions
+from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
+from hypogoal.core.drafts import draft, put_in_place
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.dataset import open_dataset, write_dataset
@@ -16,7 +19,14 @@ COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
 
 
 def collect(
-    domain: Domain, config: Any, out: Path, *, seed: int = 0, force: bool = False, quiet: bool = False
+    domain: Domain,
+    config: Any,
+    out: Path,
+    *,
+    seed: int = 0,
+    force: bool = False,
+    resume: bool = False,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Collect ``domain``'s states into ``out``.
 
@@ -26,15 +36,21 @@ def collect(
         out: the HDF5 file to write.
         seed: of whatever the domain draws at random.
         force: replace an existing file.
+        resume: go on with what was begun, of a domain whose collecting can be resumed.
         quiet: no progress.
 
     Returns:
         Numbers of states and positives per split and sub-goal.
     """
-    claim(out, force=force)
+    claim(out, force=force, resume=resume)
     size = getattr(domain, "collected_bytes", lambda config: 0)(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
-    with Progress(f"collect {domain.name}", total=1, quiet=quiet) as progress:
-        collected = domain.collect(config, seed, progress)
-    write_dataset(out, collected, domain=domain.name, config=as_dict(config), seed=seed, force=force)
+    about: dict[str, Any] = {"domain": domain.name, "config": as_dict(config), "seed": seed}
+    with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
+        kept = {"kept": partial(checkpoints_of, work.files)} if getattr(domain, "resumes", False) else {}
+        with Progress(f"collect {domain.name}", total=1, quiet=quiet) as progress:
+            collected = domain.collect(config, seed, progress, **kept)
+        made = work.files / out.name
+        write_dataset(made, collected, **about, force=True)
+        put_in_place(made, out)
     return open_dataset(out).counts()

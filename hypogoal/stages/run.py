@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import parse_assignments, resolve
+from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
+from hypogoal.core.workers import die_with_parent
 from hypogoal.domains.base import defaults_of, load_domain
 from hypogoal.experiments import doorkey, montezuma_ladders
 from hypogoal.experiments.cells import Cell, Plan
@@ -99,13 +101,30 @@ def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
-    """Run the cells, several at once, each with a log in ``out/logs``; finished ones are not run again.
+    """Run the cells, several at once, each with a log in ``out/logs``.
+
+    Args:
+        planned: the cells.
+        out: the run's folder.
+        force: make finished ones anew.
+        resume: do not run finished ones again, and go on with unfinished ones where they were.
+        quiet: no progress.
 
     Raises:
-        UserError: ``out`` exists and neither ``force`` nor ``resume`` was given, or a cell failed.
+        UserError: ``out`` exists and neither ``force`` nor ``resume`` was given, another process runs it, or a cell
+            failed.
     """
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
+    with sole_writer(out):
+        try:
+            _run(planned, out, force=force, resume=resume, quiet=quiet)
+        except KeyboardInterrupt as error:
+            error.add_note(f"what is done is kept: {GO_ON}")
+            raise
+
+
+def _run(planned: Plan, out: Path, *, force: bool, resume: bool, quiet: bool) -> None:
     logs = out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     cells, workers = planned.cells, planned.workers
@@ -121,7 +140,7 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
                 if len(running) >= workers:
                     break
                 waiting.remove(cell)
-                running[cell] = (_start(cell, logs, force or resume), time.monotonic())
+                running[cell] = (_start(cell, logs, force=force, resume=resume), time.monotonic())
                 _say(f"[{len(made)}/{total}] {cell.name} ...", quiet)
             time.sleep(POLL_SECONDS)
             for cell, (process, since) in list(running.items()):
@@ -147,16 +166,14 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
     _say(f"all {total} cells done in {summary['seconds']:.0f} s", quiet)
 
 
-def _start(cell: Cell, logs: Path, force: bool) -> subprocess.Popen[bytes]:
-    command = [
-        sys.executable,
-        "-m",
-        "hypogoal",
-        *cell.arguments,
-        *(("--force",) if force and cell.out.exists() else ()),
-    ]
-    with (logs / f"{cell.name}.log").open("wb") as log:
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+def _start(cell: Cell, logs: Path, *, force: bool, resume: bool) -> subprocess.Popen[bytes]:
+    """A cell's process, which ends when this one does: another run could not go on with what it still writes."""
+    again = "--force" if force or cell.out.exists() else "--resume"  # what is there and was to be made is not whole
+    command = [sys.executable, "-m", "hypogoal", *cell.arguments, *((again,) if force or resume else ())]
+    with (logs / f"{cell.name}.log").open("ab" if resume else "wb") as log:
+        return subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, preexec_fn=die_with_parent
+        )
 
 
 def _failure(cell: Cell, logs: Path) -> str:

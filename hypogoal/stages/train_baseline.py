@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import claim, create_artefact
+from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.preflight import preflight
@@ -49,6 +50,7 @@ def train_baseline(
     *,
     seed: int = 0,
     force: bool = False,
+    resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
@@ -58,7 +60,7 @@ def train_baseline(
         domain: doorkey, or module:object.
         config: see :class:`BaselineConfig`.
         out: the artefact to write: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
-        seed, force, quiet, device: as for every stage.
+        seed, force, resume, quiet, device: as for every stage.
 
     Returns:
         Steps, episodes, and success and length over the last 100 episodes.
@@ -72,7 +74,7 @@ def train_baseline(
     from hypogoal.learners.baselines.settings import hyperparameters
 
     prepare(device)
-    claim(out, force=force)
+    claim(out, force=force, resume=resume)
     played = load_domain(domain, given=True)
     chosen = hyperparameters(config.agent, config.setting)
     if config.environments:
@@ -86,17 +88,15 @@ def train_baseline(
         "environments": chosen.environments,
         "hyperparameters": as_dict(chosen),
     }
-    with create_artefact(out, kind="baseline", config=about, seed=seed, force=force) as folder:
-        log = MetricsLog(folder / "metrics.jsonl")
+    with create_artefact(out, kind="baseline", config=about, seed=seed, force=force, resume=resume) as folder:
+        checkpoints = checkpoints_of(folder)
         with Progress("train-baseline", total=config.steps, quiet=quiet) as progress:
-
-            def report(step: int, numbers: dict[str, float]) -> None:
-                log.write(step=step, **numbers)
-                progress.update(min(step, config.steps), success=numbers["success"])
-
-            agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL)
+            report = _Report(MetricsLog(folder / "metrics.jsonl"), progress)
+            if not checkpoints.saved:
+                report.log.restore(0)
+            agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL, checkpoints)
             progress.update(config.steps)
-        log.close()
+        report.log.close()
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(("step", "length", "reward", "terminated"))
@@ -112,6 +112,24 @@ def train_baseline(
     last = env.episodes[-100:]
     mean_length = sum(row[1] for row in last) / len(last) if last else float("nan")
     return {"steps": env.steps, "episodes": len(env.episodes), "success": env.success(), "length": mean_length}
+
+
+class _Report:
+    """Tells the log and the progress."""
+
+    def __init__(self, log: MetricsLog, progress: Progress):
+        self.log, self.progress = log, progress
+
+    def __call__(self, step: int, numbers: dict[str, float]) -> None:
+        self.log.write(step=step, **numbers)
+        self.progress.update(min(step, self.progress.total), success=numbers["success"])
+
+    def snapshot(self) -> dict[str, int]:
+        return {"log": self.log.snapshot(), "done": self.progress.done}
+
+    def restore(self, snapshot: dict[str, int]) -> None:
+        self.log.restore(snapshot["log"])
+        self.progress.resume(snapshot["done"])
 
 
 def _make_engine(domain: Domain, config: BaselineConfig, count: int) -> Any:

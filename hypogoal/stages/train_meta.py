@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact, sha256_of
+from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
@@ -53,6 +54,7 @@ def train_meta(
     options: Path | None = None,
     seed: int = 0,
     force: bool = False,
+    resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def train_meta(
         config: see :class:`TrainMetaConfig`.
         out: the artefact to write.
         options: an options artefact, made from the same ensemble, to continue from.
-        seed, force, quiet, device: as for every stage.
+        seed, force, resume, quiet, device: as for every stage.
 
     Returns:
         Steps, episodes, and success and length over the last 100 episodes.
@@ -73,7 +75,7 @@ def train_meta(
     trained = open_artefact(options, "options").whole() if options else None
     if trained:
         _check_fit(trained, source, config)
-    claim(out, force=force)
+    claim(out, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
@@ -86,7 +88,9 @@ def train_meta(
         "setting": config.network,
     }
     inputs = [ensemble, options] if options else [ensemble]
-    with create_artefact(out, kind="meta", config=about, seed=seed, inputs=inputs, force=force) as folder:
+    with create_artefact(
+        out, kind="meta", config=about, seed=seed, inputs=inputs, force=force, resume=resume
+    ) as folder:
         recorder = Recorder(verdicts.options)
         if trained:
             learner.load(load_tensors(trained.path / "options.safetensors"))
@@ -100,7 +104,7 @@ def train_meta(
         )
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
-            play(loop, config.steps, log, progress)
+            play(loop, config.steps, log, progress, checkpoints_of(folder))
         log.close()
         recorder.write(folder, engine.images)
         save_tensors(folder / "options.safetensors", learner.state())

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
+from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.preflight import preflight
@@ -50,6 +51,7 @@ def train_options(
     *,
     seed: int = 0,
     force: bool = False,
+    resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
@@ -61,7 +63,7 @@ def train_options(
     """
     prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
-    claim(out, force=force)
+    claim(out, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     preflight("train-options", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
@@ -75,7 +77,9 @@ def train_options(
         "domain_config": source.config["domain_config"],
         "setting": config.network,
     }
-    with create_artefact(out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force) as folder:
+    with create_artefact(
+        out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force, resume=resume
+    ) as folder:
         recorder = Recorder(verdicts.options)
         rng = rng_for(seed, "random-choice")
         chooser = RandomChooser(rng) if config.chooser == "random" else EvenChooser(verdicts.options, rng)
@@ -83,7 +87,7 @@ def train_options(
         loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0, initiation=initiation)
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:
-            play(loop, steps, log, progress)
+            play(loop, steps, log, progress, checkpoints_of(folder))
         log.close()
         recorder.write(folder, engine.images)
         if hasattr(engine, "positions") and hasattr(domain, "distance"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import random
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.learners.baselines import resuming
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import CELL, NETWORKS
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
@@ -52,13 +54,32 @@ class ExploringDQN(DQN):
 
 
 class _Watch(BaseCallback):
-    """Reports every ``interval`` steps, stops at NaN, and tells DQN's epsilon when the first goal was seen."""
+    """Reports every ``interval`` steps, stops at NaN, and tells DQN's epsilon when the first goal was seen.
 
-    def __init__(self, env: EngineEnv, report: Report | None, interval: int):
+    Before each rollout the state of all is offered as a checkpoint.
+    """
+
+    def __init__(self, env: EngineEnv, report: Report | None, interval: int, checkpoints: Checkpoints):
         super().__init__()
-        self.env, self.report, self.interval = env, report, interval
+        self.env, self.report, self.interval, self.checkpoints = env, report, interval, checkpoints
         self.first_goal: int | None = None
         self._seen, self._next = 0, interval
+
+    def _on_rollout_start(self) -> None:
+        self.checkpoints.offer(self.snapshot)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Where this is, where the agent is, and what the report has to say of itself."""
+        told = {"told": self.report.snapshot()} if self.report and hasattr(self.report, "snapshot") else {}
+        watch = [self.first_goal, self._seen, self._next]
+        return {"agent": resuming.snapshot(self.model, self.env), "watch": watch, **told}
+
+    def restore(self, agent: BaseAlgorithm, snapshot: Mapping[str, Any]) -> None:
+        """Continue with ``agent`` from a ``snapshot`` of the same training."""
+        resuming.restore(agent, self.env, snapshot["agent"])
+        self.first_goal, self._seen, self._next = snapshot["watch"]
+        if "told" in snapshot:
+            self.report.restore(snapshot["told"])  # type: ignore[union-attr]
 
     def _on_step(self) -> bool:
         for step, _, _, terminated in self.env.episodes[self._seen :]:
@@ -150,6 +171,7 @@ def train(
     seed: int,
     report: Report | None = None,
     interval: int = 5_000,
+    checkpoints: Checkpoints | None = None,
 ) -> BaseAlgorithm:
     """Spec E7: train a fresh agent for ``steps`` environment steps (rounded up to whole rollouts).
 
@@ -160,6 +182,8 @@ def train(
         seed: of everything random.
         report: called with (step, numbers) every ``interval`` steps.
         interval: steps.
+        checkpoints: spec G1; ``report`` is part of them where it has ``snapshot`` and ``restore``. Of no use where the
+            engine has no ``snapshot``.
 
     Returns:
         The trained agent.
@@ -167,13 +191,24 @@ def train(
     Raises:
         NumericalError: NaN or Inf in a weight.
     """
+    if checkpoints is None or not hasattr(env.engine, "snapshot"):
+        checkpoints = Checkpoints(None)
     with own_randomness():
         agent = make_agent(env, chosen, seed)
-        watch = _Watch(env, report, interval)
+        watch = _Watch(env, report, interval, checkpoints)
         if isinstance(agent, ExploringDQN):
             agent.exploration_schedule = lambda _: epsilon(agent.chosen, env.steps, watch.first_goal)
             agent.exploration_rate = 1.0
-        agent.learn(steps, callback=watch, log_interval=None)  # type: ignore[arg-type]
+        saved = checkpoints.load()
+        if saved:
+            watch.restore(agent, saved)
+        with checkpoints:
+            agent.learn(
+                steps - agent.num_timesteps,
+                callback=watch,
+                log_interval=None,  # type: ignore[arg-type]
+                reset_num_timesteps=not saved,
+            )
     check_finite(agent, env.steps)
     return agent
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,23 @@ class EngineEnv(VecEnv):
             self.episodes.append((self.steps, int(lengths[index]), reward, terminated))
             self._rewards[index] = 0
         return self._observe(self.engine.ids), step.rewards, done, infos
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
+        return {
+            "engine": self.engine.snapshot(),  # type: ignore[attr-defined]
+            "steps": self.steps,
+            "episodes": np.array(self.episodes, np.float64).reshape(-1, 4),
+            "rewards": self._rewards.copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of environments made with the same arguments."""
+        self.engine.restore(snapshot["engine"])  # type: ignore[attr-defined]
+        self.steps = snapshot["steps"]
+        rows = snapshot["episodes"].tolist()
+        self.episodes = [(int(row[0]), int(row[1]), row[2], int(row[3])) for row in rows]
+        self._rewards[:] = snapshot["rewards"]
 
     def success(self, last: int = 100) -> float:
         """Share of the last episodes that reached a terminal state; 0 before the first."""

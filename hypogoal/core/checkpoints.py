@@ -1,0 +1,211 @@
+"""Checkpoints: all that a stage needs to go on where it was, saved while it works (Spec G1, G3).
+
+A state is nested dicts and lists of arrays, tensors and plain JSON values; what has a state gives it as ``snapshot()``
+and takes it back as ``restore(snapshot)``. One state is one safetensors file, its JSON part in it as bytes; no pickle.
+Such a file is private to its stage and to the version that wrote it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+State = dict[str, Any]
+
+FEWEST_SECONDS = 10.0  # between two checkpoints
+WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
+PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
+FOLDER = "checkpoint"  # beside the folder that a stage fills
+JSON_PART = "json"
+ARRAY, TENSOR = "$array", "$tensor"
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def checkpoints_of(folder: Path, name: str = "stage") -> Checkpoints:
+    """The checkpoints called ``name`` of the stage that fills ``folder`` (see ``create_artefact``)."""
+    return Checkpoints(folder.parent / FOLDER / f"{name}.safetensors")
+
+
+class Checkpoints:
+    """One state on disk, replaced by a later one now and then; the earlier stays until the later is whole.
+
+    As a context, Ctrl-C and SIGTERM wait for the next :meth:`offer`, which saves and raises ``KeyboardInterrupt`` with
+    the signal's number. A second Ctrl-C does not wait.
+
+    Args:
+        path: the file; None, nothing is ever saved.
+    """
+
+    def __init__(self, path: Path | None):
+        self.path = path
+        pace = os.environ.get(PACE)
+        self._fixed = float(pace) if pace else None
+        self._next = time.monotonic() + (FEWEST_SECONDS if self._fixed is None else self._fixed)
+        self._signal: int | None = None
+        self._interrupted = False
+        self._handlers: dict[int, Any] = {}
+
+    def __enter__(self) -> Checkpoints:
+        self._signal, self._interrupted = None, False
+        if threading.current_thread() is threading.main_thread():  # no other may have handlers
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._handlers[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers.clear()
+        if self._signal is not None and kind is None:
+            raise KeyboardInterrupt(self._signal)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and self._interrupted:
+            raise KeyboardInterrupt(number)
+        self._interrupted |= number == signal.SIGINT  # the first; a run sends SIGTERM on
+        self._signal = self._signal or number
+
+    @property
+    def saved(self) -> bool:
+        """Whether there is one."""
+        return self.path is not None and self.path.is_file()
+
+    def offer(self, state: Callable[[], State]) -> None:
+        """Called where the state is whole: saves it if it is time to, or if the stage is to stop.
+
+        Raises:
+            KeyboardInterrupt: a signal came; the state is saved.
+            UserError: as of :meth:`save`.
+        """
+        if self._signal is None and time.monotonic() < self._next:
+            return
+        begun = time.monotonic()
+        if self.path is not None:
+            self.save(state())
+        now = time.monotonic()
+        pace = max(FEWEST_SECONDS, WAIT_PER_COST * (now - begun)) if self._fixed is None else self._fixed
+        self._next = now + pace
+        if self._signal is not None:
+            raise KeyboardInterrupt(self._signal)
+
+    def save(self, state: State) -> None:
+        """Write ``state``. One with a tensor that holds NaN or Inf is not: the last good one stays (Spec G3).
+
+        Raises:
+            UserError: it cannot be written; the one before is still there.
+        """
+        from safetensors import SafetensorError
+        from safetensors.numpy import save_file
+
+        if self.path is None:
+            return
+        arrays, tensors = _Parts(), _Parts()
+        tree = _taken_apart(state, "", arrays, tensors)
+        if not all(np.isfinite(values).all() for values in tensors.values() if values.dtype.kind == "f"):
+            return
+        text = np.frombuffer(json.dumps(tree).encode(), np.uint8)
+        fresh = self.path.with_suffix(".new")
+        try:
+            self.path.parent.mkdir(exist_ok=True)
+            save_file({**arrays, **tensors, JSON_PART: text}, fresh)
+            sync(fresh)
+            fresh.replace(self.path)
+            sync(self.path.parent)
+        except (OSError, SafetensorError) as error:
+            fresh.unlink(missing_ok=True)
+            raise UserError(
+                f"a checkpoint cannot be written ({error})", self.path, "Make room, then give --resume to go on."
+            ) from None
+
+    def load(self) -> State | None:
+        """The state last saved; None where none was.
+
+        Raises:
+            UserError: the file is damaged.
+        """
+        from safetensors import SafetensorError
+        from safetensors.numpy import load_file
+
+        if self.path is None or not self.saved:
+            return None
+        try:
+            arrays = load_file(self.path)
+            state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
+        except (SafetensorError, KeyError, ValueError, RecursionError):
+            raise UserError("the checkpoint is damaged", self.path, "Give --force to begin anew.") from None
+        return state
+
+
+class _Parts(dict[str, NDArray[Any]]):
+    """Arrays by their place in the state."""
+
+    def add(self, place: str, values: NDArray[Any]) -> str:
+        self[place] = values if values.flags.c_contiguous else values.copy(order="C")
+        return place
+
+
+def _taken_apart(value: Any, place: str, arrays: _Parts, tensors: _Parts) -> Any:
+    """``value`` as plain JSON values, its arrays and tensors put aside."""
+    if isinstance(value, dict):
+        return {key: _taken_apart(item, f"{place}/{key}", arrays, tensors) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_taken_apart(item, f"{place}/{number}", arrays, tensors) for number, item in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        return {ARRAY: arrays.add(place, value)}
+    if isinstance(value, np.generic):
+        return value.item()
+    if hasattr(value, "detach"):
+        return {TENSOR: tensors.add(place, value.detach().cpu().numpy())}
+    return value
+
+
+def _put_together(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    if isinstance(value, list):
+        return [_put_together(item, arrays) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() == {ARRAY}:
+        return arrays[value[ARRAY]]
+    if value.keys() == {TENSOR}:
+        import torch
+
+        return torch.from_numpy(arrays[value[TENSOR]]).clone()
+    return {key: _put_together(item, arrays) for key, item in value.items()}
+
+
+def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:
+    """What an optimiser knows of each parameter, step counts included; its settings are the configuration's."""
+    return {str(number): known for number, known in optimiser.state_dict()["state"].items()}
+
+
+def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None:
+    """Continue from an ``optimiser_snapshot`` of one of the same parameters."""
+    state = {int(number): known for number, known in snapshot.items()}
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+def sync(path: Path) -> None:
+    """Have what was written to a file, or to a folder's list of files, on the disk itself."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,234 @@
+"""Drafts: the hidden folder beside an output in which a stage works until the output is whole (Spec A8, G1).
+
+``.NAME.partial/`` has ``files/`` (what will be the output), ``checkpoint/`` (see ``core.checkpoints``), ``begun.json``
+(settings, seed, inputs, versions) and ``lock``, which the kernel holds for the process that works there and lets go of
+when that process dies, however it does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from hypogoal.core.checkpoints import FOLDER, sync
+from hypogoal.core.errors import NumericalError, UserError
+
+PARTIAL = ".partial"
+FILES, BEGUN, LOCK, OLD = "files", "begun.json", "lock", ".old"
+PATIENCE_SECONDS = 2.0  # for whoever is just letting go
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that cannot lock
+GO_ON = "give the same command with --resume to go on"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A draft that this process works on: the folder to fill, and the command line that began it."""
+
+    files: Path
+    command: list[str]
+
+
+def draft_folder(out: Path) -> Path:
+    """Where the draft of an output lies."""
+    return out.with_name(f".{out.name}{PARTIAL}")
+
+
+def check_free(out: Path, *, force: bool, resume: bool) -> None:
+    """Check, before any work is done, that nobody works on ``out`` and that nothing begun would be lost.
+
+    Raises:
+        UserError: another process writes it, or something unfinished is there and it was not said what to do with it.
+    """
+    folder = draft_folder(out)
+    if folder.is_dir() and os.access(folder, os.W_OK):
+        with _locked(out):
+            _check_unfinished(out, force=force, resume=resume)
+
+
+@contextlib.contextmanager
+def sole_writer(out: Path) -> Iterator[None]:
+    """Write into ``out`` as the only process that does; of outputs that have no draft because they grow bit by bit.
+
+    Raises:
+        UserError: another process does.
+    """
+    with _locked(out):
+        try:
+            yield
+        finally:
+            shutil.rmtree(draft_folder(out), ignore_errors=True)
+
+
+def unfinished(out: Path) -> bool:
+    """Whether something was begun for ``out`` that can be gone on with."""
+    folder = draft_folder(out)
+    checkpoints = (folder / FOLDER).glob("*.safetensors")
+    return (folder / BEGUN).is_file() and (folder / FILES).is_dir() and any(checkpoints)
+
+
+@contextlib.contextmanager
+def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: bool = False) -> Iterator[Draft]:
+    """Work on ``out``: a fresh draft, or with ``resume`` the one begun before, where it has a checkpoint.
+
+    Args:
+        out: the output.
+        identity: what makes it what it is; a draft begun with another is not gone on with.
+        force: begin anew whatever was begun.
+        resume: go on with what was begun; ``force`` does not undo that.
+
+    Yields:
+        The draft. When the block raises, it stays where it has a checkpoint and is removed otherwise.
+
+    Raises:
+        UserError: another process works on ``out``; something unfinished is there that was begun otherwise, or of
+            which it was not said what to do with it.
+    """
+    identity = json.loads(json.dumps(identity))
+    folder = draft_folder(out)
+    with _locked(out):
+        _settle(out)
+        _check_unfinished(out, force=force, resume=resume)
+        if resume and unfinished(out):
+            begun = _begun(folder)
+            _check_same(begun["identity"], identity, out)
+        else:
+            begun = {"identity": identity, "command": [Path(sys.argv[0]).name, *sys.argv[1:]]}
+            _begin(folder, begun)
+        try:
+            yield Draft(folder / FILES, begun["command"])
+        except BaseException as error:
+            if not unfinished(out):
+                shutil.rmtree(folder, ignore_errors=True)
+            elif isinstance(error, KeyboardInterrupt | NumericalError):
+                error.add_note(f"the last checkpoint is kept: {GO_ON}")
+            raise
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def put_in_place(made: Path, out: Path) -> None:
+    """Rename what was made, a folder or a file, to ``out``; what stood there is moved aside first and removed last."""
+    for path in [made, *made.rglob("*")]:
+        sync(path)
+    old = out.with_name(f".{out.name}{OLD}")
+    if out.exists():
+        out.rename(old)
+    made.rename(out)
+    sync(out.parent)
+    _remove(old)
+
+
+def _settle(out: Path) -> None:
+    """Finish what a process that died in ``put_in_place`` had begun."""
+    old = out.with_name(f".{out.name}{OLD}")
+    if old.exists() and not out.exists():
+        old.rename(out)
+    _remove(old)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _begin(folder: Path, begun: dict[str, Any]) -> None:
+    for name in (BEGUN, FOLDER, FILES):
+        _remove(folder / name)
+    (folder / FILES).mkdir()
+    fresh = folder / f"{BEGUN}.new"
+    fresh.write_text(json.dumps(begun) + "\n", encoding="utf-8")
+    sync(fresh)
+    fresh.replace(folder / BEGUN)
+    sync(folder)
+
+
+def _begun(folder: Path) -> dict[str, Any]:
+    try:
+        begun = json.loads((folder / BEGUN).read_text(encoding="utf-8"))
+        return {"identity": dict(begun["identity"]), "command": [str(word) for word in begun["command"]]}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        raise UserError("what was begun is damaged", folder / BEGUN, "Give --force to begin anew.") from None
+
+
+def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
+    if unfinished(out) and not (force or resume):
+        raise UserError("an unfinished one is there", out, "Give --resume to go on with it, or --force to begin anew.")
+
+
+def _check_same(before: dict[str, Any], now: dict[str, Any], out: Path) -> None:
+    """Refuse to go on with a draft that was begun otherwise, naming the first thing that differs."""
+    if before == now:
+        return
+    for key in {**before, **now}:
+        old, new = before.get(key), now.get(key)
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            key = next(name for name in {**old, **new} if old.get(name) != new.get(name))
+            old, new = old.get(key), new.get(key)
+        what = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
+        raise UserError(
+            f"what is unfinished there was begun with {what}",
+            out,
+            "Resume it with what it was begun with, or give --force and no --resume to begin anew.",
+        )
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+@contextlib.contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Hold the lock on the draft of ``out``, whose folder is made where there is none."""
+    folder = draft_folder(out)
+    until = time.monotonic() + PATIENCE_SECONDS
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            file = (folder / LOCK).open("a+", encoding="utf-8")
+        except FileNotFoundError:
+            continue  # its owner has just removed the folder
+        with file:
+            if _try_lock(file) and _is_there(file, folder / LOCK):
+                file.truncate(0)
+                file.write(f"process {os.getpid()} on {socket.gethostname()}")
+                file.flush()
+                yield
+                return
+            file.seek(0)
+            owner = file.read(200) or "another process"
+        if time.monotonic() >= until:
+            raise UserError(f"{owner} is writing this", out, "Wait until it is done, or choose another --out.")
+        time.sleep(0.05)
+
+
+def _try_lock(file: TextIO) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+    return True
+
+
+def _is_there(file: TextIO, path: Path) -> bool:
+    """Whether ``path`` still is the file that was opened: its owner removes it at the end."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    return False

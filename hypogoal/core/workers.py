@@ -1,0 +1,65 @@
+"""Tasks on several cores: each in a process of its own, none of which outlives the one that asked for it."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import TypeVar
+
+T = TypeVar("T")
+PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
+
+
+def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
+    """Run tasks, ``workers`` at once; where that is one, in this process.
+
+    When a task fails, or at Ctrl-C, those that run get SIGTERM and are waited for: who saves checkpoints saves one.
+
+    Args:
+        tasks: what to run; more than one at once, they and their results go from process to process.
+        workers: processes.
+        done: told the number and the result of each task as soon as it is there.
+    """
+    if min(workers, len(tasks)) <= 1:
+        for number, task in enumerate(tasks):
+            done(number, task())
+        return
+    before = set(multiprocessing.active_children())
+    # Started anew rather than forked: a fork takes along whatever threads and locks the caller has.
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
+    try:
+        futures = {pool.submit(_guarded, task): number for number, task in enumerate(tasks)}
+        for future in as_completed(list(futures)):
+            done(futures.pop(future), future.result())
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone, which sends SIGTERM on
+    die_with_parent()
+    if os.getppid() != parent:
+        os._exit(128 + signal.SIGKILL)
+
+
+def die_with_parent() -> None:
+    """Have the kernel kill this process when its parent dies: an orphan would go on writing beside its successor."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _guarded(task: Callable[[], T]) -> T:
+    try:
+        return task()
+    except KeyboardInterrupt:  # the pool would give this process the next task
+        os._exit(128 + signal.SIGTERM)

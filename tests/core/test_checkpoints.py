@@ -1,0 +1,152 @@
+"""Spec G1, G3: a state on disk is the state, the last good one stays, and signals wait until it is whole."""
+
+import itertools
+import os
+import resource
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hypogoal.core.checkpoints import PACE, Checkpoints, optimiser_snapshot, restore_optimiser
+from hypogoal.core.errors import UserError
+
+
+def test_a_state_comes_back_as_it_was(tmp_path: Path) -> None:
+    """Spec G1: arrays, tensors, numbers of any size and their types, in dicts and lists, to the last bit."""
+    checkpoints = Checkpoints(tmp_path / "checkpoint" / "stage.safetensors")
+    assert checkpoints.load() is None and not checkpoints.saved
+    rng = np.random.default_rng(0)
+    state = {
+        "rng": rng.bit_generator.state,
+        "arrays": [rng.random((3, 4)).T, np.array(5, np.int16), np.zeros((0, 2), np.bool_)],
+        "tensors": {"a": torch.rand(2, 3).T, "step": torch.tensor(7.0), "bytes": torch.arange(3, dtype=torch.uint8)},
+        "numbers": [1, 0.1 + 0.2, True, None, "word", np.float32(0.1), (2, 3)],
+        "nan": [float("nan"), np.array([np.nan])],  # what is no tensor may hold them
+        "empty": {},
+    }
+    checkpoints.save(state)
+    found = checkpoints.load()
+    assert found is not None and found.keys() == state.keys()
+    assert found["rng"] == state["rng"]
+    for before, after in zip(state["arrays"], found["arrays"], strict=True):
+        np.testing.assert_array_equal(before, after)
+        assert before.dtype == after.dtype and before.shape == after.shape and after.flags.writeable
+    assert all(torch.equal(found["tensors"][name], value) for name, value in state["tensors"].items())
+    assert found["numbers"] == [1, 0.1 + 0.2, True, None, "word", float(np.float32(0.1)), [2, 3]]
+    assert np.isnan(found["nan"][0]) and np.isnan(found["nan"][1][0]) and found["empty"] == {}
+
+
+def test_an_optimiser_goes_on_as_if_it_had_not_stopped() -> None:
+    """Spec G1: moments and step counts, with steps of the same size before and after."""
+
+    def steps(weight: torch.Tensor, optimiser: torch.optim.Optimizer, count: int) -> None:
+        for _ in range(count):
+            optimiser.zero_grad()
+            (weight**4).sum().backward()
+            optimiser.step()
+
+    weights = [torch.ones(5, requires_grad=True) for _ in range(2)]
+    unbroken, first = (torch.optim.Adam([weight], lr=0.1, fused=True) for weight in weights)
+    steps(weights[0], unbroken, 7)
+    steps(weights[1], first, 4)
+    resumed = torch.optim.Adam([weights[1]], lr=0.1, fused=True)
+    restore_optimiser(resumed, optimiser_snapshot(first))
+    steps(weights[1], resumed, 3)
+    assert torch.equal(*weights)
+
+
+def test_what_is_not_finite_is_not_saved(tmp_path: Path) -> None:
+    """Spec G3: NaN in a weight leaves the last good checkpoint."""
+    checkpoints = Checkpoints(tmp_path / "stage.safetensors")
+    checkpoints.save({"weight": torch.ones(2)})
+    checkpoints.save({"weight": torch.tensor([1.0, float("nan")])})
+    assert torch.equal((checkpoints.load() or {})["weight"], torch.ones(2))
+
+
+def test_a_full_disk_leaves_the_last_one_whole(tmp_path: Path) -> None:
+    """Spec G1, G2: one line, and what was there is there."""
+    checkpoints = Checkpoints(tmp_path / "stage.safetensors")
+    checkpoints.save({"array": np.arange(10)})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(UserError, match="cannot be written"):
+            checkpoints.save({"array": np.arange(10_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    np.testing.assert_array_equal((checkpoints.load() or {})["array"], np.arange(10))
+    assert [path.name for path in tmp_path.iterdir()] == ["stage.safetensors"]
+
+
+@pytest.mark.parametrize("size", [0, 5, 100, -1])
+def test_a_damaged_one_is_one_line(tmp_path: Path, size: int) -> None:
+    """Spec G2."""
+    path = tmp_path / "stage.safetensors"
+    Checkpoints(path).save({"array": np.arange(10)})
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(UserError, match="damaged"):
+        Checkpoints(path).load()
+
+
+def test_they_are_paced_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkpoint may cost a few per cent: none in the first seconds, then thirty times its cost apart."""
+    seconds = [100.0]
+    monkeypatch.setattr("hypogoal.core.checkpoints.time.monotonic", lambda: seconds[0])
+    checkpoints = Checkpoints(tmp_path / "stage.safetensors")
+    saved: list[float] = []
+
+    def state() -> dict[str, float]:
+        saved.append(seconds[0])
+        seconds[0] += 2.0  # what it costs
+        return {"at": seconds[0]}
+
+    while seconds[0] < 250.0:
+        checkpoints.offer(state)
+        seconds[0] += 1.0
+    assert saved == [110.0, 172.0, 234.0]
+
+
+def work(checkpoints: Checkpoints, number: int) -> None:
+    """Step after step, with a signal in the third."""
+    with checkpoints:
+        for steps in itertools.count(1):
+            if steps == 3:
+                os.kill(os.getpid(), number)
+            checkpoints.offer(lambda steps=steps: {"steps": steps})  # type: ignore[misc]
+
+
+def hear(passed: list[int], *numbers: int) -> None:
+    """Signals, one after the other, and which of them let go on."""
+    with Checkpoints(None):
+        for number in numbers:
+            os.kill(os.getpid(), number)
+            passed.append(number)
+
+
+def test_signals_wait_for_a_whole_state(tmp_path: Path) -> None:
+    """Spec G1: Ctrl-C and SIGTERM save and stop; a second Ctrl-C does not wait."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before = signal.getsignal(number)
+        checkpoints = Checkpoints(tmp_path / f"{number}.safetensors")
+        with pytest.raises(KeyboardInterrupt) as caught:
+            work(checkpoints, number)
+        assert caught.value.args == (number,) and checkpoints.load() == {"steps": 3}
+        assert signal.getsignal(number) == before
+    passed: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        hear(passed, signal.SIGINT, signal.SIGTERM, signal.SIGINT)
+    assert passed == [signal.SIGINT, signal.SIGTERM]
+    with pytest.raises(KeyboardInterrupt):
+        hear(passed, signal.SIGTERM)  # and nothing is offered any more
+
+
+def test_the_pace_is_set_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For the kill harness: at every step."""
+    monkeypatch.setenv(PACE, "0")
+    checkpoints = Checkpoints(tmp_path / "stage.safetensors")
+    for step in range(3):
+        checkpoints.offer(lambda step=step: {"step": step})  # type: ignore[misc]
+        assert checkpoints.load() == {"step": step}

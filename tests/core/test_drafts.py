@@ -1,0 +1,179 @@
+"""Spec G1, G2: what a stage works on is its own, is gone on with only by what began it, and is never lost."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hypogoal.core.artefacts import claim, create_artefact, open_artefact
+from hypogoal.core.checkpoints import checkpoints_of
+from hypogoal.core.drafts import draft_folder, unfinished
+from hypogoal.core.errors import NumericalError, UserError
+
+ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "chooser": "ppo"}, "seed": 7}
+
+
+class Broken(Exception):
+    """Something went wrong in a stage."""
+
+
+def stop(out: Path, error: BaseException, checkpoint: bool = True, **about: Any) -> None:
+    """A stage that stops with ``error`` after its first checkpoint, if it has one."""
+    with create_artefact(out, **{**ABOUT, **about}) as folder:
+        (folder / "half").write_text("x")
+        if checkpoint:
+            checkpoints_of(folder).save({"step": 1})
+        raise error
+
+
+def finish(out: Path, **about: Any) -> int:
+    """A stage that goes on from where it was and ends; returns where that was."""
+    with create_artefact(out, **{**ABOUT, **about}) as folder:
+        step = (checkpoints_of(folder).load() or {"step": 0})["step"]
+        (folder / "whole").write_text("y")
+    return int(step)
+
+
+def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
+    """Spec G1: with --resume; the artefact says the command that began it and has no checkpoint in it."""
+    out = tmp_path / "meta"
+    with pytest.raises(Broken):
+        stop(out, Broken())
+    assert unfinished(out) and not out.exists()
+    assert finish(out, resume=True) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["meta"]
+    assert set(open_artefact(out).manifest["files"]) == {"half", "whole"}
+
+
+def test_resume_where_nothing_was_begun_begins(tmp_path: Path) -> None:
+    """Spec G1: nothing there, or nothing that could be gone on with."""
+    assert finish(tmp_path / "meta", resume=True) == 0
+    out = tmp_path / "other"
+    with pytest.raises(Broken):
+        stop(out, Broken(), checkpoint=False)
+    assert not draft_folder(out).exists()
+    (draft_folder(out) / "files").mkdir(parents=True)  # as a process leaves it that was killed early
+    (draft_folder(out) / "files" / "half").write_text("x")
+    assert finish(out, resume=True) == 0
+    assert set(open_artefact(out).manifest["files"]) == {"whole"}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seed": 8}, "seed=7, not 8"),
+        ({"config": {"steps": 4, "chooser": "ppo"}}, "steps=3, not 4"),
+        ({"kind": "options"}, "kind=meta, not options"),
+        ({"inputs": ["input.h5"]}, "other inputs"),
+    ],
+)
+def test_another_stage_does_not_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], words: str
+) -> None:
+    """Spec G1, G2: another configuration, seed, kind or input is named in one line; --force begins anew."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "input.h5").write_text("states")
+    change = {key: [Path(name) for name in value] if key == "inputs" else value for key, value in change.items()}
+    out = tmp_path / "meta"
+    with pytest.raises(Broken):
+        stop(out, Broken())
+    with pytest.raises(UserError, match=words) as caught:
+        finish(out, **change, resume=True)
+    assert "--force" in str(caught.value) and unfinished(out)
+    assert finish(out, **change, force=True) == 0 and not draft_folder(out).exists()
+
+
+def test_other_versions_do_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1: the same bytes are promised, and another torch need not give them."""
+    out = tmp_path / "meta"
+    with pytest.raises(Broken):
+        stop(out, Broken())
+    monkeypatch.setattr("hypogoal.core.artefacts.versions", lambda: {"torch": "9.9"})
+    with pytest.raises(UserError, match=r"begun with (python|torch|hypogoal|numpy)="):
+        finish(out, resume=True)
+
+
+def test_what_is_unfinished_is_not_begun_anew_by_mistake(tmp_path: Path) -> None:
+    """Spec G1: neither flag, one line, before any work; --force says so."""
+    out = tmp_path / "meta"
+    with pytest.raises(Broken):
+        stop(out, Broken())
+    with pytest.raises(UserError, match="an unfinished one is there"):
+        claim(out)
+    with pytest.raises(UserError, match="an unfinished one is there"):
+        finish(out)
+    assert unfinished(out) and claim(out, resume=True) and claim(out, force=True)
+
+
+def test_a_damaged_draft_is_one_line(tmp_path: Path) -> None:
+    """Spec G2."""
+    out = tmp_path / "meta"
+    with pytest.raises(Broken):
+        stop(out, Broken())
+    for text in ("{", "[]", '{"identity": 3, "command": []}', '{"identity": {}}'):
+        (draft_folder(out) / "begun.json").write_text(text)
+        with pytest.raises(UserError, match="damaged"):
+            finish(out, resume=True)
+
+
+def test_what_stops_a_stage_says_how_to_go_on(tmp_path: Path) -> None:
+    """Spec G1, G3: Ctrl-C and NaN keep the last checkpoint and say so; where there is none they say nothing."""
+    for number, error in enumerate((KeyboardInterrupt(2), NumericalError("a loss is NaN"))):
+        with pytest.raises(type(error)) as caught:
+            stop(tmp_path / str(number), error)
+        assert any("--resume" in note for note in caught.value.__notes__)
+        assert unfinished(tmp_path / str(number))
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        stop(tmp_path / "early", KeyboardInterrupt(2), checkpoint=False)
+    assert not hasattr(stopped.value, "__notes__")
+
+
+def test_force_of_an_unfinished_replacement(tmp_path: Path) -> None:
+    """Spec G2: what stood there stands there until the new one is whole; --resume then needs no second --force."""
+    out = tmp_path / "meta"
+    finish(out)
+    with pytest.raises(Broken):
+        stop(out, Broken(), force=True)
+    assert set(open_artefact(out).manifest["files"]) == {"whole"}
+    assert finish(out, resume=True) == 1
+    assert set(open_artefact(out).manifest["files"]) == {"half", "whole"}
+
+
+def test_a_death_between_two_renames_loses_nothing(tmp_path: Path) -> None:
+    """Spec G2: what was moved aside comes back."""
+    out = tmp_path / "meta"
+    finish(out)
+    out.rename(tmp_path / ".meta.old")
+    with pytest.raises(Broken):
+        stop(out, Broken(), force=True, checkpoint=False)
+    assert set(open_artefact(out).manifest["files"]) == {"whole"}
+    assert [path.name for path in tmp_path.iterdir()] == ["meta"]
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from hypogoal.core.artefacts import create_artefact
+with create_artefact(Path(sys.argv[1]), kind="meta", config={}, seed=0):
+    print("begun", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_two_processes_do_not_write_one_output(tmp_path: Path) -> None:
+    """Spec G2: the second is told who writes it; when the first was killed, its lock is nobody's."""
+    out = tmp_path / "meta"
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "begun\n"
+        for attempt in (lambda: claim(out), lambda: finish(out, force=True), lambda: finish(out, resume=True)):
+            with pytest.raises(UserError, match=f"process {other.pid} on .* is writing this"):
+                attempt()
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+    assert draft_folder(out).exists()
+    assert finish(out) == 0
+    assert os.listdir(tmp_path) == ["meta"]

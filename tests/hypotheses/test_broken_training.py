@@ -1,0 +1,83 @@
+"""Spec G1: ensembles trained with a break are those trained without, whatever is trained and changed on the way."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_views import CROP, montezuma_states
+
+from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.hypotheses import training
+from hypogoal.hypotheses.localisers import fit_localiser
+from hypogoal.hypotheses.training import EnsembleConfig, fit
+from hypogoal.hypotheses.views import ACTIONS
+
+SHORT = dataclasses.replace(CROP, localiser="learned", steps=12, batch_size=16, diversity="dbat", diversity_weight=1e-2)
+
+
+class Broken(Exception):
+    """The end of a process."""
+
+
+class Breaking(Checkpoints):
+    """Saves after the step before the last and breaks off after the last."""
+
+    def __init__(self, path: Path, last: int):
+        super().__init__(path)
+        self.last, self.steps = last, 0
+
+    def offer(self, state: Callable[[], State]) -> None:
+        self.steps += 1
+        if self.steps == self.last - 1:
+            self.save(state())
+        if self.steps == self.last:
+            raise Broken
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SHORT,
+        dataclasses.replace(SHORT, schedule="sequential", augment="grey", threshold="unlabelled-q95"),
+        dataclasses.replace(SHORT, localiser="ram", jitter=2),
+    ],
+    ids=["learned localiser", "sequential, grey, thresholds", "ram, jitter"],
+)
+def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1: weights, BatchNorm, localiser and thresholds, reports; a finished one is not trained again."""
+    monkeypatch.setattr(training, "fit_localiser", partial(fit_localiser, steps=2))
+    observations, labels, origins = montezuma_states(60, seed=0)
+    unlabelled, _, there = montezuma_states(40, seed=1)
+    there |= {name: np.arange(40) % 18 for name in ACTIONS}
+
+    def trained(checkpoints: Checkpoints | None) -> tuple[dict[str, torch.Tensor], list[tuple[int, dict[str, float]]]]:
+        told: list[tuple[int, dict[str, float]]] = []
+        ensemble = fit(
+            observations,
+            labels,
+            unlabelled,
+            config,
+            0,
+            lambda *report: told.append(report),
+            origins=origins,
+            unlabelled_origins=there,
+            checkpoints=checkpoints,
+        )
+        return ensemble.state(), told
+
+    unbroken, expected = trained(None)
+    path = tmp_path / "ensemble.safetensors"
+    for last in (5, 4, 4):
+        with pytest.raises(Broken):
+            trained(Breaking(path, last))
+    resumed, told = trained(Checkpoints(path))
+    assert told == expected[-len(told) :] and told
+    again, nothing = trained(Checkpoints(path))
+    assert nothing == []
+    for state in (resumed, again):
+        assert state.keys() == unbroken.keys()
+        assert all(torch.equal(state[name], value) for name, value in unbroken.items())

@@ -1,0 +1,154 @@
+"""Spec G1: options played, learned and chosen go on after a break as if there had been none, to the last bit."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from corridor import Corridor, LongCorridor
+
+from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.errors import NumericalError
+from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.core.seeding import rng_for
+from hypogoal.meta import playing
+from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
+from hypogoal.options.initiation import Initiation
+from hypogoal.options.recording import Recorder
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+QUICK = {
+    "environments": 3,
+    "warm_up": 40,
+    "update_interval": 4,
+    "option_batch": 16,
+    "epsilon_steps": 200,
+    "replay": 150,
+}
+OWN = {"experience": "own", "mask_reached": False}
+FAR = {**OWN, "n_step": 3, "exploration": "persistent", "restart_options": True, "option_timeout": 6}
+CASES: dict[str, tuple[type[Corridor], str, dict[str, object], str]] = {
+    "light, shared, ppo": (Corridor, "light", {"initiation": "learned"}, "ppo"),
+    "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
+    "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
+    "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
+}
+STEPS, BREAKS = 300, (23, 51, 80)  # environment steps, and the steps of the loop after which it breaks
+
+
+class Broken(Exception):
+    """The end of a process."""
+
+
+class Breaking(Checkpoints):
+    """Saves after each of ``saves`` steps and breaks off five steps after the last of them."""
+
+    def __init__(self, path: Path, last: int):
+        super().__init__(path)
+        self.last, self.steps = last, 0
+
+    def offer(self, state: Callable[[], State]) -> None:
+        self.steps += 1
+        if self.steps in (self.last // 2, self.last):
+            self.save(state())
+        if self.steps == self.last + 5:
+            raise Broken
+
+
+def loop_of(case: str) -> OptionLoop:
+    engine_class, network, changes, chooser_name = CASES[case]
+    config = OptionConfig(**{"option_timeout": 10, **QUICK, **changes})  # type: ignore[arg-type]
+    engine = engine_class(3)
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner = playing.LEARNERS[network](engine, verdicts, config, seed=1)
+    chooser = RandomChooser(rng_for(0, "choice"))
+    if chooser_name == "even":
+        chooser = EvenChooser(2, rng_for(0, "choice"))
+    elif chooser_name != "random":
+        head = "gaussian" if chooser_name == "gaussian" else "categorical"
+        chooser = MetaPolicy(engine, 2, MetaConfig(head=head, decisions=16, meta_batch=8), 2)  # type: ignore[assignment]
+    initiation = Initiation(engine, 2, config, seed=3) if config.initiation == "learned" else None
+    return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, 100), config, gamma=0.9, initiation=initiation)
+
+
+def run(case: str, folder: Path, checkpoints: Checkpoints) -> OptionLoop:
+    loop = loop_of(case)
+    log = MetricsLog(folder / "metrics.jsonl")
+    try:
+        playing.play(loop, STEPS, log, Progress("", 0, quiet=True), checkpoints)
+    finally:
+        log.close()
+    return loop
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1: networks, optimisers, replays, choices, episodes, verdicts, generators, log, after three breaks."""
+    monkeypatch.setattr(playing, "LOG_INTERVAL", 50)
+    (tmp_path / "unbroken").mkdir()
+    (tmp_path / "broken").mkdir()
+    unbroken = run(case, tmp_path / "unbroken", Checkpoints(None))
+    path = tmp_path / "broken" / "checkpoint.safetensors"
+    for last in BREAKS:
+        before = Breaking(path, last)
+        before.steps = 0 if last == BREAKS[0] else BREAKS[BREAKS.index(last) - 1]
+        with pytest.raises(Broken):
+            run(case, tmp_path / "broken", before)
+    resumed = run(case, tmp_path / "broken", Checkpoints(path))
+
+    for folder in ("unbroken", "broken"):
+        loop = unbroken if folder == "unbroken" else resumed
+        loop.recorder.write(tmp_path / folder, loop.engine.images)
+        Checkpoints(tmp_path / folder / "checkpoint.safetensors").save(loop.snapshot())
+    for name in ("metrics.jsonl", "episodes.csv", "choices.csv", "terminations.h5", "checkpoint.safetensors"):
+        one, other = (tmp_path / folder / name for folder in ("unbroken", "broken"))
+        assert one.read_bytes() == other.read_bytes(), name
+    weights = unbroken.learner.state()  # type: ignore[attr-defined]
+    fresh = loop_of(case).learner.state()  # type: ignore[attr-defined]
+    assert any(not torch.equal(value, fresh[name]) for name, value in weights.items()), "nothing was learned"
+
+
+class Poisoned(Checkpoints):
+    """Saves after every step, and from the 40th on a weight is NaN."""
+
+    def __init__(self, path: Path):
+        super().__init__(path)
+        self.steps = 0
+
+    def offer(self, state: Callable[[], State]) -> None:
+        self.steps += 1
+        now = state()
+        if self.steps >= 40:
+            now["loop"]["learner"]["online"]["heads.bias"][0] = torch.nan  # the state is the network's own
+        self.save(now)
+
+
+def test_nan_stops_and_the_last_good_checkpoint_stays(tmp_path: Path) -> None:
+    """Spec G3."""
+    checkpoints = Poisoned(tmp_path / "checkpoint.safetensors")
+    with pytest.raises(NumericalError, match="nan"):
+        run("light, shared, gaussian", tmp_path, checkpoints)
+    saved = checkpoints.load()
+    assert saved is not None and saved["loop"]["recorder"]["steps"][0] == 39 * 3
+    assert all(torch.isfinite(value).all() for value in saved["loop"]["learner"]["online"].values())
+
+
+class Plain(Corridor):
+    """An own domain's engine, which gives no snapshots."""
+
+    def __getattribute__(self, name: str) -> Any:
+        if name == "snapshot":
+            raise AttributeError(name)
+        return super().__getattribute__(name)
+
+
+def test_an_engine_without_snapshots_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6, G1: own domains need none; what is played there saves no checkpoint."""
+    monkeypatch.setitem(CASES, "plain", (Plain, "light", {}, "random"))
+    checkpoints = Breaking(tmp_path / "checkpoint.safetensors", 1)
+    assert run("plain", tmp_path, checkpoints).recorder.steps == STEPS
+    assert not checkpoints.saved and checkpoints.steps == 0
