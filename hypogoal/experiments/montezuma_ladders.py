@@ -113,8 +113,8 @@ def cells(
     for groups in config.groups:
         data = add(f"data/groups-{groups}.h5", ("collect", DOMAIN, "--set", f"groups={groups}"), PER_COLLECTION)
         for method, variant, seed in product(config.methods, ("", *config.variants), config.seeds):
-            folders = ("ensemble", method, variant.replace(" ", ","), f"groups-{groups}-seed-{seed}")
-            place = "/".join(filter(None, folders))
+            named = ",".join([method, *variant.split()])
+            place = f"ensemble/{named}/groups-{groups}-seed-{seed}"
             settings = (part for change in variant.split() for part in ("--set", change))
             arguments = ("train-ensemble", str(data), *METHODS[method], *settings, "--seed", str(seed))
             evaluated += members[method]

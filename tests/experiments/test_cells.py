@@ -52,6 +52,7 @@ def test_each_variant_gives_one_more_ensemble_per_method_and_seed() -> None:
     trained = [cell for cell in cells if cell.arguments[0] == "train-ensemble"]
     assert len(trained) == 3 * 2 * 2
     assert sum("localiser=ram" in cell.arguments for cell in trained) == 4
+    assert {len(cell.out.relative_to(OUT).parts) for cell in trained} == {3}  # evaluate looks no deeper
     full = [cell for cell in trained if "view=full" in cell.arguments]
     assert len(full) == 4 and all("network=montezuma" in cell.arguments for cell in full)
 
