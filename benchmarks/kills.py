@@ -174,7 +174,9 @@ def broken(stage: Stage, folder: Path, kills: int, seconds: float, rng: random.R
                 break
         else:
             tally.ended += 1
-            tally.differences += len(differences(whole, out))
+            differ = differences(whole, out)
+            print("".join(f"{stage.name}: {name} differs\n" for name in differ), end="", file=sys.stderr)
+            tally.differences += len(differ)
             tally.losses += draft_folder(out).exists() and not left_over(out)
             _remove(out)
     return tally

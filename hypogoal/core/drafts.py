@@ -33,7 +33,7 @@ GO_ON = "give the same command with --resume to go on"
 
 @dataclass(frozen=True)
 class Draft:
-    """A draft that this process works on: the folder to fill, and the command line that began it."""
+    """A draft that this process works on: the folder to fill, and the command line that began it, without --resume."""
 
     files: Path
     command: list[str]
@@ -103,7 +103,8 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
             begun = _begun(folder)
             _check_same(begun["identity"], identity, out)
         else:
-            begun = {"identity": identity, "command": [Path(sys.argv[0]).name, *sys.argv[1:]]}
+            words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
+            begun = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
             _begin(folder, begun)
         try:
             yield Draft(folder / FILES, begun["command"])

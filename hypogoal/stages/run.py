@@ -170,7 +170,8 @@ def _start(cell: Cell, logs: Path, *, force: bool, resume: bool) -> subprocess.P
     """A cell's process, which ends when this one does: another run could not go on with what it still writes."""
     again = "--force" if force or cell.out.exists() else "--resume"  # what is there and was to be made is not whole
     command = [sys.executable, "-m", "hypogoal", *cell.arguments, *((again,) if force or resume else ())]
-    with (logs / f"{cell.name}.log").open("ab" if resume else "wb") as log:
+    with (logs / f"{cell.name}.log").open("ab" if resume else "wb", buffering=0) as log:
+        log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
         return subprocess.Popen(
             command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, preexec_fn=die_with_parent
         )

@@ -38,15 +38,19 @@ def finish(out: Path, **about: Any) -> int:
     return int(step)
 
 
-def test_what_was_begun_is_gone_on_with(tmp_path: Path) -> None:
+def test_what_was_begun_is_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G1: with --resume; the artefact says the command that began it and has no checkpoint in it."""
     out = tmp_path / "meta"
+    monkeypatch.setattr("sys.argv", ["/usr/bin/hypogoal", "train-meta", "--resume"])
     with pytest.raises(Broken):
         stop(out, Broken())
     assert unfinished(out) and not out.exists()
+    monkeypatch.setattr("sys.argv", ["/usr/bin/hypogoal", "train-meta", "--quiet", "--resume"])
     assert finish(out, resume=True) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["meta"]
-    assert set(open_artefact(out).manifest["files"]) == {"half", "whole"}
+    manifest = open_artefact(out).manifest
+    assert set(manifest["files"]) == {"half", "whole"}
+    assert manifest["command"] == ["hypogoal", "train-meta"]
 
 
 def test_resume_where_nothing_was_begun_begins(tmp_path: Path) -> None:
