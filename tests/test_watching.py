@@ -48,7 +48,7 @@ def test_what_is_being_made_comes_first(run):
 
 def test_the_view_fits_80_columns(run):
     """Spec A6: with ages, steps, the last value and a curve; long names lose their beginning."""
-    log = next(run.glob("meta/.*/metrics.jsonl"))
+    log = next(run.glob("meta/.*/files/metrics.jsonl"))
     os.utime(log, (time.time() - 300, time.time() - 300))
     deep = run / "a-setting-with-a-long-name" / "options" / "layout-123-seed-45"
     with create_artefact(deep, kind="options", config={}, seed=0) as folder:

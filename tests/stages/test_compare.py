@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hypogoal.cli import main
-from hypogoal.core.artefacts import create_artefact, open_artefact
+from hypogoal.core.artefacts import MANIFEST, create_artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.comparing import labels_of, on_grid
 from hypogoal.options.recording import write_table
@@ -113,6 +113,9 @@ def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
         metrics = json.loads(path.read_text(encoding="utf-8"))
         change(metrics)
         path.write_text(json.dumps(metrics), encoding="utf-8")
+        manifest = json.loads((path.parent / MANIFEST).read_text(encoding="utf-8"))
+        manifest["files"][path.name] = sha256_of(path)
+        (path.parent / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
         return tmp_path / name
 
     assert "two different runs or more" in refused(slow)
