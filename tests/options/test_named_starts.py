@@ -13,6 +13,7 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import ALLOWED
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import write_ensemble
 from hypogoal.options.recording import EXECUTION_COLUMNS
@@ -55,6 +56,12 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
         for number, sub_goal in enumerate(domain.sub_goals):
             write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
     return folder
+
+
+@pytest.fixture(autouse=True)
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The manifests here name this module's domain."""
+    monkeypatch.setenv(ALLOWED, DOMAIN.name)
 
 
 @pytest.fixture(scope="module")
