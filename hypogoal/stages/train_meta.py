@@ -23,7 +23,7 @@ from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import reading
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
+from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.needs import play_needs
 from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
@@ -77,6 +77,7 @@ def train_meta(
         _check_fit(trained, source, config)
     claim(out, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
+    start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     about = as_dict(config) | {

@@ -16,7 +16,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.meta.playing import PlayConfig, build, layout_facts, play
+from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments
 from hypogoal.needs import play_needs
 from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
 from hypogoal.options.initiation import Initiation
@@ -65,6 +65,7 @@ def train_options(
     source = open_artefact(ensemble, "ensemble").whole()
     claim(out, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
+    start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-options", out, play_needs(domain, source.config, config), quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
     members = verdicts.options // len(source.config["sub_goals"])
