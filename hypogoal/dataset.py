@@ -129,7 +129,10 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
     """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
-    chunk = (min(64, max(1, len(observations))), *observations.shape[1:])
+    if not len(observations):
+        group.create_dataset("observations", data=observations)  # no chunk is as small as that
+        return
+    chunk = (min(64, len(observations)), *observations.shape[1:])
     group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
 
 

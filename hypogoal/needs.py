@@ -6,6 +6,7 @@ process with torch has before any of it (450 MB were measured while ``train-meta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,12 +32,14 @@ class Needs(NamedTuple):
     disk: float
 
 
-def ensemble_needs(data: Path, config: EnsembleConfig, sub_goals: int, workers: int) -> Needs:
+def ensemble_needs(
+    data: Path, unlabelled: Sequence[Path], config: EnsembleConfig, sub_goals: int, workers: int
+) -> Needs:
     """``train-ensemble``: each process holds a sub-goal's states three times (read, as seen, prepared)."""
     dataset = open_dataset(data)
-    counts = dataset.counts()
-    labelled = max((row["states"] for row in counts["labelled"].values()), default=0)
-    states = (labelled + counts["unlabelled"]) * prod(dataset.observation_shape)
+    labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
+    others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
+    states = (labelled + others) * prod(dataset.observation_shape)
     own = BASE + 3 * states + COPIES * config.members * MEMBER
     return Needs(workers * own, sub_goals * config.members * MEMBER + LOGS)
 
@@ -57,7 +60,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
     weights = options * PAPER_POLICY if paper else 8e6
     frames = LEARNERS[config.network].reach(config, options) * prod(domain.observation_shape[:2])
     kept = frames if getattr(domain, "starts", ()) else 0
-    stops = STOPS_KEPT * options * picture
+    stops = STOPS_KEPT * options * picture + config.save_visited * picture
     memory = BASE + replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
     return Needs(memory + len(about["sub_goals"]) * about["members"] * MEMBER, weights + stops + LOGS)
 
