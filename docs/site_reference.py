@@ -52,5 +52,10 @@ def settings() -> str:
 def _row(row: dict[str, Any]) -> str:
     default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple | list) else str(row["default"])
     allowed = f" ({row['allowed']})" if row["allowed"] else ""
-    cells = (f"`{row['name']}`", f"{default or '(none)'} {row['unit']}".strip(), row["meaning"] + allowed, row["source"])
+    cells = (
+        f"`{row['name']}`",
+        f"{default or '(none)'} {row['unit']}".strip(),
+        row["meaning"] + allowed,
+        row["source"],
+    )
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -125,7 +125,9 @@ def test_the_other_pages_name_commands_that_are_there() -> None:
 
 def test_equations_lead_to_code() -> None:
     """Spec, head: a reader finds each equation of the paper in ten seconds."""
-    rows = re.findall(r"^\| [^|]+ \| ([^|]+`hypogoal/[^|]+|`hypogoal/[^|]+) \|$", (DOCS / "concepts.md").read_text(), re.M)
+    rows = re.findall(
+        r"^\| [^|]+ \| ([^|]+`hypogoal/[^|]+|`hypogoal/[^|]+) \|$", (DOCS / "concepts.md").read_text(), re.M
+    )
     assert len(rows) >= 15
     for row in rows:
         file = None
