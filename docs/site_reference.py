@@ -36,8 +36,8 @@ def settings() -> str:
     lines = [
         "# Settings",
         "",
-        "Every setting of every stage: `--set name=value` changes one, a preset changes several, and the manifest of what was "
-        "made has them all. `hypogoal config STAGE --domain DOMAIN` prints the same.",
+        "Every setting of every stage: `--set name=value` changes one, a preset changes several, and the manifest of "
+        "what was made has them all. `hypogoal config STAGE --domain DOMAIN` prints the same.",
         "",
     ]
     for domain in BUILT_IN:
