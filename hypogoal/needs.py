@@ -22,6 +22,7 @@ MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
 PER_TRANSITION = 50  # bytes in a replay, its sum tree included
+CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
 LOGS = 50e6
 
 
@@ -40,8 +41,9 @@ def ensemble_needs(
     labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
     others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
     states = (labelled + others) * prod(dataset.observation_shape)
-    own = BASE + 3 * states + COPIES * config.members * MEMBER
-    return Needs(workers * own, sub_goals * config.members * MEMBER + LOGS)
+    training = COPIES * config.members * MEMBER
+    own = BASE + 3 * states + training
+    return Needs(workers * own, sub_goals * (config.members * MEMBER + training) + CHECKPOINTS * training + LOGS)
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Needs:
@@ -61,13 +63,16 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
     frames = LEARNERS[config.network].reach(config, options) * prod(domain.observation_shape[:2])
     kept = frames if getattr(domain, "starts", ()) else 0
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
-    memory = BASE + replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
-    return Needs(memory + len(about["sub_goals"]) * about["members"] * MEMBER, weights + stops + LOGS)
+    state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
+    members = len(about["sub_goals"]) * about["members"] * MEMBER
+    # A checkpoint is a copy of the state, in memory while it is written.
+    return Needs(BASE + 2 * state + members, weights + stops + CHECKPOINTS * state + LOGS)
 
 
 def baseline_needs(observation: int, replay: int) -> Needs:
     """``train-baseline``: ``replay`` transitions of two observations of so many bytes."""
-    return Needs(BASE + 100e6 + 2.0 * observation * replay, LOGS)
+    state = 2.0 * observation * replay
+    return Needs(BASE + 100e6 + 2 * state, CHECKPOINTS * (state + 50e6) + LOGS)
 
 
 def evaluation_needs(data: list[Path]) -> Needs:
