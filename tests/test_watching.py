@@ -117,7 +117,7 @@ def events(folder):
 
 
 def test_tensorboard_reads_the_logs(run, tmp_path, capsys):
-    """Issue 4, item 7: every number of every log, an ensemble's by sub-goal, also while an agent is still learning."""
+    """Spec A6: every number of every log, an ensemble's by sub-goal, also while an agent is still learning."""
     out = tmp_path / "boards"
     assert main(["watch", str(run), "--once", "--tensorboard", str(out)]) == 0
     agent = events(out / "meta/layout-100-seed-0")
@@ -134,7 +134,7 @@ def test_tensorboard_reads_the_logs(run, tmp_path, capsys):
 
 
 def test_tensorboard_gets_what_is_new_once(run, tmp_path):
-    """Issue 4, item 7: looking again writes only the lines that came since, a resumed stage's old ones not again."""
+    """Spec A6: looking again writes only the lines that came since, a resumed stage's old ones not again."""
     boards = Boards(tmp_path / "boards")
     mirror(read_progress(run), boards)
     log = next(run.glob("meta/.*/files/metrics.jsonl"))
@@ -147,7 +147,7 @@ def test_tensorboard_gets_what_is_new_once(run, tmp_path):
 
 
 def test_without_the_extra(run, tmp_path, monkeypatch, capsys):
-    """Issue 4, item 7: one line that says what to install, and no folder."""
+    """Spec A6: one line that says what to install, and no folder."""
     monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.event_file_writer", None)
     assert main(["watch", str(run), "--tensorboard", str(tmp_path / "boards")]) == 2
     assert "pip install 'hypogoal[tensorboard]'" in capsys.readouterr().err
