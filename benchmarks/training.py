@@ -3,8 +3,8 @@
     python -m benchmarks training [--short] [--json PATH]
 
 The plain loop is the formulation of the authors' public code, written anew: each member by itself, float32 NCHW,
-labelled and unlabelled states in two passes, the disagreement of each ordered pair, Adam for each member. Both train the
-paper's networks on the same real states, 64 labelled and 64 unlabelled a step.
+labelled and unlabelled states in two passes, the disagreement of each ordered pair, Adam for each member. Both train
+the paper's networks on the same real states, 64 labelled and 64 unlabelled a step.
 """
 
 from __future__ import annotations
@@ -114,6 +114,25 @@ def ours(split: Split, unlabelled: np.ndarray, config: EnsembleConfig) -> float:
     return clock.per_step()
 
 
+def compared(split: Split, unlabelled: np.ndarray, domain: str, members: int, steps: int, repeats: int) -> Any:
+    """Both ways, in turn."""
+    config = resolve(
+        EnsembleConfig,
+        stage="train-ensemble",
+        assignments=[f"members={members}", f"steps={steps + 1}"],
+        domain=domain,
+        defaults=defaults_of(domain, "train-ensemble"),
+    )
+    found = timing.alternated(
+        {
+            "plain loop": lambda: plain(split, unlabelled, config, steps),
+            "hypogoal": lambda: ours(split, unlabelled, config),
+        },
+        repeats,
+    )
+    return timing.rows_of(found, "plain loop", {"hypogoal": WANTED[domain]})
+
+
 def main() -> None:
     """Measure, print, write."""
     given = timing.arguments(__doc__, "training")
@@ -125,22 +144,7 @@ def main() -> None:
         for domain in WANTED if not given.short else ("doorkey",):
             split, unlabelled = states(domain, Path(folder))
             for members in (3, 6):
-                config = resolve(
-                    EnsembleConfig,
-                    stage="train-ensemble",
-                    preset=None,
-                    assignments=[f"members={members}", f"steps={steps + 1}"],
-                    domain=domain,
-                    defaults=defaults_of(domain, "train-ensemble"),
-                )
-                found = timing.alternated(
-                    {
-                        "plain loop": lambda config=config: plain(split, unlabelled, config, steps),
-                        "hypogoal": lambda config=config: ours(split, unlabelled, config),
-                    },
-                    repeats,
-                )
-                rows = timing.rows_of(found, "plain loop", {"hypogoal": WANTED[domain]})
+                rows = compared(split, unlabelled, domain, members, steps, repeats)
                 timing.show(f"\n{domain}, K={members}, 64 + 64 states: a step", rows)
                 results[f"{domain}-{members}"] = rows
     timing.write(given.json, about, results)
