@@ -52,7 +52,8 @@ def baseline(algorithm: str, steps: int) -> float:
 
     env = ImgObsWrapper(RGBImgObsWrapper(DoorKeyGrid(layout_seed=LAYOUT), tile_size=8))
     if algorithm == "ppo":
-        agent: Any = PPO("CnnPolicy", env, seed=0, device="cpu", n_steps=min(2048, steps))
+        rollout = min(2048, steps)
+        agent: Any = PPO("CnnPolicy", env, seed=0, device="cpu", n_steps=rollout, batch_size=min(64, rollout))
     else:
         agent = DQN("CnnPolicy", env, seed=0, device="cpu", learning_starts=100, buffer_size=10_000)
     return per_step(steps, lambda: agent.learn(steps))
@@ -104,7 +105,7 @@ def ceiling(steps: int) -> float:
 def main() -> None:
     """Measure, print, write."""
     given = timing.arguments(__doc__, "loop")
-    repeats, ours, theirs = (1, 2_500, 300) if given.short else (3, 60_000, 4_096)
+    repeats, ours, theirs = (1, 2_500, 256) if given.short else (3, 60_000, 4_096)
     about = timing.machine("torch", "stable-baselines3", "minigrid", "ale-py")
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     with tempfile.TemporaryDirectory() as name:
@@ -125,12 +126,11 @@ def main() -> None:
         quietly("collect", "montezuma", "--out", folder / "rooms.h5", *(x for pair in rooms for x in ("--set", pair)))
         few = ("--set", "steps=2", "--set", "members=1", "--set", "workers=1")
         quietly("train-ensemble", folder / "rooms.h5", "--out", folder / "climbers", *few)
+        climbs = 2_500 if given.short else 10_000
         climbed = timing.alternated(
             {
                 "the emulator's ceiling": lambda: ceiling(1_000),
-                "train-options at a ladder": lambda: climbing(
-                    folder / "climbers", 2_500 if given.short else 10_000, folder
-                ),
+                "train-options at a ladder": lambda: climbing(folder / "climbers", climbs, folder),
             },
             repeats,
         )
