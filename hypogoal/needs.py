@@ -37,8 +37,17 @@ def ensemble_needs(data: Path, config: EnsembleConfig, sub_goals: int, workers: 
     counts = dataset.counts()
     labelled = max((row["states"] for row in counts["labelled"].values()), default=0)
     states = (labelled + counts["unlabelled"]) * prod(dataset.observation_shape)
-    own = BASE + 3 * states + COPIES * config.members * MEMBER
-    return Needs(workers * own, sub_goals * config.members * MEMBER + LOGS)
+    return Needs(workers * ensemble_process(states, config.members), ensemble_disk(sub_goals, config.members))
+
+
+def ensemble_process(states: float, members: int) -> float:
+    """Memory of a process that trains a sub-goal's ensemble on so many bytes of states."""
+    return BASE + 3 * states + COPIES * members * MEMBER
+
+
+def ensemble_disk(sub_goals: int, members: int) -> float:
+    """What an ensemble leaves on the disk."""
+    return sub_goals * members * MEMBER + LOGS
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Needs:

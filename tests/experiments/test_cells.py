@@ -6,7 +6,7 @@ import pytest
 
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Cell, Plan
-from hypogoal.stages.run import EXPERIMENTS, plan
+from hypogoal.stages.sweep import EXPERIMENTS, plan
 
 OUT = Path("somewhere")
 
