@@ -57,10 +57,11 @@ def cost_lines(cells: Sequence[Cell], workers: int, factor: float) -> list[str]:
     seconds, disk = factor * sum(cell.cost.seconds for cell in cells), sum(cell.cost.disk for cell in cells)
     unknown = sum(cell.cost.seconds == 0 and cell.stage != "report" for cell in cells)
     wall = duration(wall_seconds(cells, workers, factor))
-    text = f"{len(cells)} commands: about {duration(seconds)} of one core, {wall} with {workers} at once"
+    told = f"about {duration(seconds)} of one core, {wall} with {workers} at once" if seconds else "time not known"
+    text = f"{len(cells)} commands: {told}"
     text += f", at most {human(disk)} of disk" if disk else ""
-    text += f" ({factor:.2g} times what docs/performance.md's machine takes)"
-    lines.append(text + (f"; {unknown} of unknown length" if unknown else ""))
+    text += f" ({factor:.2g} times what docs/performance.md's machine takes)" if seconds else ""
+    lines.append(text + (f"; {unknown} of unknown length" if unknown and seconds else ""))
     return lines
 
 

@@ -21,12 +21,14 @@ from hypogoal.core.files import plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_cell
+from hypogoal.experiments.results import Number
 
 FORMAT_VERSION = 1
 STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
 KEYS = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
 CELL_KEYS = {"name": str, "command": str, "axes": list, "minutes": (int, float), "memory_gb": (int, float)}
 RESERVED = ("--out", "--force", "--resume")
+TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *Number._fields)  # axes become columns
 MAX_CELLS = 20_000
 MOST = 1e7  # minutes, gigabytes
 MEND = "Mend the file, see docs/formats.md."
@@ -107,7 +109,7 @@ def _check_keys(table: Mapping[str, Any], kinds: Mapping[str, Any], path: Path) 
 
 def _values(name: str, values: Any, path: Path) -> tuple[Value, ...]:
     """An axis: its values make names of folders, so they must be fit for that."""
-    if not name.isidentifier() or name in ("out", "run", "workers", "evaluate"):
+    if not name.isidentifier() or name in TAKEN:
         raise UserError("an axis cannot be called this", repr(name), MEND)
     if isinstance(values, str):
         values = list(parse_integers(values))
@@ -174,7 +176,7 @@ def _cell(group: _Group, point: Mapping[str, Value], groups: Mapping[str, _Group
 
     words = [re.sub(r"\{([^{}]*)\}", filled, word) for word in group.words]
     cost = Cost(60 * group.minutes, 1e9 * group.memory)
-    return stage_cell(_place(group, point, out), out, words, needs, cost, {"cells": group.name, **point})
+    return stage_cell(_place(group, point, out), out, words, needs, cost, {"group": group.name, **point})
 
 
 def _place(group: _Group, point: Mapping[str, Value], out: Path) -> Path:
