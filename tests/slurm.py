@@ -10,6 +10,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from hypogoal.core.workers import die_with_parent
+
 WAIT_SECONDS = 60.0
 MISSING = shutil.which("slurmctld") is None or shutil.which("slurmd") is None
 CONFIGURATION = """
@@ -59,8 +61,11 @@ def cluster(folder: Path, cpus: int = 2, memory: int = 4000, kill_wait: int = 30
     path = folder / "slurm.conf"
     path.write_text(CONFIGURATION.format(**values))
     environment = {**os.environ, "SLURM_CONF": str(path)}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
-    daemons = [subprocess.Popen([name, "-D"], **quiet) for name in ("slurmctld", "slurmd")]  # type: ignore[call-overload]
+    with (folder / "daemons.log").open("w") as log:
+        daemons = [
+            subprocess.Popen([name, "-D"], stdout=log, stderr=log, env=environment, preexec_fn=die_with_parent)
+            for name in ("slurmctld", "slurmd")
+        ]
     try:
         until = time.monotonic() + WAIT_SECONDS
         while (state := told("sinfo", "--noheader", "--format=%t", env=environment)) != "idle":

@@ -19,6 +19,7 @@ from hypogoal.experiments.finished import is_finished
 from hypogoal.experiments.records import read_plan
 
 WARNING = signal.SIGUSR2
+SLOW = "nothing new could be saved before the time limit: give a longer --time, or an earlier --warn"
 SAVED = 128 + signal.SIGTERM  # how a stage ends that was told to stop, and did
 
 
@@ -64,19 +65,18 @@ def run_element(run: Path, name: str) -> None:
     signals.running = start(cell, run, cores=int(processors) if processors.isdigit() else 1)
     signals.tell()  # what came in between
     code = signals.running.process.wait()
+    again = code == SAVED and signals.warned and not signals.stopped
+    if again and (not unfinished(cell.out) or _saved(cell) == before):  # it would come here for ever
+        signals.running.log.write(f"hypogoal: {SLOW}\n".encode())
+        again, code = False, 1
     signals.running.ended(code)
-    if code and signals.warned and not signals.stopped:
-        _again(cell, code, before)
+    if again:
+        _queue_again(cell)
     elif code:
-        raise UserError(f"{name} failed: {reason(run, cell, code)}", None, "")
+        raise UserError(f"{name} failed: {reason(run, cell, code)}")
 
 
-def _again(cell: Cell, code: int, before: list[tuple[str, int]]) -> None:
-    """Queue this job again, if the cell saved anything new: else it would come here for ever."""
-    if code != SAVED or not unfinished(cell.out) or _saved(cell) == before:
-        raise UserError(
-            f"{cell.name} saved nothing before its time limit", cell.out, "Start the sweep again with a longer --time."
-        )
+def _queue_again(cell: Cell) -> None:
     job = os.environ.get("SLURM_JOB_ID", "")
     print(f"{cell.name}: saved, queued again (job {job})", file=sys.stderr, flush=True)
     done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=False)
