@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -108,6 +109,9 @@ def time_left(states: Sequence[State], workers: int, factor: float) -> float | N
             seconds = 0.0
         else:
             return None
+        if told := re.search(r"\([1-9]\d*/s, (\d+) s left\)", one.text):  # what it says itself is nearer
+            left.append(float(told[1]))
+            continue
         spent = one.record.seconds + (time.time() - one.record.started if one.state == RUNNING else 0.0)
         left.append(max(0.0, seconds - spent))
     return max(sum(left) / workers, max(left, default=0.0))

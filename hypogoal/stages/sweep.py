@@ -9,6 +9,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,8 @@ def submit(
     Raises:
         UserError: as of :func:`sweep` and ``slurm.submit``.
     """
+    at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
+    planned = replace(planned, workers=at_once)
     with sole_writer(out):
         _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
         todo = left_of(planned.cells)

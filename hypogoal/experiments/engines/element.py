@@ -77,7 +77,9 @@ def run_element(run: Path, name: str) -> None:
 
 
 def _queue_again(cell: Cell) -> None:
-    job = os.environ.get("SLURM_JOB_ID", "")
+    # By array and element: the last element's own number is the array's too, and would queue all of them again.
+    names = ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID")
+    job = "_".join(os.environ.get(name, "") for name in names)
     print(f"{cell.name}: saved, queued again (job {job})", file=sys.stderr, flush=True)
     done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=False)
     if done.returncode:
