@@ -15,6 +15,7 @@ from slurm import MISSING, cluster, told
 from toy import write_toy
 
 from hypogoal.core.drafts import unfinished
+from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Cell, Cost, Plan
 from hypogoal.experiments.costs import machine_factor
 from hypogoal.experiments.engines.slurm import MOST_ELEMENTS, Options, arrays, submit
@@ -55,9 +56,11 @@ def test_arrays_are_stages_and_wait_for_what_they_need_only() -> None:
     ]
 
 
-SBATCH = """#!/bin/sh
-echo "$@" >> "$(dirname "$0")/asked"
-grep -q refuse "$3" "$2" 2> /dev/null && { echo "sbatch: error: invalid partition" >&2; exit 1; }
+COMMAND = """#!/bin/sh
+echo "$(basename "$0") $*" >> "$(dirname "$0")/asked"
+case "$(tail -n 1 "$(dirname "$0")/asked")" in
+*evaluate.sh) test -e "$(dirname "$0")/full" && { echo "sbatch: error: queue is full" >&2; exit 1; } ;;
+esac
 wc -l < "$(dirname "$0")/asked"
 """
 
@@ -65,7 +68,7 @@ wc -l < "$(dirname "$0")/asked"
 def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G4: partition, time, memory, GPUs, cap, warning; a stand-in for sbatch takes them down."""
     for name in ("sbatch", "scancel"):
-        (tmp_path / name).write_text(SBATCH)
+        (tmp_path / name).write_text(COMMAND)
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     monkeypatch.setattr("hypogoal.experiments.engines.slurm.queued", lambda run: [])
@@ -91,6 +94,11 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         assert f"\n{line}\n" in script, line
     lines = (tmp_path / "asked").read_text().splitlines()
     assert "--dependency=afterany:1 " in lines[2] and "--dependency=afterany:2:3 " in lines[3]
+    (tmp_path / "full").touch()
+    with pytest.raises(UserError, match="queue is full"):
+        submit(plan, out, plan.cells, asked)
+    ended = [line for line in (tmp_path / "asked").read_text().splitlines() if line.startswith("scancel")]
+    assert len(ended) == 3  # what was submitted before
     subprocess.run(["sh", "-n", str(out / "slurm" / "01-train-ensemble.sh")], check=True)
 
 

@@ -14,6 +14,7 @@ from toy import SMALL, write_toy
 
 from hypogoal.cli import main
 from hypogoal.core.drafts import draft_folder, unfinished
+from hypogoal.core.errors import UserError
 from hypogoal.experiments.records import is_running, open_log, read_plan, read_record
 from hypogoal.experiments.status import read_status
 
@@ -162,11 +163,21 @@ def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
         child = subprocess.Popen(["sleep", "600"], stdout=log)
     try:
         assert is_running(run, cell)
+        with pytest.raises(UserError, match="is being run by another process"):
+            open_log(run, cell)
         assert [one.state for one in read_status(run).states] == ["done", "running", "done"]
     finally:
         child.kill()
         child.wait()
     assert not is_running(run, cell)
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_at_random_ends_with_the_same_results(tmp_path: Path) -> None:
+    """Spec G1, G4: ``python -m benchmarks.sweeps`` is the long version."""
+    command = [sys.executable, "-m", "benchmarks.sweeps", "--kills", "4", "--folder", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_long_sweep_asks_first_where_somebody_can_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
