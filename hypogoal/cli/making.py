@@ -59,6 +59,13 @@ def train_ensemble(
     out: Out,
     diversity: Annotated[str | None, typer.Option(help="dbat, divdis, none, or an own one.")] = None,
     members: Annotated[int | None, typer.Option(help="Hypotheses per sub-goal (K).")] = None,
+    unlabelled: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Take the unlabelled states of this data file, or those visited by these options or this "
+            "meta-policy, instead of DATA's; repeatable."
+        ),
+    ] = None,
     preset: Preset = None,
     set_: Set = None,
     seed: Seed = 0,
@@ -75,7 +82,8 @@ def train_ensemble(
         return
     given = {"diversity": diversity, "members": members}
     config = resolve_for(domain_of(data, "data"), TrainEnsembleConfig, "train-ensemble", preset, set_, given)
-    stage(data, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
+    others = tuple(unlabelled or ())
+    stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)
 
 
