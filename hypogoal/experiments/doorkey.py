@@ -23,7 +23,7 @@ PER_BASELINE_STEP = {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45
 PER_MEMBER_STEP = 0.2
 PER_COLLECTION = 15.0
 PER_EVALUATION = 20.0
-REPLAYED = {"ppo": 2_048, "dqn": 50_000}  # steps that an agent on the primitive actions keeps, at the most
+REPLAYED = {"ppo": 2_048, "dqn": 100_000}  # steps that an agent on the primitive actions keeps, at the most
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,9 @@ def is_finished(cell: Cell) -> bool:
     except UserError as error:
         if cell.stage in DERIVED:
             return False
-        raise UserError(str(error), None, "Move it away to have it made again.") from None
+        raise UserError(str(error), None, "Move it out of the run to have it made again.") from None
     if fault and cell.stage not in DERIVED:
-        raise UserError(fault, cell.out, "Move it away to have it made again.")
+        raise UserError(fault, cell.out, "Move it out of the run to have it made again.")
     return not fault
 
 

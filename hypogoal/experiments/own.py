@@ -138,7 +138,7 @@ def _group(row: Any, axes: Mapping[str, Any], known: Mapping[str, _Group], path:
     where = f"cells {name!r} in {path}"
     if not plain_name(name) or not re.fullmatch(r"[\w-]+", name) or name in (*known, *axes, "evaluation", "report"):
         raise UserError("cells need a name of their own, of letters, digits, - and _", where, MEND)
-    if not all(axis in axes for axis in own) or len({*own}) != len(own):
+    if not all(isinstance(axis, str) and axis in axes for axis in own) or len({*own}) != len(own):
         raise UserError("cells over an axis that is not there", where, MEND)
     try:
         words = tuple(shlex.split(command))

@@ -80,6 +80,7 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
     ]
     script = (out / "slurm" / "01-train-ensemble.sh").read_text()
     for line in (
+        "#SBATCH --job-name=a-run-01-train-ensemble",
         "#SBATCH --array=0-2%7",
         "#SBATCH --partition=long",
         "#SBATCH --time=4:00:00",
@@ -100,6 +101,14 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
     ended = [line for line in (tmp_path / "asked").read_text().splitlines() if line.startswith("scancel")]
     assert len(ended) == 3  # what was submitted before
     subprocess.run(["sh", "-n", str(out / "slurm" / "01-train-ensemble.sh")], check=True)
+
+
+def test_without_slurm_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G2: one line, nothing written."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match="there is no Slurm here"):
+        submit(some_plan(), tmp_path / "out", some_plan().cells, Options())
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.fixture(scope="module")

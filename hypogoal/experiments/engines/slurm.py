@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import getpass
 import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -137,7 +138,7 @@ def _check(options: Options) -> None:
 def _head(run: Path, name: str, options: Options) -> list[str]:
     lines = [
         "#!/bin/sh",
-        f"#SBATCH --job-name={name}",
+        f"#SBATCH --job-name={re.sub(r'[^A-Za-z0-9_.-]', '-', run.name)}-{name}",
         f"#SBATCH --output={shlex.quote(str((run / FOLDER).resolve()))}/%x-%A-%a.out",
         "#SBATCH --open-mode=append",
     ]
