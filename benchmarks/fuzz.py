@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -54,6 +55,17 @@ PRESET = {
     "train-baseline": {"agent": "ppo", "setting": "tuned"},
     "run": {"layout_seeds": [100, 101], "seeds": [0], "controls": ["random"]},
 }
+OWN = """
+format = 1
+evaluate = false
+workers = 2
+axes = { seed = [0, 1], layout = "210-211" }
+cells = [
+  { name = "data", command = "collect doorkey --set heldout_layouts=1" },
+  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}", minutes = 1.5 },
+  { name = "ppo", axes = ["seed", "layout"], command = "train-baseline doorkey --layout-seed {layout}" },
+]
+"""
 
 
 def make_seeds(root: Path) -> None:
@@ -290,7 +302,7 @@ def fuzz_tables(box: Sandbox, rng: Rng, case: int) -> bool:
 
 def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
     from hypogoal.core.config import resolve
-    from hypogoal.stages.run import EXPERIMENTS, STAGES, config_class_of, plan
+    from hypogoal.stages.sweep import EXPERIMENTS, STAGES, config_class_of, plan
 
     path = box.case / "own.toml"
     text = toml_of(tree_changed(PRESET, rng, box.odd), rng).encode(errors="surrogatepass")
@@ -311,12 +323,35 @@ def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
     return tolerated(*stages, *runs)
 
 
+def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
+    """An own experiment, and the plan and the records that a sweep leaves."""
+    from hypogoal.experiments.own import own_plan
+    from hypogoal.experiments.records import PLAN, write_plan
+    from hypogoal.experiments.status import lines, read_status
+
+    own, run = box.case / "own.toml", box.out / "run"
+    own.write_text(OWN, encoding="utf-8")
+    if rng.random() < 0.5:
+        text = toml_of(tree_changed(tomllib.loads(OWN), rng, box.odd), rng).encode(errors="surrogatepass")
+        own.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
+        return tolerated(lambda: own_plan(own, run, ["seed=0-2"] if case % 2 else []))
+    write_plan(run, own_plan(own, run), 1.0)
+    (run / "logs").mkdir(exist_ok=True)
+    (run / "logs" / "data.log").write_text("started\n", encoding="utf-8")
+    record = json.dumps({"attempts": 1, "seconds": 2.0, "code": 2, "started": 0.0, "host": "here"}).encode()
+    (run / "logs" / "data.json").write_bytes(json_changed(record, rng, box.odd))
+    plan = (run / PLAN).read_bytes()
+    (run / PLAN).write_bytes(json_changed(plan, rng, box.odd) if rng.random() < 0.8 else plan)
+    return tolerated(lambda: lines(read_status(run)), partial(command, "sweep", "--out", run, "--gather"))
+
+
 FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {
     "manifest": fuzz_manifest,
     "hdf5": fuzz_hdf5,
     "safetensors": fuzz_safetensors,
     "tables": fuzz_tables,
     "toml": fuzz_toml,
+    "sweep": fuzz_sweep,
 }
 DEBUG = False
 

@@ -31,7 +31,7 @@ def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
     from hypogoal.core.config import describe
     from hypogoal.domains.base import BUILT_IN, defaults_of
-    from hypogoal.stages.run import STAGES, config_class_of
+    from hypogoal.stages.sweep import STAGES, config_class_of
 
     lines = [
         "# Settings",

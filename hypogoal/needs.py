@@ -41,9 +41,18 @@ def ensemble_needs(
     labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
     others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
     states = (labelled + others) * prod(dataset.observation_shape)
-    training = COPIES * config.members * MEMBER
-    own = BASE + 3 * states + training
-    return Needs(workers * own, sub_goals * (config.members * MEMBER + training) + CHECKPOINTS * training + LOGS)
+    return Needs(workers * ensemble_process(states, config.members), ensemble_disk(sub_goals, config.members))
+
+
+def ensemble_process(states: float, members: int) -> float:
+    """Memory of a process that trains a sub-goal's ensemble on so many bytes of states."""
+    return BASE + 3 * states + COPIES * members * MEMBER
+
+
+def ensemble_disk(sub_goals: int, members: int) -> float:
+    """What an ensemble needs on the disk, its checkpoints included."""
+    training = COPIES * members * MEMBER
+    return sub_goals * (members * MEMBER + training) + CHECKPOINTS * training + LOGS
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Needs:

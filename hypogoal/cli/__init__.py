@@ -14,11 +14,11 @@ from typing import Annotated
 
 import typer
 
-from hypogoal.cli import making, showing
+from hypogoal.cli import making, showing, sweeping
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import NumericalError, UserError
 
-__all__ = ["app", "main", "making", "showing"]
+__all__ = ["app", "main", "making", "showing", "sweeping"]
 
 
 def _version(value: bool) -> None:
@@ -36,7 +36,10 @@ def _root(
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """Stages: collect, train-ensemble, train-options, train-meta, evaluate, report; 'run' chains them."""
+    """Stages: collect, train-ensemble, train-options, train-meta, evaluate, report.
+
+    'run' chains them, 'sweep' runs them over seeds, layouts, ladders and methods.
+    """
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The commands that make something: one stage each, and ``run``, which chains them."""
+"""The commands that make something: one stage each."""
 
 from __future__ import annotations
 
@@ -234,32 +234,3 @@ def compare(
     from hypogoal.stages.compare import compare as stage
 
     typer.echo(stage(runs, out, force=force))
-
-
-@app.command()
-def run(
-    experiment: Annotated[str, typer.Argument(help="doorkey or montezuma-ladders.")],
-    out: Out,
-    preset: Preset = None,
-    set_: Set = None,
-    force: Force = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
-    quiet: Quiet = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")] = False,
-) -> None:
-    """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
-    import json
-
-    from hypogoal.stages.evaluate import summary_table
-    from hypogoal.stages.run import plan
-    from hypogoal.stages.run import run as stage
-
-    planned = plan(experiment, out, preset=preset, assignments=set_ or ())
-    if dry_run:
-        for cell in planned.cells:
-            typer.echo(cell.text)
-        typer.echo(planned.cost(), err=True)
-        return
-    stage(planned, out, force=force, resume=resume, quiet=quiet)
-    print_table(summary_table(json.loads((out / "evaluation" / "metrics.json").read_text(encoding="utf-8"))))
-    typer.echo(out / "report" / "index.html")

@@ -76,7 +76,7 @@ def config(
     """Every setting of a stage: default, unit, meaning, source."""
     from hypogoal.core.config import describe
     from hypogoal.domains.base import defaults_of
-    from hypogoal.stages.run import config_class_of
+    from hypogoal.stages.sweep import config_class_of
 
     rows = describe(config_class_of(stage, domain), defaults_of(domain, stage, given=True))
     if as_json:

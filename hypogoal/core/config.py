@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
@@ -22,6 +23,7 @@ from hypogoal.core.files import read_text
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
+MAX_RANGE = 10_000  # integers that one range may stand for
 DOMAIN = "doorkey"  # whose presets and defaults hold where no domain is said
 
 
@@ -186,10 +188,35 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
     return parsed
 
 
+def parse_integers(text: str) -> list[int]:
+    """``0-3,7`` -> ``[0, 1, 2, 3, 7]``.
+
+    Raises:
+        UserError: it says something else.
+    """
+    try:
+        return [int(number) for item in text.split(",") for number in _range(item)]
+    except ValueError:
+        raise UserError("these are no integers", repr(text[:200]), "Write them as 0-3,7.") from None
+
+
+def _range(item: Any) -> Iterable[Any]:
+    """The integers of ``3-7``; anything else is itself."""
+    match = re.fullmatch(r"\s*(\d{1,9})-(\d{1,9})\s*", item) if isinstance(item, str) else None
+    if match is None:
+        return (item,)
+    first, last = int(match[1]), int(match[2])
+    if not first <= last < first + MAX_RANGE:
+        raise ValueError
+    return range(first, last + 1)
+
+
 def _parse(kind: Any, value: Any) -> Any:
     if typing.get_origin(kind) is tuple:
         (item_kind, *_rest) = typing.get_args(kind)
         items = value.split(",") if isinstance(value, str) else value
+        if item_kind is int:
+            items = [number for item in items for number in _range(item)]
         return tuple(_parse(item_kind, item.strip() if isinstance(item, str) else item) for item in items if item != "")
     if kind is bool:
         if isinstance(value, bool):

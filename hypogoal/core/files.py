@@ -6,6 +6,7 @@ Sizes are looked at before anything is read, names before anything is opened. De
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
 
@@ -95,6 +96,16 @@ def _check_depth(value: Any) -> None:
         if not level:
             return
     raise RecursionError
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all: a reader finds what was there before, or ``text``."""
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        fresh.write_text(text, encoding="utf-8")
+        fresh.replace(path)
+    finally:
+        fresh.unlink(missing_ok=True)
 
 
 def plain_name(name: object) -> bool:

@@ -12,7 +12,15 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import TypeVar
 
 T = TypeVar("T")
+CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
 PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
+
+
+def cores() -> int:
+    """How many cores this process may use: those the system gives it, or fewer where ``HYPOGOAL_CORES`` says so."""
+    given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    told = os.environ.get(CORES, "")
+    return max(1, min(given, int(told))) if told.isdigit() else given
 
 
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:

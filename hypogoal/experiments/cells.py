@@ -3,13 +3,34 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
-from hypogoal.core.artefacts import MANIFEST
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name
+
+Axes = tuple[tuple[str, str | int | float], ...]
+
+
+class Cost(NamedTuple):
+    """What a cell costs, estimated; 0 where that is not known.
+
+    Attributes:
+        seconds: on one core like that of docs/performance.md.
+        memory: bytes, of each of its processes.
+        disk: bytes that it leaves behind or needs on the way.
+        cores: processes that it can use.
+    """
+
+    seconds: float = 0.0
+    memory: float = 0.0
+    disk: float = 0.0
+    cores: int = 1
+
+
+UNKNOWN = Cost()
 
 
 @dataclass(frozen=True)
@@ -21,62 +42,81 @@ class Cell:
         arguments: of ``hypogoal``, without ``--force``.
         out: what it writes.
         needs: outputs of other cells that must be complete first.
-        seconds: what it costs, on one core like that of docs/performance.md; 0 where that is not known.
+        cost: what it takes.
+        axes: where it stands in the experiment: seed, method, ... with its value; columns of ``results.csv``.
     """
 
     name: str
     arguments: tuple[str, ...]
     out: Path
     needs: tuple[Path, ...] = ()
-    seconds: float = 0.0
+    cost: Cost = UNKNOWN
+    axes: Axes = ()
+
+    @property
+    def stage(self) -> str:
+        """Its command: train-meta, ..."""
+        return self.arguments[0]
 
     @property
     def text(self) -> str:
         """The command as one would type it."""
         return shlex.join(("hypogoal", *self.arguments))
 
-    def complete(self) -> bool:
-        """Whether its output is there; what has a manifest, and a data file under its name, is whole."""
-        return (self.out / MANIFEST).is_file() if self.out.suffix != ".h5" else self.out.is_file()
-
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment's cells, in an order in which they can run, and how many run at once."""
+    """An experiment's cells, in an order in which they can run, and how many cores they may use at once."""
 
+    experiment: str
     cells: list[Cell]
     workers: int
 
-    def cost(self, cells: Sequence[Cell] | None = None) -> str:
-        """How many of the plan's cells (all, or those given) there are to run, and for how long."""
-        some = self.cells if cells is None else cells
-        seconds = sum(cell.seconds for cell in some)
-        longest = max((cell.seconds for cell in some), default=0.0)
-        wall = max(seconds / self.workers, longest)
-        time = f"about {_duration(seconds)} of one core, {_duration(wall)} with {self.workers} at once"
-        return f"{len(some)} commands, {time} (rates of a 2.5 GHz core, docs/performance.md)"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90 * 60:
-        return f"{max(1, round(seconds / 60))} min"
-    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} days"
-
 
 def stage_cell(
-    out: Path, run: Path, arguments: Sequence[str], needs: Sequence[Path] = (), seconds: float = 0.0
+    out: Path,
+    run: Path,
+    arguments: Sequence[str],
+    needs: Sequence[Path] = (),
+    cost: Cost = UNKNOWN,
+    axes: Mapping[str, str | int | float] | None = None,
 ) -> Cell:
     """The cell of a stage that writes ``out`` within the run's folder; its name is its place there."""
     if not all(map(plain_name, out.relative_to(run).parts)):
         raise UserError("this would be written outside the run", out, "Leave separators and dots out of names.")
     name = out.relative_to(run).with_suffix("").as_posix().replace("/", "-")
-    return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), seconds)
+    if not plain_name(f"{name}.json"):
+        raise UserError("this name is too long for a file", name, "Choose shorter ones.")
+    return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), cost, tuple((axes or {}).items()))
 
 
-def closing_cells(run: Path, needs: Sequence[Path], seconds: float = 0.0) -> list[Cell]:
-    """Evaluate (which takes ``seconds``) and report, when everything else is there."""
+def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> list[Cell]:
+    """Evaluate (which takes ``cost``) and report, when everything else is there."""
     evaluation = run / "evaluation"
     return [
-        Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs), seconds),
-        Cell("report", ("report", str(run)), run / "report", (evaluation,)),
+        Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs), cost),
+        Cell("report", ("report", str(run)), run / "report", (evaluation,), cost._replace(seconds=0.0)),
     ]
+
+
+def moved(cell: Cell, here: str, there: str) -> Cell:
+    """The cell of the same run in another place: ``here`` is what its paths begin with now."""
+
+    def part(text: str) -> str:
+        inside = text == here or text.startswith(f"{here}/")
+        return there + text[len(here) :] if inside else text
+
+    return replace(
+        cell,
+        arguments=tuple(map(part, cell.arguments)),
+        out=Path(part(str(cell.out))),
+        needs=tuple(Path(part(str(need))) for need in cell.needs),
+    )
+
+
+def depths(cells: Sequence[Cell]) -> dict[Path, int]:
+    """How many cells come before each, at least, by what it writes: 0 for those that need nothing."""
+    found: dict[Path, int] = {}
+    for cell in cells:
+        found[cell.out] = 1 + max((found[need] for need in cell.needs), default=-1)
+    return found

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import prod
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import setting
-from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
+from hypogoal.domains.base import load_domain
+from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell
+from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "doorkey"
 STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
@@ -18,7 +21,9 @@ STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-bas
 PER_STEP = {"light": 1e-3, "paper": 65e-3}
 PER_BASELINE_STEP = {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45e-3, "dqn-tuned": 0.3e-3}
 PER_MEMBER_STEP = 0.2
+PER_COLLECTION = 15.0
 PER_EVALUATION = 20.0
+REPLAYED = {"ppo": 2_048, "dqn": 100_000}  # steps that an agent on the primitive actions keeps, at the most
 
 
 @dataclass(frozen=True)
@@ -51,25 +56,36 @@ def cells(
         resolved: by stage, its configuration.
         common: by stage, the arguments that brought that configuration about.
     """
+    domain = load_domain(DOMAIN)
     single = len(config.layout_seeds) * len(config.seeds) == 1
     data = out / "data.h5"
-    planned = [stage_cell(data, out, ("collect", DOMAIN, *common["collect"]))]
     ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
+    states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
+    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_layouts=0))  # type: ignore[attr-defined]
+    collecting = Cost(PER_COLLECTION, BASE + 2 * states, states)
+    planned = [stage_cell(data, out, ("collect", DOMAIN, *common["collect"]), cost=collecting)]
+    goals = len(ensemble.sub_goals or domain.sub_goals)
+    about = {"sub_goals": ensemble.sub_goals or domain.sub_goals, "members": ensemble.members}
+    played = play_needs(domain, about, play)
     spent = resolved["train-options"].steps if config.pretrain else 0
     steps = spent + play.steps
     budget = str(steps)
     agents: list[Path] = []
 
     def add(
-        name: str, arguments: Sequence[str], seed: int, layout: int | None, needs: tuple[Path, ...], seconds: float
+        name: str, arguments: Sequence[str], seed: int, layout: int | None, needs: tuple[Path, ...], cost: Cost
     ) -> Path:
         place = name if single else f"{name}/seed-{seed}" if layout is None else f"{name}/layout-{layout}-seed-{seed}"
         at = ("--seed", str(seed), *(("--layout-seed", str(layout)) if layout is not None else ()))
         stage = arguments[0]
-        planned.append(stage_cell(out / place, out, (*arguments, *common[stage], *at), needs, seconds))
+        axes: dict[str, str | int | float] = {"agent": name, "seed": seed}
+        axes |= {} if layout is None else {"layout_seed": layout}
+        planned.append(stage_cell(out / place, out, (*arguments, *common[stage], *at), needs, cost, axes))
         return out / place
 
-    training = PER_MEMBER_STEP * ensemble.members * ensemble.steps
+    process = ensemble_process(taught, ensemble.members)
+    seconds = PER_MEMBER_STEP * ensemble.members * ensemble.steps
+    training = Cost(seconds, process, ensemble_disk(goals, ensemble.members), min(ensemble.workers or goals, goals))
     ensembles = {
         seed: add("ensemble", ("train-ensemble", str(data)), seed, None, (data,), training) for seed in config.seeds
     }
@@ -80,21 +96,28 @@ def cells(
         needs: tuple[Path, ...] = (source,)
         if config.pretrain:
             options = add(
-                "options", ("train-options", str(source)), seed, layout, (source,), spent * PER_STEP[play.network]
+                "options",
+                ("train-options", str(source)),
+                seed,
+                layout,
+                (source,),
+                Cost(spent * PER_STEP[play.network], *played),
             )
             extra, needs = ("--options", str(options)), (source, options)
-        costs = play.steps * PER_STEP[play.network]
+        costs = Cost(play.steps * PER_STEP[play.network], *played)
         agents.append(add("meta", ("train-meta", str(source), *extra), seed, layout, needs, costs))
     for control in config.controls:
         change = "chooser=random" if control == "random" else "termination=oracle"
         for layout, seed in cases:
             arguments = ("train-meta", str(ensembles[seed]), "--set", change, "--set", f"steps={budget}")
-            costs = steps * PER_STEP[play.network]
+            costs = Cost(steps * PER_STEP[play.network], *played)
             agents.append(add(f"meta-{control}", arguments, seed, layout, (ensembles[seed],), costs))
     for baseline in config.baselines:
         agent, _, kind = baseline.partition("-")
         for layout, seed in cases:
             arguments = ("train-baseline", DOMAIN, "--agent", agent, "--set", f"setting={kind}")
-            costs = steps * PER_BASELINE_STEP[baseline]
+            picture = prod(domain.observation_shape)
+            costs = Cost(steps * PER_BASELINE_STEP[baseline], *baseline_needs(picture, REPLAYED[agent]))
             agents.append(add(baseline, (*arguments, "--set", f"steps={budget}"), seed, layout, (), costs))
-    return planned + closing_cells(out, (*ensembles.values(), *agents), PER_EVALUATION * len(ensembles))
+    evaluating = Cost(PER_EVALUATION * len(ensembles), BASE + 300e6 + 2 * states, 2 * LOGS)
+    return planned + closing_cells(out, (*ensembles.values(), *agents), evaluating)

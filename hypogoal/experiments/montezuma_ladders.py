@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import as_dict, from_values, parse_assignments, setting
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import load_domain
 from hypogoal.domains.montezuma_ladders import ladder_named
-from hypogoal.experiments.cells import Cell, closing_cells, stage_cell
+from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.needs import BASE, LOGS, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "montezuma"
 STAGES = ("collect", "train-ensemble", "train-options")
@@ -20,6 +22,7 @@ STAGES = ("collect", "train-ensemble", "train-options")
 # What things cost on one core of the machine of docs/performance.md: seconds per collection, per gradient step of a
 # member, per localiser learned, per environment step of an option, per member that is evaluated.
 PER_COLLECTION = 30.0
+PLAYING = 6  # rooms that a collection plays in at once, at the most
 PER_MEMBER_STEP = {"montezuma": 0.11, "montezuma-crop": 0.01}
 PER_LOCALISER = 90.0
 PER_STEP = {"light": 2.5e-3, "paper": 4.0}
@@ -101,24 +104,43 @@ def cells(
     made: list[Path] = []
 
     ensemble, play = resolved["train-ensemble"], resolved["train-options"]
-    variants = {variant: _changed(ensemble, variant) for variant in ("", *config.variants)}
+    variants: dict[str, Any] = {variant: _changed(ensemble, variant) for variant in ("", *config.variants)}
     members = {method: 1 if method == "cnn" else ensemble.members for method in METHODS}
     option = play.steps * PER_STEP[play.network]
     evaluated = 0
 
-    def add(place: str, arguments: tuple[str, ...], seconds: float, needs: tuple[Path, ...] = ()) -> Path:
-        planned.append(stage_cell(out / place, out, (*arguments, *common[arguments[0]]), needs, seconds))
+    domain = load_domain(DOMAIN)
+    states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
+    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_per_room=0))  # type: ignore[attr-defined]
+    goals = len(ensemble.sub_goals or domain.sub_goals)
+    collecting = Cost(PER_COLLECTION, BASE + 2 * states / PLAYING, states, resolved["collect"].workers or PLAYING)
+
+    def add(
+        place: str, arguments: tuple[str, ...], axes: dict[str, Any], cost: Cost, needs: tuple[Path, ...] = ()
+    ) -> Path:
+        planned.append(stage_cell(out / place, out, (*arguments, *common[arguments[0]]), needs, cost, axes))
         return out / place
 
+    def training(method: str, variant: str) -> Cost:
+        settings, count = variants[variant], members[method]
+        cores = min(settings.workers or goals, goals)
+        return Cost(_training(settings, count), ensemble_process(taught, count), ensemble_disk(goals, count), cores)
+
+    def learning(method: str, seconds: float) -> Cost:
+        about = {"sub_goals": domain.sub_goals, "members": members[method]}
+        return Cost(seconds, *play_needs(domain, about, play))
+
     for groups in config.groups:
-        data = add(f"data/groups-{groups}.h5", ("collect", DOMAIN, "--set", f"groups={groups}"), PER_COLLECTION)
+        collect = ("collect", DOMAIN, "--set", f"groups={groups}")
+        data = add(f"data/groups-{groups}.h5", collect, {"groups": groups}, collecting)
         for method, variant, seed in product(config.methods, ("", *config.variants), config.seeds):
             named = ",".join([method, *variant.split()])
             place = f"ensemble/{named}/groups-{groups}-seed-{seed}"
             settings = (part for change in variant.split() for part in ("--set", change))
             arguments = ("train-ensemble", str(data), *METHODS[method], *settings, "--seed", str(seed))
             evaluated += members[method]
-            made.append(add(place, arguments, _training(variants[variant], members[method]), (data,)))
+            axes = {"method": method, "variant": variant, "groups": groups, "seed": seed}
+            made.append(add(place, arguments, axes, training(method, variant), (data,)))
     for ladder in config.ladders:
         for seed in config.seeds:
             for groups in config.option_groups:
@@ -127,12 +149,15 @@ def cells(
                     place = f"options/{method}/groups-{groups}-ladder-{ladder}-seed-{seed}"
                     arguments = ("train-options", str(source), "--set", f"start={ladder}", "--seed", str(seed))
                     options = members[method] if play.steps_for == "each" else 1
-                    made.append(add(place, arguments, option * options, (source,)))
+                    axes = {"method": method, "groups": groups, "ladder": ladder, "seed": seed}
+                    made.append(add(place, arguments, axes, learning(method, option * options), (source,)))
             if config.oracle and config.option_groups and config.option_methods:
                 first = f"{config.option_methods[0]}/groups-{config.option_groups[0]}-seed-{seed}"
                 source = out / f"ensemble/{first}"
                 changes = ("--set", f"start={ladder}", "--set", "termination=oracle")
                 place = f"options/oracle/ladder-{ladder}-seed-{seed}"
                 arguments = ("train-options", str(source), *changes, "--seed", str(seed))
-                made.append(add(place, arguments, option, (source,)))
-    return planned + closing_cells(out, made, PER_EVALUATED_MEMBER * evaluated)
+                axes = {"method": "oracle", "ladder": ladder, "seed": seed}
+                made.append(add(place, arguments, axes, learning("cnn", option), (source,)))
+    evaluating = Cost(PER_EVALUATED_MEMBER * evaluated, BASE + 300e6 + 2 * states, 2 * LOGS)
+    return planned + closing_cells(out, made, evaluating)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +19,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.workers import in_processes
+from hypogoal.core.workers import cores, in_processes
 from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.storage import write_ensemble
@@ -81,7 +80,7 @@ def train_ensemble(
         "domain": dataset.domain,
         "domain_config": dataset.config,
     }
-    workers = min(config.workers or os.cpu_count() or 1, len(sub_goals))
+    workers = min(config.workers or cores(), len(sub_goals))
     preflight(
         "train-ensemble", out, ensemble_needs(data, others or (data,), config, len(sub_goals), workers), quiet=quiet
     )

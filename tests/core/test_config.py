@@ -12,7 +12,7 @@ import hypogoal
 from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import defaults_of
-from hypogoal.stages.run import STAGES, config_class_of
+from hypogoal.stages.sweep import STAGES, config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from hypogoal.core.errors import UserError
-from hypogoal.experiments.cells import Cell, Plan
-from hypogoal.stages.run import EXPERIMENTS, plan
+from hypogoal.experiments.cells import Cell, Cost, depths, moved
+from hypogoal.experiments.costs import cost_lines
+from hypogoal.stages.sweep import EXPERIMENTS, plan
 
 OUT = Path("somewhere")
 
@@ -74,8 +75,45 @@ def test_a_ladders_experiment_that_cannot_be_is_told_in_one_line(changes: list[s
 
 
 def test_the_cost_is_that_of_the_cells_given_shared_among_the_workers() -> None:
-    """Two workers halve it, but never below the longest cell."""
-    cells = [Cell(str(n), (), OUT / str(n), (), seconds) for n, seconds in enumerate((3600.0, 3600.0, 7200.0))]
-    assert Plan(cells, 2).cost().startswith("3 commands, about 4.0 h of one core, 2.0 h with 2 at once")
-    assert Plan(cells, 4).cost().startswith("3 commands, about 4.0 h of one core, 2.0 h with 4 at once")
-    assert Plan(cells, 2).cost(cells[:1]).startswith("1 commands, about 60 min of one core, 60 min")
+    """Spec G4: two workers halve it, but never below the longest cell; a slower machine takes longer."""
+    cells = [
+        Cell(str(n), ("collect",), OUT / str(n), (), Cost(seconds, 2e9, 1e9))
+        for n, seconds in enumerate((3600, 3600, 7200))
+    ]
+    assert cost_lines(cells, 2, 1.0)[-1].startswith("3 commands: about 4.0 h of one core, 2.0 h with 2 at once")
+    assert cost_lines(cells, 4, 1.5)[-1].startswith("3 commands: about 6.0 h of one core, 3.0 h with 4 at once")
+    assert "at most 3.0 GB of disk" in cost_lines(cells, 4, 1.0)[-1]
+    assert cost_lines(cells, 4, 1.0)[0].split()[:5] == ["collect", "3", "x", "80", "min,"]
+    unknown = [Cell("x", ("collect",), OUT / "x")]
+    assert cost_lines(unknown, 2, 1.0)[-1] == "1 commands: time not known"
+
+
+def test_every_cell_of_a_named_experiment_has_a_cost_and_a_place() -> None:
+    """Spec G4: time, memory and disk of each, and axes that tell all cells of a stage apart."""
+    for experiment, changes in (("figure6", []), ("montezuma-ladders", ["ladders=1L", "variants=jitter=1"])):
+        cells = plan(experiment, OUT, assignments=changes).cells
+        assert all(cell.cost.seconds > 0 and cell.cost.memory > 0 and cell.cost.disk > 0 for cell in cells[:-1])
+        trained = [(cell.stage, cell.axes) for cell in cells if cell.stage.startswith("train")]
+        assert len(set(trained)) == len(trained)
+
+
+def test_the_papers_figures_are_experiments() -> None:
+    """Spec E4, F1, F3, F5: each with its preset; seeds and layouts as ranges."""
+    figure = plan("figure6", OUT).cells
+    assert figure == plan("doorkey", OUT, preset="figure6").cells
+    assert plan("figure3", OUT).cells == plan("montezuma-ladders", OUT, preset="figure3").cells
+    assert plan("figure4", OUT).cells == plan("montezuma-ladders", OUT, preset="figure4").cells
+    ten = plan("figure6", OUT, seeds="0", assignments=["layout_seeds=210-219"]).cells
+    agents = [cell for cell in ten if cell.stage == "train-meta" and dict(cell.axes)["agent"] == "meta"]
+    assert [dict(cell.axes)["layout_seed"] for cell in agents] == [*range(210, 220)]
+
+
+def test_a_moved_cell_is_the_same_in_another_place() -> None:
+    """Paths that begin with the run's folder move, others and folders of a similar name do not."""
+    cell = Cell("a", ("train-meta", "runs/x/a", "runs/xy", "--out", "runs/x"), Path("runs/x/b"), (Path("runs/x/a"),))
+    there = moved(cell, "runs/x", "{run}")
+    assert there.arguments == ("train-meta", "{run}/a", "runs/xy", "--out", "{run}")
+    assert (there.out, there.needs) == (Path("{run}/b"), (Path("{run}/a"),))
+    assert moved(there, "{run}", "runs/x") == cell
+    depth = depths([Cell("a", ("x",), OUT / "a"), Cell("b", ("x",), OUT / "b", (OUT / "a",))])
+    assert [*depth.values()] == [0, 1]

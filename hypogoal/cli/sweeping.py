@@ -1,0 +1,149 @@
+"""Many cells with one command: ``run`` chains the stages, ``sweep`` runs experiments here or by Slurm (Spec A6, G4)."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hypogoal.cli.common import AsJson, Force, Out, Preset, Quiet, Set, app, echo, print_table
+
+DryRun = Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")]
+SLURM = "Slurm (with --engine slurm)"
+
+
+@app.command()
+def run(
+    experiment: Annotated[str, typer.Argument(help="doorkey or montezuma-ladders.")],
+    out: Out,
+    preset: Preset = None,
+    set_: Set = None,
+    force: Force = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
+    quiet: Quiet = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
+    import json
+
+    from hypogoal.stages.evaluate import summary_table
+    from hypogoal.stages.sweep import plan
+    from hypogoal.stages.sweep import run as stage
+
+    out = _folder(out)
+    planned = plan(experiment, out, preset=preset, assignments=set_ or ())
+    if dry_run:
+        _list(planned)
+        return
+    stage(planned, out, force=force, resume=resume, quiet=quiet)
+    metrics = out / "evaluation" / "metrics.json"
+    if not metrics.is_file():
+        typer.echo(out / "results.csv")
+        return
+    print_table(summary_table(json.loads(metrics.read_text(encoding="utf-8"))))
+    typer.echo(out / "report" / "index.html")
+
+
+@app.command()
+def sweep(
+    out: Annotated[Path, typer.Option("--out", help="The sweep's folder. Started again on it, a sweep goes on.")],
+    experiment: Annotated[
+        str | None,
+        typer.Argument(help="doorkey, montezuma-ladders, figure3, figure4, figure6, or an own .toml file."),
+    ] = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seeds: Annotated[str | None, typer.Option(help="The run seeds: 0-9, or 0,3,7.")] = None,
+    engine: Annotated[str, typer.Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
+    dry_run: DryRun = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
+    status: Annotated[bool, typer.Option("--status", help="Only say how far it is.")] = False,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Only end its jobs in Slurm; they save first.")] = False,
+    gather: Annotated[bool, typer.Option("--gather", help="Only write results.csv of what is done.")] = False,
+    cell: Annotated[str | None, typer.Option(hidden=True, help="Only this cell, within a Slurm job.")] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    partition: Annotated[str, typer.Option(rich_help_panel=SLURM, help="As sbatch's.")] = "",
+    time: Annotated[str, typer.Option(rich_help_panel=SLURM, help="Limit of a cell, as sbatch's: 4:00:00.")] = "",
+    memory: Annotated[
+        str, typer.Option(rich_help_panel=SLURM, help="Of a cell, as sbatch's --mem; else estimated.")
+    ] = "",
+    cpus: Annotated[int, typer.Option(min=0, rich_help_panel=SLURM, help="Of a cell; 0: what it can use.")] = 0,
+    gpus: Annotated[int, typer.Option(min=0, rich_help_panel=SLURM, help="Of a cell.")] = 0,
+    cap: Annotated[int, typer.Option(min=0, rich_help_panel=SLURM, help="Cells of an array that run at once.")] = 0,
+    warn: Annotated[
+        int,
+        typer.Option(min=1, max=65535, rich_help_panel=SLURM, help="Seconds before its limit at which a cell saves."),
+    ] = 120,
+    sbatch: Annotated[
+        list[str] | None,
+        typer.Option(rich_help_panel=SLURM, help="Another option for sbatch, as --sbatch=--account=x; repeatable."),
+    ] = None,
+) -> None:
+    """Run every cell of an experiment that is not finished: seeds, layouts, ladders, methods.
+
+    --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
+    """
+    out = _folder(out)
+    if cell is not None:
+        from hypogoal.experiments.engines.element import run_element
+
+        run_element(out, cell)
+        return
+    if status:
+        from hypogoal.experiments.status import as_json as status_json
+        from hypogoal.experiments.status import lines, read_status
+
+        found = read_status(out)
+        echo(status_json(found), as_json, lines(found))
+        return
+    if cancel:
+        from hypogoal.experiments.engines.slurm import cancel as end
+
+        typer.echo(f"{end(out)} jobs ended; the same command as before goes on", err=True)
+        return
+
+    from hypogoal.core.errors import UserError
+    from hypogoal.experiments.engines.slurm import Options
+    from hypogoal.stages import sweep as stage
+
+    if gather:
+        typer.echo(stage.gather(out))
+        return
+    if experiment is None:
+        raise UserError("which experiment?", "hypogoal sweep", "See 'hypogoal sweep --help'.")
+    if engine not in ("local", "slurm"):
+        raise UserError("unknown engine", engine, "Choose local or slurm.")
+    planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds)
+    if dry_run:
+        _list(planned)
+        return
+    ask = None if yes or not sys.stdin.isatty() else _confirm
+    if engine == "local":
+        typer.echo(stage.sweep(planned, out, quiet=quiet, confirm=ask))
+        return
+    options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
+    for job in stage.submit(planned, out, options, quiet=quiet, confirm=ask):
+        typer.echo(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
+    typer.echo(out)
+
+
+def _folder(out: Path) -> Path:
+    """The folder by a name of its own, also where it was called ``.``: what belongs to it is named after it."""
+    return out if out.name and ".." not in out.parts else out.resolve()
+
+
+def _list(planned: Any) -> None:
+    from hypogoal.experiments.costs import cost_lines, machine_factor
+
+    for cell in planned.cells:
+        typer.echo(cell.text)
+    for line in cost_lines(planned.cells, planned.workers, machine_factor()):
+        typer.echo(line, err=True)
+
+
+def _confirm(cost: str) -> None:
+    if not typer.confirm(f"{cost}. Begin?", err=True):
+        raise typer.Exit(1)

@@ -1,0 +1,117 @@
+"""The cells on this machine: as many at once as cores and memory allow (Spec G4)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.preflight import free_memory
+from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.experiments.engines.running import Running, start
+from hypogoal.experiments.finished import is_finished
+from hypogoal.experiments.records import last_line, log_of
+
+POLL_SECONDS = 0.2
+REPORT_SECONDS = 15.0
+
+
+@dataclass
+class Outcome:
+    """What became of the cells: of each that failed why, and those that wait for such a one."""
+
+    done: list[Cell] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    waiting: list[Cell] = field(default_factory=list)
+
+
+def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None]) -> Outcome:
+    """Run what is not finished; a cell that fails stops only those that need it.
+
+    Args:
+        plan: the cells, and how many cores they may use.
+        run: the run's folder.
+        force: make finished ones anew.
+        say: told what happens, a line at a time.
+    """
+    outcome = Outcome(waiting=list(plan.cells))
+    running: list[Running] = []
+    made: set[Path] = set()
+    startable: list[Cell] = []
+    budget = free_memory()
+    total, told = len(plan.cells), time.monotonic()
+    try:
+        while True:
+            for cell in [cell for cell in outcome.waiting if made.issuperset(cell.needs)]:
+                outcome.waiting.remove(cell)
+                try:
+                    if not force and is_finished(cell):
+                        _add(outcome, made, cell)
+                    else:
+                        startable.append(cell)
+                except UserError as error:
+                    _fail(outcome, cell, str(error), say)
+            while startable and (cores := _allotted(startable, running, plan.workers, budget)):
+                cell = startable.pop(0)
+                try:
+                    running.append(start(cell, run, cores=cores, force=force))
+                    say(f"[{len(made)}/{total}] {cell.name} ...")
+                except UserError as error:
+                    _fail(outcome, cell, str(error), say)
+            if not running and not any(made.issuperset(cell.needs) for cell in outcome.waiting):
+                return outcome
+            time.sleep(POLL_SECONDS)
+            for one in [one for one in running if one.process.poll() is not None]:
+                running.remove(one)
+                one.ended(one.process.returncode)
+                if one.process.returncode:
+                    _fail(outcome, one.cell, reason(run, one.cell, one.process.returncode), say)
+                else:
+                    _add(outcome, made, one.cell)
+                    say(f"[{len(made)}/{total}] {one.cell.name} done in {one.seconds:.0f} s")
+            if running and time.monotonic() - told > REPORT_SECONDS:
+                told = time.monotonic()
+                for one in running:
+                    say(f"    {one.cell.name}: {last_line(log_of(run, one.cell))}")
+    finally:
+        for one in running:
+            one.process.terminate()
+        for one in running:
+            one.ended(one.process.wait())
+
+
+def _allotted(startable: list[Cell], running: list[Running], workers: int, budget: int | None) -> int:
+    """How many processes the next cell gets; 0: it has to wait.
+
+    It does not wait until all are free that it could use: small cells would be preferred for ever. Where several can
+    start, they share.
+    """
+    cell = startable[0]
+    free = workers - sum(one.cores for one in running)
+    if free <= 0:
+        return 0
+    cores = max(1, min(cell.cost.cores, free // len(startable)))
+    if budget is None or not running:  # one runs in any case; it says itself when memory is too little
+        return cores
+    left = budget - sum(one.cell.cost.memory * one.cores for one in running)
+    return min(cores, max(0, int(left // cell.cost.memory))) if cell.cost.memory else cores
+
+
+def _add(outcome: Outcome, made: set[Path], cell: Cell) -> None:
+    outcome.done.append(cell)
+    made.add(cell.out)
+
+
+def _fail(outcome: Outcome, cell: Cell, why: str, say: Callable[[str], None]) -> None:
+    outcome.failed[cell.name] = why
+    say(f"{cell.name} FAILED: {why}")
+
+
+def reason(run: Path, cell: Cell, code: int) -> str:
+    """Why a cell ended with this exit code, in a line."""
+    log = log_of(run, cell)
+    if code < 0:
+        return f"ended by signal {-code}{' (out of memory?)' if code == -9 else ''}; see {log}"
+    return f"{last_line(log).removeprefix('hypogoal: ')} ({log})"

@@ -1,0 +1,85 @@
+"""One cell's process: what every engine starts, on whichever machine (Spec G4)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO
+
+from hypogoal.core.workers import CORES, die_with_parent
+from hypogoal.experiments.cells import Cell
+from hypogoal.experiments.records import Record, begun, open_log, read_record, write_record
+
+# Of the libraries beneath the stages: one thread a process, unless the user says otherwise.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+@dataclass
+class Running:
+    """A cell that runs in a process of its own, its log locked until :meth:`ended`."""
+
+    cell: Cell
+    run: Path
+    process: subprocess.Popen[bytes]
+    cores: int
+    log: BinaryIO
+    record: Record
+    since: float
+
+    @property
+    def seconds(self) -> float:
+        """Since it was started."""
+        return time.monotonic() - self.since
+
+    def ended(self, code: int) -> None:
+        """Write down how it ended, and let go of the log."""
+        write_record(self.run, self.cell, replace(self.record, seconds=self.record.seconds + self.seconds, code=code))
+        self.log.close()
+
+
+def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Running:
+    """Start a cell; it goes on where it was, and ends when this process does.
+
+    Args:
+        cell: what to run.
+        run: the run's folder.
+        cores: processes that it may use.
+        force: begin anew, whatever is there.
+
+    Raises:
+        UserError: another process runs it.
+    """
+    log = open_log(run, cell)
+    try:
+        record = begun(read_record(run, cell))
+        write_record(run, cell, record)
+        log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
+        again = "--force" if force or cell.out.exists() else "--resume"  # what is there is an evaluation of before
+        command = [sys.executable, "-m", "hypogoal", *cell.arguments, again]
+        environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores)}
+        process = subprocess.Popen(
+            command,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            preexec_fn=_follow(os.getpid()),
+        )
+    except BaseException:
+        log.close()
+        raise
+    return Running(cell, run, process, cores, log, record, time.monotonic())
+
+
+def _follow(parent: int) -> Callable[[], None]:
+    def follow() -> None:
+        die_with_parent()
+        if os.getppid() != parent:  # it died before the kernel was told
+            os._exit(1)
+
+    return follow

@@ -1,0 +1,242 @@
+"""The cells as Slurm job arrays (Spec G4): Slurm decides where and when, the cells' manifests say what is done.
+
+One array for the cells of one stage at one depth of the experiment. An array begins when those that make what it needs
+have ended, whichever way (``afterany``): an element whose own needs are not there ends at once, the others run.
+Nothing is asked of Slurm's accounting, which need not be there.
+"""
+
+from __future__ import annotations
+
+import getpass
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_json, replace_text
+from hypogoal.experiments.cells import Cell, Plan, depths
+from hypogoal.experiments.records import AGAIN
+
+FOLDER, JOBS = "slurm", "jobs.json"
+MOST_ELEMENTS = 1000  # of one array: Slurm's own limit, if nobody changed it, is 1001
+LEAST_MEMORY = 500e6
+CANCEL_SECONDS = 120.0
+GATHER = "gather"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked of Slurm for every cell; what is empty is left to Slurm, or estimated (memory, cpus).
+
+    Attributes:
+        partition: where.
+        time: limit of a cell, as ``sbatch --time`` takes it.
+        memory: of a cell, as ``sbatch --mem`` takes it.
+        gpus: of a cell.
+        cpus: of a cell; 0: as many processes as it can use.
+        cap: cells of an array that run at once, at most; 0: no limit.
+        warn: seconds before the time limit at which a cell saves, to be queued again.
+        extra: further options of ``sbatch``.
+    """
+
+    partition: str = ""
+    time: str = ""
+    memory: str = ""
+    gpus: int = 0
+    cpus: int = 0
+    cap: int = 0
+    warn: int = 120
+    extra: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Array:
+    """One array: its name, its cells, and the names of the arrays that come before it."""
+
+    name: str
+    cells: list[Cell]
+    after: list[str]
+
+
+def arrays(plan: Plan, todo: Sequence[Cell]) -> list[Array]:
+    """The arrays of the cells that are to be run, each after those that make what it needs."""
+    depth = depths(plan.cells)
+    groups: dict[tuple[int, str], list[Cell]] = {}
+    for cell in todo:
+        groups.setdefault((depth[cell.out], cell.stage), []).append(cell)
+    made: dict[Path, str] = {}
+    found = []
+    for (level, stage), cells in sorted(groups.items()):
+        needs = {need for cell in cells for need in cell.needs}
+        after = list(dict.fromkeys(made[need] for need in made if need in needs))
+        for number in range(ceil(len(cells) / MOST_ELEMENTS)):
+            part = cells[number * MOST_ELEMENTS : (number + 1) * MOST_ELEMENTS]
+            name = f"{level:02d}-{stage}" + (f"-{number}" if number else "")
+            found.append(Array(name, part, after))
+            made.update((cell.out, name) for cell in part)
+    return found
+
+
+def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> list[dict[str, Any]]:
+    """Write a script for each array into ``run/slurm`` and submit it; one more job gathers the numbers at the end.
+
+    Args:
+        plan: all cells.
+        run: the run's folder, which every node must see under the same path.
+        todo: those that are not finished.
+        options: what to ask of Slurm.
+
+    Returns:
+        Of each job its number (``id``), name and cells.
+
+    Raises:
+        UserError: there is no Slurm, it refuses, or jobs of this sweep are still in its queue.
+    """
+    _check(options)
+    if alive := queued(run):
+        do = "Look with --status, end them with --cancel."
+        raise UserError(f"this sweep is in Slurm's queue already (job {alive[0]})", run, do)
+    folder = run / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs: list[dict[str, Any]] = []
+    numbers: dict[str, str] = {}
+    try:
+        for array in arrays(plan, todo):
+            script = folder / f"{array.name}.sh"
+            replace_text(script, _script(array, run, options))
+            numbers[array.name] = _sbatch(script, [numbers[name] for name in array.after])
+            jobs.append({"id": numbers[array.name], "name": array.name, "cells": [cell.name for cell in array.cells]})
+            replace_text(folder / JOBS, json.dumps(jobs, indent=1) + "\n")
+        script = folder / f"{GATHER}.sh"
+        replace_text(script, _gather(run, options))
+        jobs.append({"id": _sbatch(script, list(numbers.values())), "name": GATHER, "cells": []})
+    except UserError:
+        for job in jobs:
+            _command("scancel", job["id"])
+        raise
+    replace_text(folder / JOBS, json.dumps(jobs, indent=1) + "\n")
+    return jobs
+
+
+def _check(options: Options) -> None:
+    if shutil.which("sbatch") is None:
+        raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
+    for text in (options.partition, options.time, options.memory, *options.extra):
+        if not text.isprintable():
+            raise UserError("not an option of sbatch", repr(text), "See 'man sbatch'.")
+
+
+def _head(run: Path, name: str, options: Options) -> list[str]:
+    lines = [
+        "#!/bin/sh",
+        f"#SBATCH --job-name={re.sub(r'[^A-Za-z0-9_.-]', '-', run.name)}-{name}",
+        f"#SBATCH --output={shlex.quote(str((run / FOLDER).resolve()))}/%x-%A-%a.out",
+        "#SBATCH --open-mode=append",
+    ]
+    lines += [f"#SBATCH --partition={options.partition}"] if options.partition else []
+    return lines + [f"#SBATCH {extra}" for extra in options.extra]
+
+
+def _script(array: Array, run: Path, options: Options) -> str:
+    """A plain batch script: element N runs the Nth of the cells it names."""
+    cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
+    estimated = cpus * max(cell.cost.memory for cell in array.cells)
+    memory = options.memory or (f"{ceil(max(estimated, LEAST_MEMORY) / 2**20)}M" if estimated else "")
+    lines = _head(run, array.name, options)
+    lines += [
+        f"#SBATCH --array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
+        f"#SBATCH --cpus-per-task={cpus}",
+        "#SBATCH --requeue",
+        f"#SBATCH --signal=B:USR2@{options.warn}",
+    ]
+    lines += [f"#SBATCH --mem={memory}"] if memory else []
+    lines += [f"#SBATCH --time={options.time}"] if options.time else []
+    lines += [f"#SBATCH --gres=gpu:{options.gpus}"] if options.gpus else []
+    names = " ".join(shlex.quote(cell.name) for cell in array.cells)
+    lines += [
+        "trap '' USR2  # until the program listens: the warning must not end it",
+        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
+        f"set -- {names}",
+        'shift "$SLURM_ARRAY_TASK_ID"',
+        f'exec {shlex.quote(sys.executable)} -m hypogoal sweep --out {shlex.quote(str(run))} --cell "$1"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _gather(run: Path, options: Options) -> str:
+    lines = _head(run, GATHER, options)
+    lines += [
+        f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M",
+        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
+        f"exec {shlex.quote(sys.executable)} -m hypogoal sweep --out {shlex.quote(str(run))} --gather",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _sbatch(script: Path, after: Sequence[str]) -> str:
+    dependency = [f"--dependency=afterany:{':'.join(after)}"] if after else []
+    done = _command("sbatch", "--parsable", *dependency, str(script))
+    if done.returncode:
+        what = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
+        raise UserError(
+            f"Slurm refuses the array ({what})", script, "Change the options; nothing was left in the queue."
+        )
+    return done.stdout.strip().partition(";")[0]
+
+
+def _command(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(words, capture_output=True, text=True, check=False)
+
+
+def jobs_of(run: Path) -> list[str]:
+    """The numbers of the jobs that were last submitted for a run; none where there were none."""
+    path = run / FOLDER / JOBS
+    if not path.is_file():
+        return []
+    jobs = read_json(path, "the list of jobs is", AGAIN)
+    try:
+        numbers = [str(job["id"]) for job in jobs]
+    except (KeyError, TypeError):
+        raise UserError("the list of jobs is damaged", path, "Remove it if no job runs.") from None
+    return [number for number in numbers if number.isdigit()]
+
+
+def queued(run: Path) -> list[str]:
+    """Which of a run's jobs Slurm still has waiting or running; none where there is no Slurm."""
+    numbers = jobs_of(run)
+    if not numbers or shutil.which("squeue") is None:
+        return []
+    done = _command("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}", f"--jobs={','.join(numbers)}")
+    if done.returncode and "Invalid job id" not in done.stderr:
+        raise UserError(f"Slurm does not answer ({' '.join(done.stderr.split())})", run, "Try again later.")
+    return sorted(set(done.stdout.split()), key=int)
+
+
+def cancel(run: Path) -> int:
+    """Have Slurm end every job of a run; cells that run save where they are. Returns how many jobs there were.
+
+    Raises:
+        UserError: there are none, or Slurm does not end them.
+    """
+    alive = queued(run)
+    if not alive:
+        raise UserError("no jobs in Slurm's queue", run, "A sweep on this machine is ended with Ctrl-C or SIGTERM.")
+    numbers = jobs_of(run)
+    # Those that wait first, or they would begin as others end. Then all; Slurm tells running ones by SIGTERM.
+    for state in (["--state=PENDING"], []):
+        _command("scancel", *state, *numbers)
+    until = time.monotonic() + CANCEL_SECONDS
+    while queued(run):
+        if time.monotonic() > until:
+            raise UserError("Slurm has not ended all jobs yet", run, "Look with squeue.")
+        time.sleep(0.5)
+    return len(alive)

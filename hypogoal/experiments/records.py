@@ -1,0 +1,218 @@
+"""What a sweep writes down beside its cells' outputs, for whoever looks or goes on (Spec G4).
+
+``sweep.json`` is the plan, in which the run's folder is called ``{run}``: the folder can be moved, and every machine
+that sees it can read it. ``logs/NAME.log`` is what a cell said; who holds the kernel's lock on it runs the cell, and
+the lock goes on to the cell's own processes, so it ends with the last of them. ``logs/NAME.json`` is how it went.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import socket
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name, read_json, replace_text
+from hypogoal.experiments.cells import Cell, Cost, Plan, moved
+
+FORMAT_VERSION = 1
+PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
+RUN = "{run}"
+COMMANDS = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "evaluate", "report")
+AGAIN = "Start the sweep again."
+
+
+@dataclass(frozen=True)
+class Record:
+    """How a cell went so far.
+
+    Attributes:
+        attempts: how often it was started.
+        seconds: that it ran, all attempts that ended together.
+        code: its exit code, minus the signal that ended it; None: it runs, or died with whoever ran it.
+        started: when the last attempt began, seconds of the clock since 1970; for people only.
+        host: where.
+    """
+
+    attempts: int = 0
+    seconds: float = 0.0
+    code: int | None = None
+    started: float = 0.0
+    host: str = ""
+
+
+def log_of(run: Path, cell: Cell) -> Path:
+    """Where a cell's words go."""
+    return run / LOGS / f"{cell.name}.log"
+
+
+def last_line(log: Path) -> str:
+    """What a cell said last."""
+    try:
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    return lines[-1] if lines else "started"
+
+
+def read_record(run: Path, cell: Cell) -> Record:
+    """How a cell went; an empty record where it was never started, or where what is there cannot be read."""
+    path = run / LOGS / f"{cell.name}.json"
+    try:
+        values = read_json(path, "the record is", AGAIN)
+        record = Record(**values)
+        numbers = (record.attempts, record.seconds, record.started, record.code or 0)
+        return record if all(isinstance(number, int | float) for number in numbers) else Record()
+    except (UserError, TypeError):
+        return Record()
+
+
+def write_record(run: Path, cell: Cell, record: Record) -> None:
+    """Write down how a cell went."""
+    replace_text(run / LOGS / f"{cell.name}.json", json.dumps(asdict(record)) + "\n")
+
+
+def begun(before: Record) -> Record:
+    """The record of a cell that is being started."""
+    return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
+
+
+def open_log(run: Path, cell: Cell) -> BinaryIO:
+    """A cell's log to append to, locked: nobody else runs this cell while it, or a copy of it, is open.
+
+    Raises:
+        UserError: another process runs the cell.
+    """
+    path = log_of(run, cell)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    log = path.open("ab", buffering=0)
+    until = time.monotonic() + PATIENCE_SECONDS  # for those that are just dying, or only look
+    while not _lock(log, fcntl.LOCK_EX):
+        if time.monotonic() > until:
+            log.close()
+            host = read_record(run, cell).host
+            raise UserError(f"{cell.name} is being run by another process ({host})", path, "Wait until it is done.")
+        time.sleep(0.05)
+    return log
+
+
+def is_running(run: Path, cell: Cell) -> bool:
+    """Whether some process, on whichever machine, runs the cell.
+
+    Where the file system cannot lock, a cell that was started and has not ended counts as running.
+    """
+    try:
+        with log_of(run, cell).open("rb") as log:
+            return not _lock(log, fcntl.LOCK_SH)
+    except _NoLocks:
+        record = read_record(run, cell)
+        return record.attempts > 0 and record.code is None
+    except OSError:
+        return False
+
+
+class _NoLocks(Exception):
+    pass
+
+
+def _lock(file: BinaryIO, kind: int) -> bool:
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        if kind == fcntl.LOCK_SH:
+            raise _NoLocks from None
+    return True
+
+
+def write_plan(run: Path, plan: Plan, factor: float) -> None:
+    """Write the plan down.
+
+    Args:
+        run: the run's folder, made where it is not there.
+        plan: the experiment.
+        factor: how much slower this machine is than the one that costs are of.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    rows = [_row(moved(cell, str(run), RUN)) for cell in plan.cells]
+    about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
+    lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
+    head = json.dumps(about)[:-1]
+    replace_text(run / PLAN, f'{head}, "cells": [\n{lines}\n]}}\n')
+
+
+def _row(cell: Cell) -> dict[str, Any]:
+    return {
+        "name": cell.name,
+        "arguments": list(cell.arguments),
+        "out": str(cell.out),
+        "needs": [str(need) for need in cell.needs],
+        "axes": dict(cell.axes),
+        **cell.cost._asdict(),
+    }
+
+
+def read_plan(run: Path) -> tuple[Plan, float]:
+    """The plan of a run's folder, and its machine's factor (see :func:`write_plan`).
+
+    Raises:
+        UserError: there is none, or what is there is not one.
+    """
+    path = run / PLAN
+    if not path.is_file():
+        raise UserError("no sweep here", run, "Give the folder of a sweep that was started as --out.")
+    about = read_json(path, "the sweep's plan is", AGAIN)
+    try:
+        if about["format"] > FORMAT_VERSION:
+            raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
+        plan = Plan(str(about["experiment"]), [_cell(row, run) for row in about["cells"]], int(about["workers"]))
+        seen: set[Path] = set()
+        for cell in plan.cells:
+            if not seen.issuperset(cell.needs) or cell.out in seen:
+                raise ValueError
+            seen.add(cell.out)
+        return plan, float(about["factor"])
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise UserError("the sweep's plan is damaged", path, AGAIN) from None
+
+
+def _cell(row: dict[str, Any], run: Path) -> Cell:
+    arguments = tuple(map(str, row["arguments"]))
+    places = [Path(place).relative_to(RUN) for place in (row["out"], *row["needs"])]
+    fits = arguments[0] in COMMANDS and plain_name(row["name"])
+    if not fits or not all(plain_name(part) for place in places for part in place.parts):
+        raise ValueError
+    cost = Cost(float(row["seconds"]), float(row["memory"]), float(row["disk"]), int(row["cores"]))
+    needs = tuple(Path(need) for need in row["needs"])
+    axes = tuple((str(name), value) for name, value in row["axes"].items())
+    return moved(Cell(row["name"], arguments, Path(row["out"]), needs, cost, axes), RUN, str(run))
+
+
+def check_same(run: Path, cells: Sequence[Cell]) -> None:
+    """Refuse cells that do not go on with what the folder has: every cell of before, commands as they were.
+
+    Raises:
+        UserError: a cell of before is not there any more, or its command is another.
+    """
+    if not (run / PLAN).is_file():
+        return
+    now = {cell.name: moved(cell, str(run), RUN) for cell in cells}
+    do = "Give the settings it was begun with, or choose another --out."
+    for cell in read_plan(run)[0].cells:
+        before, after = moved(cell, str(run), RUN), now.get(cell.name)
+        if after is None:
+            raise UserError(f"the sweep here has a cell that this one has not: {cell.name}", run, do)
+        if (after.arguments, after.out) != (before.arguments, before.out):
+            pairs = zip_longest(before.arguments, after.arguments, fillvalue="")
+            one, other = next((pair for pair in pairs if pair[0] != pair[1]), (before.out, after.out))
+            raise UserError(f"{cell.name} of the sweep here was begun with '{one}', not '{other}'", run, do)

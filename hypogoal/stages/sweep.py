@@ -1,0 +1,254 @@
+"""Spec A6, G4: an experiment's cells, run here or by Slurm. Every cell is one ordinary command with its own output.
+
+``hypogoal run`` is the sweep of a named experiment on this machine.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.config import parse_assignments, resolve
+from hypogoal.core.drafts import GO_ON, sole_writer
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import replace_text
+from hypogoal.core.workers import cores
+from hypogoal.domains.base import defaults_of, load_domain
+from hypogoal.experiments import doorkey, montezuma_ladders
+from hypogoal.experiments.cells import Plan
+from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
+from hypogoal.experiments.engines import slurm
+from hypogoal.experiments.engines.local import run_cells
+from hypogoal.experiments.finished import left_of
+from hypogoal.experiments.own import own_plan
+from hypogoal.experiments.records import FINISHED, LOGS, check_same, read_plan, read_record, write_plan
+from hypogoal.experiments.results import write_results
+from hypogoal.experiments.status import is_there
+
+EXPERIMENTS: Mapping[str, Any] = {"doorkey": doorkey, "montezuma-ladders": montezuma_ladders}
+FIGURES = {  # of the paper: the experiment and its preset
+    "figure3": ("montezuma-ladders", "figure3"),
+    "figure4": ("montezuma-ladders", "figure4"),
+    "figure6": ("doorkey", "figure6"),
+}
+CONFIGS = {
+    "train-ensemble": "hypogoal.stages.train_ensemble:TrainEnsembleConfig",
+    "train-options": "hypogoal.stages.train_options:TrainOptionsConfig",
+    "train-meta": "hypogoal.stages.train_meta:TrainMetaConfig",
+    "train-baseline": "hypogoal.stages.train_baseline:BaselineConfig",
+}
+STAGES = ("collect", *CONFIGS, "run")
+AGAIN = "give the same command again to go on"
+
+
+def config_class_of(stage: str, domain: str = "doorkey") -> type:
+    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment.
+
+    Raises:
+        UserError: no such stage or domain, or no experiment is on that domain.
+    """
+    if stage == "collect":
+        return load_domain(domain, given=True).config_class
+    if stage == "run":
+        for experiment in EXPERIMENTS.values():
+            if domain == experiment.DOMAIN:
+                return experiment.RunConfig
+        raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
+    if stage not in CONFIGS:
+        raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}.")
+    module, _, name = CONFIGS[stage].partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def plan(
+    experiment: str, out: Path, *, preset: str | None = None, assignments: Iterable[str] = (), seeds: str | None = None
+) -> Plan:
+    """The cells of an experiment.
+
+    Args:
+        experiment: a name, one of the paper's figures, or an own TOML file (see ``experiments.own``).
+        out: the run's folder.
+        preset: of a named experiment; a figure has its own.
+        assignments: ``KEY=VALUE`` or ``STAGE.KEY=VALUE``; of an own experiment ``AXIS=VALUES``.
+        seeds: the run seeds, ``0-9``.
+
+    Raises:
+        UserError: unknown experiment or preset, or a setting that no stage has.
+    """
+    assignments = [*assignments]
+    if experiment.endswith(".toml"):
+        if preset is not None:
+            raise UserError("an own experiment takes no preset", preset, "Write --preset into its commands.")
+        return own_plan(Path(experiment), out, assignments + ([f"seed={seeds}"] if seeds else []))
+    name, own_preset = FIGURES.get(experiment, (experiment, None))
+    if name not in EXPERIMENTS:
+        known = ", ".join([*EXPERIMENTS, *FIGURES])
+        raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
+    chosen = assignments + ([f"seeds={seeds}"] if seeds else [])
+    return _named_plan(name, out, preset or own_preset, chosen)
+
+
+def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Sequence[str]) -> Plan:
+    found = EXPERIMENTS[experiment]
+    own, by_stage = _split(assignments)
+    config = resolve(found.RunConfig, stage="run", preset=preset, assignments=own, domain=found.DOMAIN)
+    for stage in by_stage:
+        if stage not in found.STAGES:
+            raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(found.STAGES)}.")
+    resolved: dict[str, Any] = {
+        stage: resolve(
+            config_class_of(stage, found.DOMAIN),
+            stage=stage,
+            preset=preset,
+            assignments=by_stage.get(stage, ()),
+            domain=found.DOMAIN,
+            defaults=defaults_of(found.DOMAIN, stage),
+        )
+        for stage in found.STAGES
+    }
+    common = {
+        stage: (
+            *(("--preset", preset) if preset else ()),
+            *(x for pair in by_stage.get(stage, ()) for x in ("--set", pair)),
+        )
+        for stage in found.STAGES
+    }
+    return Plan(experiment, found.cells(out, config, resolved, common), config.workers or cores())
+
+
+def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:
+    own: list[str] = []
+    by_stage: dict[str, list[str]] = {}
+    for assignment in assignments:
+        (key,) = parse_assignments([assignment])
+        stage, dot, rest = key.partition(".")
+        if dot:
+            value = assignment.partition("=")[2]
+            by_stage.setdefault(stage.replace("_", "-"), []).append(f"{rest}={value}")
+        else:
+            own.append(assignment)
+    return own, by_stage
+
+
+def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
+    """Spec A6: ``sweep`` with the manners of a stage: what is there is refused unless resumed or forced.
+
+    Raises:
+        UserError: as of :func:`sweep`, or ``out`` exists and neither ``force`` nor ``resume`` was given.
+    """
+    if out.exists() and not (force or resume):
+        raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
+    sweep(planned, out, force=force, quiet=quiet, go_on=GO_ON)
+
+
+def sweep(
+    planned: Plan,
+    out: Path,
+    *,
+    force: bool = False,
+    quiet: bool = False,
+    confirm: Callable[[str], None] | None = None,
+    go_on: str = AGAIN,
+) -> Path:
+    """Run on this machine what is not finished, and gather every number.
+
+    It may be killed at any time and started again: what is finished is recognised and never run again, what was begun
+    goes on where it was.
+
+    Args:
+        planned: the cells.
+        out: the run's folder.
+        force: make finished ones anew.
+        quiet: no progress.
+        confirm: asked before something long begins; it raises where the answer is no.
+        go_on: what a user who interrupts it is told.
+
+    Returns:
+        ``results.csv``.
+
+    Raises:
+        UserError: another process runs it, the folder has another sweep, or a cell failed.
+    """
+    say = (lambda text: None) if quiet else _say
+    with sole_writer(out):
+        _begin(planned, out, force=force, say=say, confirm=confirm)
+        try:
+            outcome = run_cells(planned, out, force=force, say=say)
+        except KeyboardInterrupt as error:
+            error.add_note(f"what is done is kept: {go_on}")
+            raise
+        results = gather(out)
+    if outcome.failed:
+        name, why = next(iter(outcome.failed.items()))
+        rest = f", {len(outcome.waiting)} wait for them" if outcome.waiting else ""
+        what = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {why}"
+        raise UserError(what, None, "Mend it, then start again: what is done is kept.")
+    say(f"all {len(planned.cells)} cells done")
+    return results
+
+
+def submit(
+    planned: Plan,
+    out: Path,
+    options: slurm.Options,
+    *,
+    quiet: bool = False,
+    confirm: Callable[[str], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Have Slurm run what is not finished; arguments as of :func:`sweep`, returns the jobs.
+
+    Raises:
+        UserError: as of :func:`sweep` and ``slurm.submit``.
+    """
+    at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
+    planned = replace(planned, workers=at_once)
+    with sole_writer(out):
+        _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
+        todo = left_of(planned.cells)
+        return slurm.submit(planned, out, todo, options) if todo else []
+
+
+def _begin(
+    planned: Plan, out: Path, *, force: bool, say: Callable[[str], None], confirm: Callable[[str], None] | None
+) -> None:
+    """Before the first cell: is this the sweep of this folder, what will it cost, is that wanted."""
+    if alive := slurm.queued(out):
+        raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
+    if not force:
+        check_same(out, planned.cells)
+    factor = machine_factor()
+    todo = planned.cells if force else [cell for cell in planned.cells if not is_there(cell)]
+    if len(todo) < len(planned.cells):
+        say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
+    if todo:
+        for line in cost_lines(todo, planned.workers, factor):
+            say(line)
+    seconds = wall_seconds(todo, planned.workers, factor)
+    if confirm is not None and seconds > LONG_SECONDS:
+        confirm(cost_lines(todo, planned.workers, factor)[-1])
+    (out / LOGS).mkdir(parents=True, exist_ok=True)
+    write_plan(out, planned, factor)
+
+
+def gather(out: Path) -> Path:
+    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former.
+
+    Raises:
+        UserError: there is no sweep, or an artefact is damaged.
+    """
+    planned, _ = read_plan(out)
+    results = write_results(planned, out)
+    if all(map(is_there, planned.cells)):
+        seconds = sum(read_record(out, cell).seconds for cell in planned.cells)
+        about = {"cells": [cell.text for cell in planned.cells], "seconds": round(seconds, 1)}
+        replace_text(out / FINISHED, json.dumps(about, indent=1) + "\n")
+    return results
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

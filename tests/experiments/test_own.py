@@ -1,0 +1,100 @@
+"""Own experiments in TOML (Spec G4): what they can say, and that they can say nothing else."""
+
+from pathlib import Path
+
+import pytest
+
+from hypogoal.core.errors import UserError
+from hypogoal.experiments.cells import Plan
+from hypogoal.experiments.own import own_plan
+
+ROOT = Path(__file__).resolve().parents[2]
+OUT = Path("somewhere")
+GOOD = """
+format = 1
+axes = { seed = [0, 1], layout = "210-212" }
+cells = [
+  { name = "data", command = "collect doorkey --seed 3" },
+  { name = "ensemble", axes = ["seed"], command = "train-ensemble {data} --seed {seed}", minutes = 2, memory_gb = 1.5 },
+  { name = "agent", axes = ["seed", "layout"], command = "train-meta {ensemble} --layout-seed {layout} --seed {seed}" },
+]
+"""
+
+
+def planned(tmp_path: Path, text: str, *assignments: str) -> Plan:
+    (tmp_path / "own.toml").write_text(text)
+    return own_plan(tmp_path / "own.toml", OUT, assignments)
+
+
+def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
+    """Spec G4: cells are the product of axes; what they read is what cells of the same point wrote."""
+    plan = planned(tmp_path, GOOD)
+    assert [cell.stage for cell in plan.cells].count("collect") == 1
+    agents = [cell for cell in plan.cells if cell.stage == "train-meta"]
+    assert len(agents) == 6 and len({cell.out for cell in agents}) == 6
+    one = agents[-1]
+    assert one.text == (
+        "hypogoal train-meta somewhere/ensemble/seed-1 --layout-seed 212 --seed 1 "
+        "--out somewhere/agent/seed-1-layout-212"
+    )
+    assert one.needs == (OUT / "ensemble/seed-1",)
+    assert one.axes == (("group", "agent"), ("seed", 1), ("layout", 212))
+    ensemble = next(cell for cell in plan.cells if cell.stage == "train-ensemble")
+    assert (ensemble.cost.seconds, ensemble.cost.memory) == (120, 1.5e9)
+    assert [cell.name for cell in plan.cells[-2:]] == ["evaluate", "report"]
+    assert set(plan.cells[-2].needs) == {cell.out for cell in plan.cells[:-2]}
+
+
+def test_axes_from_the_command_line(tmp_path: Path) -> None:
+    """--seeds 0-4 and --set layout=1,5 take the place of the file's values."""
+    plan = planned(tmp_path, GOOD, "seed=0-4", "layout=1,5", "evaluate=false", "workers=3")
+    assert sum(cell.stage == "train-meta" for cell in plan.cells) == 10
+    assert plan.workers == 3 and plan.cells[-1].stage == "train-meta"
+
+
+def test_the_example_is_one() -> None:
+    """The file in examples/ is an experiment."""
+    plan = own_plan(ROOT / "examples" / "sweep-doorkey.toml", OUT)
+    assert len(plan.cells) == 1 + 4 + 8 + 4 + 2
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("format = 1", "format = 2", "format must be 1"),
+        ("format = 1", "format = 1\nsubmit = 'rm'", "no such key"),
+        ("minutes = 2", "minuets = 2", "no such key"),
+        ("minutes = 2", "minutes = nan", "minutes and memory_gb"),
+        ("minutes = 2", "minutes = true", "wrong kind"),
+        ("train-meta {", "rm -rf {", "must be a stage"),
+        ("train-meta {", "train-meta --out /tmp/x {", "given by the sweep"),
+        ("train-meta {", "train-meta --force {", "given by the sweep"),
+        ("{ensemble}", "{ensembles}", "is no axis"),
+        ('axes = ["seed"], command', "command", "is no axis"),
+        ('axes = ["seed", "layout"]', 'axes = ["layout"]', "is no axis"),
+        ('axes = ["seed"]', 'axes = ["sed"]', "an axis that is not there"),
+        ("[0, 1]", "[0, 0]", "values that differ"),
+        ("[0, 1]", "['../x']", "parts of names"),
+        ("[0, 1]", "[]", "values that differ"),
+        ('"210-212"', '"212-210"', "no integers"),
+        ('"210-212"', '"0-99999"', "no integers"),
+        ("layout =", "value =", "cannot be called this"),
+        ('name = "agent"', 'name = "data"', "name of their own"),
+        ('name = "agent"', 'name = "../agent"', "name of their own"),
+        ("collect doorkey", "collect 'doorkey", "cannot be read"),
+        ("collect doorkey", "collect os:path", "code of its own"),
+        ("cells = [", "cells = [ [", "not valid TOML"),
+    ],
+)
+def test_what_is_no_experiment_is_told_in_one_line(tmp_path: Path, before: str, after: str, words: str) -> None:
+    """Spec G2: a stranger's file is data: stages only, into the sweep's folder only, no code that it names."""
+    assert before in GOOD
+    with pytest.raises(UserError, match=words):
+        planned(tmp_path, GOOD.replace(before, after))
+
+
+@pytest.mark.parametrize("given", ["seeds=1", "seed=", "seed=x", "workers=many", "evaluate=perhaps"])
+def test_what_the_command_line_cannot_say(tmp_path: Path, given: str) -> None:
+    """Spec G2: in one line."""
+    with pytest.raises(UserError):
+        planned(tmp_path, GOOD, given)

@@ -1,0 +1,190 @@
+"""Spec G4: a sweep on this machine, killed, failed, extended, looked at."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from toy import SMALL, write_toy
+
+from hypogoal.cli import main
+from hypogoal.core.drafts import draft_folder, unfinished
+from hypogoal.core.errors import UserError
+from hypogoal.experiments.records import is_running, open_log, read_plan, read_record
+from hypogoal.experiments.status import read_status
+
+ROOT = Path(__file__).resolve().parents[2]
+WAIT_SECONDS = 300.0
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``toy.toml`` and its unbroken sweep ``whole``."""
+    folder = tmp_path_factory.mktemp("sweep")
+    write_toy(folder / "toy.toml")
+    assert main(["sweep", str(folder / "toy.toml"), "--out", str(folder / "whole"), "-q"]) == 0
+    return folder
+
+
+def killed(arguments: list[str], moment: Callable[[], bool]) -> None:
+    """Start a sweep as a process of its own and kill it when ``moment`` has come."""
+    environment = {**os.environ, "HYPOGOAL_CHECKPOINT_SECONDS": "0"}
+    command = [sys.executable, "-m", "hypogoal", *arguments]
+    until = time.monotonic() + WAIT_SECONDS
+    with subprocess.Popen(command, cwd=ROOT, env=environment) as process:
+        while not moment():
+            assert process.poll() is None and time.monotonic() < until
+            time.sleep(0.01)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+
+
+def test_a_killed_sweep_ends_with_the_same_results(swept: Path) -> None:
+    """Spec G1, G4: SIGKILL while states are collected, and while an ensemble is trained; then the same bytes."""
+    out = swept / "broken"
+    arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
+    killed(arguments, lambda: draft_folder(out / "data.h5").exists())
+    assert not (out / "data.h5").exists()
+    killed(arguments, lambda: unfinished(out / "ensemble/seed-0"))
+    made = (out / "data.h5").stat().st_mtime_ns
+    assert main(arguments) == 0
+    assert (out / "data.h5").stat().st_mtime_ns == made
+    assert (out / "results.csv").read_bytes() == (swept / "whole" / "results.csv").read_bytes()
+    for name in ("data.h5", "ensemble/seed-0/metrics.jsonl", "ensemble/seed-1/open-red-door.safetensors"):
+        assert (out / name).read_bytes() == (swept / "whole" / name).read_bytes()
+
+
+def test_results_are_a_row_for_each_number_of_each_cell(swept: Path) -> None:
+    """Spec G4: tidy, axes as columns, no machine, time or path in it."""
+    lines = (swept / "whole" / "results.csv").read_text().splitlines()
+    assert lines[0] == "cell,stage,group,seed,sub_goal,member,scope,number,value"
+    rows = [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
+    states = [row for row in rows if row["cell"] == "data" and row["number"] == "states"]
+    assert {row["value"] for row in states if row["scope"] == "labelled"} == {"1640"}
+    steps = {(row["seed"], row["sub_goal"], row["value"]) for row in rows if row["number"] == "step"}
+    assert steps == {("0", "open-red-door", "6"), ("1", "open-red-door", "6")}
+    assert str(swept) not in "\n".join(lines)
+
+
+def test_finished_cells_are_never_run_again_and_new_ones_are_added(swept: Path, tmp_path: Path) -> None:
+    """Spec G4: started again nothing runs; with one more seed only that seed does; another sweep is refused."""
+    out = tmp_path / "out"
+    arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
+    assert main([*arguments, "--seeds", "0"]) == 0
+    assert main([*arguments, "--seeds", "0"]) == 0
+    assert main([*arguments, "--seeds", "0-1"]) == 0
+    attempts = {cell.name: read_record(out, cell).attempts for cell in read_plan(out)[0].cells}
+    assert attempts == {"data": 1, "ensemble-seed-0": 1, "ensemble-seed-1": 1}
+    assert (out / "results.csv").read_bytes() == (swept / "whole" / "results.csv").read_bytes()
+
+
+def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: a folder is of one experiment: no cell of before may be missing or be another."""
+    out = str(swept / "whole")
+    other = tmp_path / "toy.toml"
+    other.write_text((swept / "toy.toml").read_text().replace("steps=6", "steps=7"))
+    for arguments, words in (
+        (["sweep", str(other), "--out", out], "ensemble-seed-0 of the sweep here was begun with 'steps=6'"),
+        (["sweep", str(swept / "toy.toml"), "--out", out, "--seeds", "1-2"], "this one has not: ensemble-seed-0"),
+        (["sweep", "figure6", "--out", out], "data of the sweep here was begun with"),
+        (["sweep", "figure7", "--out", out], "unknown experiment"),
+        (["sweep", "--out", out], "which experiment?"),
+        (["sweep", "figure6", "--out", out, "--engine", "cloud"], "unknown engine"),
+        (["sweep", "figure6", "--out", str(tmp_path / "x"), "--status"], "no sweep here"),
+        (["sweep", "--out", out, "--cancel"], "no jobs in Slurm's queue"),
+    ):  # fmt: skip
+        capsys.readouterr()
+        assert main(arguments) == 2
+        err = capsys.readouterr().err
+        assert words in err and err.count("\n") == 1, err
+
+
+FAILS = f"""
+[[cells]]
+name = "worse"
+axes = ["seed"]
+command = "train-ensemble {{data}} --seed {{seed}} --diversity magic {SMALL}"
+
+[[cells]]
+name = "agent"
+axes = ["seed"]
+command = "train-meta {{worse}} --seed {{seed}}"
+"""
+
+
+def test_a_failed_cell_stops_only_those_that_need_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G4: told with its log; exit code 2 and one line at the end; the status says who waits for whom."""
+    toy, out = write_toy(tmp_path / "toy.toml", "0", FAILS), tmp_path / "out"
+    capsys.readouterr()
+    assert main(["sweep", str(toy), "--out", str(out), "-q"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "1 of 4 cells failed, 1 wait for them; the first is worse-seed-0" in err
+    assert str(out / "logs" / "worse-seed-0.log") in err and "magic" in err
+    status = read_status(out)
+    states = {one.cell.name: one.state for one in status.states}
+    assert states == {"data": "done", "ensemble-seed-0": "done", "worse-seed-0": "failed", "agent-seed-0": "held"}
+    assert "ensemble,0,open-red-door" in (out / "results.csv").read_text()
+    assert main(["sweep", "--out", str(out), "--status"]) == 0
+    text = capsys.readouterr().out
+    assert "4 cells: 2 done, 0 running, 1 failed, 1 left (1 wait for failed ones)" in text and "magic" in text
+    assert main(["sweep", "--out", str(out), "--status", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["counts"]["held"] == 1
+
+
+def test_what_was_changed_by_hand_is_not_replaced(
+    swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G2, G4: manifests are verified; a damaged output is told, and stays until the user moves it."""
+    out = tmp_path / "out"
+    arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "--seeds", "0", "-q"]
+    assert main(arguments) == 0
+    before = (out / "results.csv").read_bytes()
+    log = out / "ensemble/seed-0/metrics.jsonl"
+    log.write_text(log.read_text() + "\n")
+    assert main(arguments) == 2
+    assert "metrics.jsonl: changed since it was written" in capsys.readouterr().err
+    (out / "ensemble/seed-0").rename(out / "moved")
+    assert main(arguments) == 0
+    assert (out / "results.csv").read_bytes() == before
+
+
+def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
+    """Spec G4: from files alone: who holds the lock on a log runs the cell; when that dies, nobody does."""
+    run = swept / "whole"
+    plan, _ = read_plan(run)
+    cell = plan.cells[1]
+    assert not is_running(run, cell) and read_status(run).count("done") == 3
+    with open_log(run, cell) as log:
+        child = subprocess.Popen(["sleep", "600"], stdout=log)
+    try:
+        assert is_running(run, cell)
+        with pytest.raises(UserError, match="is being run by another process"):
+            open_log(run, cell)
+        assert [one.state for one in read_status(run).states] == ["done", "running", "done"]
+    finally:
+        child.kill()
+        child.wait()
+    assert not is_running(run, cell)
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_at_random_ends_with_the_same_results(tmp_path: Path) -> None:
+    """Spec G1, G4: ``python -m benchmarks.sweeps`` is the long version."""
+    command = [sys.executable, "-m", "benchmarks.sweeps", "--kills", "4", "--folder", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_long_sweep_asks_first_where_somebody_can_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G4: no, and nothing is begun; --yes does not ask."""
+    toy, out = write_toy(tmp_path / "toy.toml"), tmp_path / "out"
+    toy.write_text(toy.read_text() + "minutes = 600\n")
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.confirm", lambda *_, **__: False)
+    assert main(["sweep", str(toy), "--out", str(out), "-q"]) == 1
+    assert not out.exists()
