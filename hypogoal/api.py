@@ -7,11 +7,12 @@ from pathlib import Path
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.doorkey_registration import register
+from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.options.env import OptionEnv, Options, make_policies
 
-__all__ = ["OptionEnv", "load_ensemble", "load_options"]
+__all__ = ["GymnasiumDomain", "OptionEnv", "load_ensemble", "load_options"]
 
 register()
 

@@ -44,7 +44,7 @@ def collect(
         return
     found = load_domain(domain, given=True)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
-    counts = stage(found, config, out, seed=seed, force=force, resume=resume, quiet=quiet)
+    counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
     if not quiet:
         for split in ("labelled", "heldout"):
             for sub_goal, row in counts[split].items():

@@ -84,7 +84,7 @@ def train_baseline(
     size = math.prod(env.observation_space.shape or (1,))
     preflight("train-baseline", out, baseline_needs(size, getattr(chosen, "replay", 0)), quiet=quiet)
     about = as_dict(config) | {
-        "domain": played.name,
+        "domain": domain,
         "environments": chosen.environments,
         "hyperparameters": as_dict(chosen),
     }

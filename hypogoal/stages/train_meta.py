@@ -83,7 +83,7 @@ def train_meta(
     about = as_dict(config) | {
         "sub_goals": source.config["sub_goals"],
         "members": verdicts.options // len(source.config["sub_goals"]),
-        "domain": domain.name,
+        "domain": source.config["domain"],
         "domain_config": source.config["domain_config"],
         "options_steps": trained.config["steps"] if trained else 0,
         "setting": config.network,

@@ -74,7 +74,7 @@ def train_options(
         "steps": steps,
         "sub_goals": source.config["sub_goals"],
         "members": members,
-        "domain": domain.name,
+        "domain": source.config["domain"],
         "domain_config": source.config["domain_config"],
         "setting": config.network,
     }

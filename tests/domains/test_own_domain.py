@@ -17,7 +17,7 @@ TESTS = Path(__file__).parents[1]
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TESTS))
     monkeypatch.syspath_prepend(str(TESTS / "domains"))
-    monkeypatch.setenv("HYPOGOAL_DOMAINS", "own_domain:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
 
 
 def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
