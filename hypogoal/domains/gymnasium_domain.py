@@ -136,12 +136,11 @@ class GymnasiumDomain:
         self, env: gymnasium.Env, config: GymnasiumConfig, layout: int, seed: int, known: set[bytes], progress: Any
     ) -> States:
         """The distinct states of one layout that are not ``known``: an even sample of each combination of sub-goals."""
-        rng = rng_for(seed, "play", layout)
-        known = set(known)
+        rng, known = rng_for(seed, "play", layout), set(known)
         groups: dict[bytes, _Sample] = {}
-        observation, _info = env.reset(seed=layout)
         episode = step = 0
-        for _ in range(config.steps):
+
+        def look(observation: Any) -> None:
             image = as_image(observation, self.observation_shape)
             digest = _digest(image)
             if digest not in known:
@@ -149,12 +148,17 @@ class GymnasiumDomain:
                 labels = self.label(env)
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states, labels))
                 group.offer((image, layout, episode, step), rng)
+
+        observation, _info = env.reset(seed=layout)
+        look(observation)
+        for _ in range(config.steps):
             if self.policy is None or rng.random() < config.explore:
                 action = int(rng.integers(env.action_space.n))  # type: ignore[attr-defined]
             else:
                 action = int(self.policy(env, observation, rng))
             observation, _reward, terminated, truncated, _info = env.step(action)
             step += 1
+            look(observation)  # the last state of an episode, too: a sub-goal may lie there
             progress.advance()
             if terminated or truncated or step >= config.max_episode_steps:
                 observation, _info = env.reset(seed=layout)
