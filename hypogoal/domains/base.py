@@ -68,15 +68,22 @@ class Engine(Protocol):
 
 @runtime_checkable
 class Domain(Protocol):
-    """What hypogoal needs to know of a domain.
+    """What hypogoal needs to know of a domain; :class:`hypogoal.GymnasiumDomain` makes one of an environment.
 
-    It may also have ``env_id`` (its Gymnasium environment), ``starts`` (names of places where episodes begin, one of which ``make_engine`` takes as ``start``),
-    ``distance`` (positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
-    sub-goal holds), ``picture`` (room -> uint8 (height, width, 3)) and ``pixel`` (positions -> column and row in that
-    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``),
-    ``collected_bytes`` (config -> bytes of observations that ``collect`` will make, at the most), ``played_bytes`` (steps
-    -> bytes of pictures that an engine keeps while it plays them), ``defaults`` (see ``defaults_of``) and ``resumes``: where that is true, ``collect`` also takes ``kept``, a function from a name to the
-    ``Checkpoints`` in which the part of that name is kept until all are there.
+    ``hypogoal check`` tests it. It may also have
+
+    - ``env_id``: its Gymnasium environment;
+    - ``defaults``: settings of stages that suit it, see ``defaults_of``;
+    - ``collected_bytes``: config -> bytes of observations that ``collect`` will make, at the most;
+    - ``played_bytes``: steps -> bytes of pictures that an engine keeps while it plays them, at the most;
+    - ``resumes``: true where ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which the
+      part of that name is kept until all are there;
+    - ``kinds``: names of the values of the origin ``kind``;
+    - ``starts``: names of places where episodes begin, one of which ``make_engine`` takes as ``start``;
+    - ``distance``: positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
+      sub-goal holds;
+    - ``picture``: room -> uint8 (height, width, 3), ``pixel``: positions -> column and row in that picture (n, 2),
+      ``rooms_of``: start -> the rooms to draw.
     """
 
     name: str
@@ -132,4 +139,3 @@ def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str,
     """
     defaults: Mapping[str, Mapping[str, Any]] = getattr(installed_domain(domain, given=given), "defaults", {})
     return defaults.get(stage, {})
-

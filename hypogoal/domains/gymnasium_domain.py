@@ -129,8 +129,9 @@ class GymnasiumDomain:
             sets.append(_joined(own, self.observation_shape, len(self.sub_goals)))
             seen.update(map(_digest, sets[-1].observations))
         env.close()
-        self._require_classes(*sets, config)
-        return Collected(self.observation_shape, self.sub_goals, *sets)
+        labelled, unlabelled, heldout = sets
+        self._require_classes(labelled, unlabelled, heldout, config)
+        return Collected(self.observation_shape, self.sub_goals, labelled, unlabelled, heldout)
 
     def _play(
         self, env: gymnasium.Env, config: GymnasiumConfig, layout: int, seed: int, known: set[bytes], progress: Any

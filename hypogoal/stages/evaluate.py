@@ -320,7 +320,9 @@ def states_of_layout(engine: Any, steps: int = 2_000) -> NDArray[np.int64]:
         known: NDArray[np.int64] = engine.reachable()
         return known
     rng = rng_for(0, "states-of-layout")
-    met = [engine.step(rng.integers(engine.n_actions, size=engine.count)).next_ids for _ in range(steps // engine.count)]
+    met = [
+        engine.step(rng.integers(engine.n_actions, size=engine.count)).next_ids for _ in range(steps // engine.count)
+    ]
     return np.unique(np.concatenate([engine.ids, *met]))
 
 

@@ -16,7 +16,6 @@ TESTS = Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TESTS))
-    monkeypatch.syspath_prepend(str(TESTS / "domains"))
     monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
 
 
