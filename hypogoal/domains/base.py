@@ -76,8 +76,8 @@ class Domain(Protocol):
     - ``defaults``: settings of stages that suit it, see ``defaults_of``;
     - ``collected_bytes``: config -> bytes of observations that ``collect`` will make, at the most;
     - ``played_bytes``: steps -> bytes of pictures that an engine keeps while it plays them, at the most;
-    - ``resumes``: true where ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which the
-      part of that name is kept until all are there;
+    - ``resumes``: true where ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which
+      the part of that name is kept until all are there;
     - ``kinds``: names of the values of the origin ``kind``;
     - ``starts``: names of places where episodes begin, one of which ``make_engine`` takes as ``start``;
     - ``distance``: positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
