@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench clean
+.PHONY: help setup demo test check bench docs clean
 
 help: ## what one can make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,6 +43,9 @@ check: $(STAMP) ## linter, formatter, types, import contracts
 bench: $(STAMP) ## DoorKey steps per second, MiniGrid's and ours (BENCH=--short for a quick look)
 	$(BIN)/python -m benchmarks.doorkey $(BENCH)
 
+docs: $(STAMP) ## the documentation as a site, in site/
+	$(BIN)/python -m mkdocs build --strict
+
 clean: ## remove caches and builds; data/, runs/ and .venv stay
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -64,7 +64,11 @@ _ALL = (
         ("data",),
     ),
     Stage("climbers", ("train-ensemble", "{rooms}", *_set("steps=4", "workers=1", "members=2")), ("rooms",)),
-    Stage("options", ("train-options", "{ensemble}", *_set("steps=1000", "environments=8", *QUICK)), ("ensemble",)),
+    Stage(
+        "options",
+        ("train-options", "{ensemble}", *_set("steps=1000", "environments=8", "save_visited=50", *QUICK)),
+        ("ensemble",),
+    ),
     Stage(
         "meta",
         (

@@ -11,6 +11,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hypogoal.core.hdf5 import fixed
+
 Rng = random.Random
 
 
@@ -175,8 +177,11 @@ def _attribute(file: Any, rng: Rng, odd: list[Any]) -> None:
     value = rng.choice(odd)
     kinds: list[Callable[[], Any]] = [
         lambda: text,
+        lambda: fixed(text),
         lambda: (
-            json.dumps(tree_changed(json.loads(file.attrs[name]), rng, odd)) if isinstance(file.attrs[name], str) else 3
+            fixed(json.dumps(tree_changed(json.loads(file.attrs[name]), rng, odd)))
+            if isinstance(file.attrs[name], bytes) and name != "domain"
+            else 3
         ),
         lambda: np.zeros(1000),
         lambda: file.ref,

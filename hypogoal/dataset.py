@@ -22,9 +22,19 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, plain_name
-from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, members, open_hdf5, read_array
-from hypogoal.core.manifests import FORMAT_VERSION
+from hypogoal.core.hdf5 import (
+    Foreign,
+    attribute,
+    check_dataset,
+    create_hdf5,
+    find,
+    members,
+    open_hdf5,
+    read_array,
+    set_attribute,
+)
 
+DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 ATTRIBUTES = (
     "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete", "lost",
@@ -83,14 +93,14 @@ def write_dataset(
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
         with create_hdf5(partial) as file:
-            file.attrs["format"] = FORMAT_VERSION
-            file.attrs["domain"] = domain
-            file.attrs["sub_goals"] = json.dumps(list(collected.sub_goals))
-            file.attrs["observation_shape"] = json.dumps(list(collected.observation_shape))
-            file.attrs["config"] = json.dumps(dict(config))
-            file.attrs["seed"] = seed
-            file.attrs["versions"] = json.dumps(versions())
-            file.attrs["complete"] = False  # its place is in front: a file that is cut off keeps its attributes
+            set_attribute(file, "format", DATA_FORMAT)
+            set_attribute(file, "domain", domain)
+            set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
+            set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
+            set_attribute(file, "config", json.dumps(dict(config)))
+            set_attribute(file, "seed", seed)
+            set_attribute(file, "versions", json.dumps(versions()))
+            set_attribute(file, "complete", False)  # its place is in front: a file that is cut off keeps its attributes
             for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
                 _write_split(file, split, states, collected.sub_goals)
             group = file.create_group("unlabelled")
@@ -119,7 +129,10 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
     """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
-    chunk = (min(64, max(1, len(observations))), *observations.shape[1:])
+    if not len(observations):
+        group.create_dataset("observations", data=observations)  # no chunk is as small as that
+        return
+    chunk = (min(64, len(observations)), *observations.shape[1:])
     group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
 
 
@@ -137,14 +150,16 @@ class Dataset:
 
     def __init__(self, path: Path):
         self.path = path
-        with self._file() as file:
-            self.attributes = {name: attribute(file, name) for name in ATTRIBUTES}
         foreign = UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
-        version = self.attributes["format"]
-        if not isinstance(version, int) or isinstance(version, bool):
-            raise foreign
-        if version > FORMAT_VERSION:
-            raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
+        with self._file() as file:
+            version = attribute(file, "format")
+            if not isinstance(version, int) or isinstance(version, bool):
+                raise foreign
+            if version > DATA_FORMAT:
+                raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
+            if version < DATA_FORMAT:
+                raise UserError(f"format {version} is that of an earlier hypogoal", path, AGAIN)
+            self.attributes = {name: attribute(file, name) for name in ATTRIBUTES}
         if not self.attributes["complete"]:
             raise UserError("the data file is not complete", path, f"{AGAIN} Or save what is whole: {REPAIR} {path}")
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
@@ -219,7 +234,8 @@ class Dataset:
     @staticmethod
     def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:
         group = find(file, f"{base}/origin")
-        origins = {name: read_array(file, f"{base}/origin/{name}", "iub") for name in members(group or ())}
+        names = members(group) if group is not None else []
+        origins = {name: read_array(file, f"{base}/origin/{name}", "iub") for name in names}
         for name, values in origins.items():
             if values.shape != (count,):
                 raise Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")

@@ -6,6 +6,7 @@ process with torch has before any of it (450 MB were measured while ``train-meta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
 PER_TRANSITION = 50  # bytes in a replay, its sum tree included
+CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
 LOGS = 50e6
 
 
@@ -31,14 +33,17 @@ class Needs(NamedTuple):
     disk: float
 
 
-def ensemble_needs(data: Path, config: EnsembleConfig, sub_goals: int, workers: int) -> Needs:
+def ensemble_needs(
+    data: Path, unlabelled: Sequence[Path], config: EnsembleConfig, sub_goals: int, workers: int
+) -> Needs:
     """``train-ensemble``: each process holds a sub-goal's states three times (read, as seen, prepared)."""
     dataset = open_dataset(data)
-    counts = dataset.counts()
-    labelled = max((row["states"] for row in counts["labelled"].values()), default=0)
-    states = (labelled + counts["unlabelled"]) * prod(dataset.observation_shape)
-    own = BASE + 3 * states + COPIES * config.members * MEMBER
-    return Needs(workers * own, sub_goals * config.members * MEMBER + LOGS)
+    labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
+    others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
+    states = (labelled + others) * prod(dataset.observation_shape)
+    training = COPIES * config.members * MEMBER
+    own = BASE + 3 * states + training
+    return Needs(workers * own, sub_goals * (config.members * MEMBER + training) + CHECKPOINTS * training + LOGS)
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Needs:
@@ -59,14 +64,17 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
     kept = frames if getattr(domain, "starts", ()) else 0
     if hasattr(domain, "played_bytes"):
         kept = domain.played_bytes(getattr(config, "steps", 0))
-    stops = STOPS_KEPT * options * picture
-    memory = BASE + replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
-    return Needs(memory + len(about["sub_goals"]) * about["members"] * MEMBER, weights + stops + LOGS)
+    stops = STOPS_KEPT * options * picture + config.save_visited * picture
+    state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
+    members = len(about["sub_goals"]) * about["members"] * MEMBER
+    # A checkpoint is a copy of the state, in memory while it is written.
+    return Needs(BASE + 2 * state + members, weights + stops + CHECKPOINTS * state + LOGS)
 
 
 def baseline_needs(observation: int, replay: int) -> Needs:
     """``train-baseline``: ``replay`` transitions of two observations of so many bytes."""
-    return Needs(BASE + 100e6 + 2.0 * observation * replay, LOGS)
+    state = 2.0 * observation * replay
+    return Needs(BASE + 100e6 + 2 * state, CHECKPOINTS * (state + 50e6) + LOGS)
 
 
 def evaluation_needs(data: list[Path]) -> Needs:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, require_file
-from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, read_array, walk
+from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, read_array, set_attribute, walk
 from hypogoal.core.preflight import free_disk, human
 from hypogoal.dataset import ATTRIBUTES, open_dataset, write_observations
 
@@ -151,11 +151,11 @@ def _write(
     with create_hdf5(path) as file:
         for name, value in about.items():
             if value is not None and name not in ("sub_goals", "observation_shape", "lost", "complete"):
-                file.attrs[name] = value
-        file.attrs["sub_goals"] = json.dumps(sub_goals)
-        file.attrs["observation_shape"] = json.dumps(about["observation_shape"])
-        file.attrs["lost"] = json.dumps(lost)
-        file.attrs["complete"] = True
+                set_attribute(file, name, value)
+        set_attribute(file, "sub_goals", json.dumps(sub_goals))
+        set_attribute(file, "observation_shape", json.dumps(about["observation_shape"]))
+        set_attribute(file, "lost", json.dumps(lost))
+        set_attribute(file, "complete", True)
         for group, arrays in parts.items():
             place = file.create_group(group)
             for name, values in arrays.items():

@@ -101,7 +101,7 @@ def _read_arrays(path: Path) -> None:
     with open_hdf5(path, "the file of arrays", AGAIN) as file:
         try:
             for name in walk(file):
-                read_array(file, name, "uibfT")
+                read_array(file, name, "uibfS")
         except Foreign as error:
             raise UserError(f"the file of arrays is damaged ({error})", path, AGAIN) from None
 

@@ -6,7 +6,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +17,7 @@ from rich.live import Live
 from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST
+from hypogoal.core.boards import Boards
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError
@@ -35,32 +36,49 @@ class Progressing:
     """One artefact that is made, or was.
 
     Attributes:
-        name: its path within the run; of an ensemble with the sub-goal that it is at.
+        name: its path within the run.
+        sub_goal: that an ensemble is at; empty for others.
         seconds: since its log was written; None when it is complete.
         step: the last logged.
         watched: what is followed (one of ``WATCHED``), empty where there is nothing to follow.
         series: its values so far.
+        lines: its log so far, of an ensemble of all sub-goals.
     """
 
     name: str
+    sub_goal: str
     seconds: float | None
     step: int
     watched: str
     series: tuple[float, ...]
+    lines: list[dict[str, Any]]
+
+    @property
+    def title(self) -> str:
+        """What a person calls it."""
+        return f"{self.name}: {self.sub_goal}" if self.sub_goal else self.name
 
 
-def watch(run: Path, *, once: bool = False) -> None:
+def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> None:
     """Show how a run's artefacts are doing, again and again until it is finished or interrupted.
 
     Args:
         run: the folder that ``hypogoal run`` or stages write into.
         once: print the view once; so it is done too where there is no terminal, and where the run is finished.
+        boards: get the logs too.
 
     Raises:
         UserError: there is no such folder, or nothing in it that logs.
     """
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-    rows = read_progress(run)
+
+    def look() -> list[Progressing]:
+        rows = read_progress(run)
+        if boards is not None:
+            mirror(rows, boards)
+        return rows
+
+    rows = look()
     if once or not console.is_terminal or finished(run):
         console.print(view(rows))
         return
@@ -68,9 +86,20 @@ def watch(run: Path, *, once: bool = False) -> None:
         with Live(view(rows, console.height - 3), console=console, screen=False, auto_refresh=False) as live:
             while not finished(run):
                 time.sleep(SECONDS)
-                live.update(view(read_progress(run), console.height - 3), refresh=True)
+                live.update(view(look(), console.height - 3), refresh=True)
     except KeyboardInterrupt:
         return
+
+
+def mirror(rows: Iterable[Progressing], boards: Boards) -> None:
+    """What is new in the logs to TensorBoard: a folder per artefact, of an ensemble one per sub-goal."""
+    for row in rows:
+        by_place: dict[str, list[dict[str, Any]]] = {}
+        for line in row.lines:
+            place = f"{row.name}/{line['sub_goal']}" if "sub_goal" in line else row.name
+            by_place.setdefault(place, []).append(line)
+        for place, lines in by_place.items():
+            boards.add(place, lines)
 
 
 def finished(run: Path) -> bool:
@@ -90,7 +119,7 @@ def read_progress(run: Path) -> list[Progressing]:
     found = [_read(log, run) for log in sorted(logs)]
     if not found:
         raise UserError(f"nothing to watch: no {LOG}", run, "Training stages write it as they go; is one running?")
-    return sorted(found, key=lambda row: (row.seconds is None, row.name))
+    return sorted(found, key=lambda row: (row.seconds is None, row.title))
 
 
 def _read(log: Path, run: Path) -> Progressing:
@@ -99,17 +128,16 @@ def _read(log: Path, run: Path) -> Progressing:
     draft = next((folder for folder in log.parents if re.fullmatch(rf"\..+{re.escape(PARTIAL)}", folder.name)), None)
     place = draft.with_name(draft.name[1 : -len(PARTIAL)]) if draft else log.parent
     name = place.relative_to(run).as_posix() if place != run else place.name
-    if "sub_goal" in last:
-        name = f"{name}: {last['sub_goal']}"
-        lines = [line for line in lines if line.get("sub_goal") == last["sub_goal"]]
+    goal = str(last.get("sub_goal", ""))
+    own = [line for line in lines if line.get("sub_goal", "") == goal]
     watched = next((key for key in WATCHED if key in last), "")
-    series = tuple(float(line[watched]) for line in lines if isinstance(line.get(watched), int | float))
+    series = tuple(float(line[watched]) for line in own if isinstance(line.get(watched), int | float))
     whole = draft is None and (place / MANIFEST).is_file()
     try:
         seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
     except OSError:  # renamed since: it has just become complete
         seconds = None
-    return Progressing(name, seconds, int(last.get("step", 0)), watched, series)
+    return Progressing(name, goal, seconds, int(last.get("step", 0)), watched, series, lines)
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
@@ -142,7 +170,7 @@ def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
     shown = rows if most is None or len(rows) <= most else rows[: max(1, most - 1)]
     for row in shown:
         table.add_row(
-            row.name if len(row.name) <= NAME else f"…{row.name[1 - NAME :]}",
+            row.title if len(row.title) <= NAME else f"…{row.title[1 - NAME :]}",
             "done" if row.seconds is None else f"{_ago(row.seconds)} ago",
             f"{row.step:,}",
             f"{row.watched} {row.series[-1]:.3g}" if row.series else "–",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.hdf5 import set_attribute
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
 
 
@@ -45,6 +46,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     [
         ("format", 99, "newer"),
         ("format", "x", "not a hypogoal data file"),
+        ("format", 1, "earlier"),
         ("complete", False, "not complete"),
         ("domain", None, "not a hypogoal data file"),
         ("sub_goals", "{", "not a hypogoal data file"),
@@ -58,7 +60,7 @@ def test_foreign_and_damaged_attributes(tmp_path: Path, attribute: str, value: A
     with h5py.File(path, "a") as file:
         del file.attrs[attribute]
         if value is not None:
-            file.attrs[attribute] = value
+            set_attribute(file, attribute, value)
     with pytest.raises(UserError, match=words) as caught:
         open_dataset(path)
     assert "\n" not in str(caught.value)

@@ -17,6 +17,7 @@ from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
+from hypogoal.core.hdf5 import set_attribute
 from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
@@ -62,6 +63,14 @@ HOSTILE = {
         ),
         "declares",
     ),
+    "texts of variable length": (
+        lambda f, s: f.create_dataset(OBSERVATIONS, shape=(7, *SHAPE), dtype=h5py.string_dtype()),
+        "type",
+    ),
+    "a dataset in place of a group": (
+        lambda f, s: f.create_dataset("labelled/one/origin", shape=(2**40,), dtype="u1"),
+        "a group should be",
+    ),
     "another shape": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, 9), "u1")), "not uint8"),
 }
 
@@ -73,7 +82,11 @@ def test_hostile_hdf5(tmp_path: Path, case: str) -> None:
     with h5py.File(tmp_path / "secret.h5", "w") as file:
         file["x"] = np.ones((7, *SHAPE), "u1")
     path = write(tmp_path / "data.h5")
-    replaced(path, OBSERVATIONS, lambda file: make(file, tmp_path / "secret.h5"))
+    replaced(
+        path,
+        "labelled/one/origin" if "group" in case else OBSERVATIONS,
+        lambda file: make(file, tmp_path / "secret.h5"),
+    )
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(UserError, match=words) as caught:
         open_dataset(path).labelled("one")
@@ -102,8 +115,17 @@ def test_names_of_sub_goals_become_files(tmp_path: Path, names: Any) -> None:
     """Spec G2: a sub-goal called ../../x would be written outside --out."""
     path = write(tmp_path / "data.h5")
     with h5py.File(path, "a") as file:
-        file.attrs["sub_goals"] = json.dumps(names)
+        set_attribute(file, "sub_goals", json.dumps(names))
     with pytest.raises(UserError, match="not a hypogoal data file"):
+        open_dataset(path)
+
+
+def test_texts_of_variable_length(tmp_path: Path) -> None:
+    """Spec G2: these lie in a heap that the HDF5 library, where it is damaged, may read for ever."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path, "a") as file:
+        file.attrs["domain"] = "toy"
+    with pytest.raises(UserError, match="'domain' is no text of fixed length"):
         open_dataset(path)
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import sys
 import time
 
 import pytest
@@ -10,9 +11,10 @@ from rich.console import Console
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.boards import Boards
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog
-from hypogoal.watching import BARS, curve, finished, read_progress, view
+from hypogoal.watching import BARS, curve, finished, mirror, read_progress, view
 
 
 def write(folder, rows):
@@ -42,7 +44,7 @@ def test_what_is_being_made_comes_first(run):
     assert (agent.name, agent.step, agent.watched) == ("meta/layout-100-seed-0", 9_000, "success")
     assert agent.series == tuple(s / 10 for s in range(1, 10))
     assert agent.seconds is not None and agent.seconds < 60
-    assert (ensemble.name, ensemble.seconds) == ("ensemble: open-red-door", None)
+    assert (ensemble.title, ensemble.seconds) == ("ensemble: open-red-door", None)
     assert ensemble.series == (0.1, 0.05)
 
 
@@ -101,3 +103,52 @@ def test_a_run_is_finished_when_it_says_so(tmp_path):
         (tmp_path / "run.json").write_text(json.dumps({}))
         assert not finished(tmp_path)
     assert finished(tmp_path)
+
+
+def events(folder):
+    """(step, tag, value) of all event files in a folder."""
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+    found = []
+    for path in sorted(folder.glob("events.*")):
+        for event in EventFileLoader(str(path)).Load():
+            found += [(event.step, value.tag, value.tensor.float_val[0]) for value in event.summary.value]
+    return found
+
+
+def test_tensorboard_reads_the_logs(run, tmp_path, capsys):
+    """Spec A6: every number of every log, an ensemble's by sub-goal, also while an agent is still learning."""
+    out = tmp_path / "boards"
+    assert main(["watch", str(run), "--once", "--tensorboard", str(out)]) == 0
+    agent = events(out / "meta/layout-100-seed-0")
+    assert [row for row in agent if row[1] == "success"] == [
+        (1_000 * s, "success", pytest.approx(s / 10)) for s in range(1, 10)
+    ]
+    assert {tag for _, tag, _ in agent} == {"success", "length"}
+    assert events(out / "ensemble/open-red-door") == [
+        (10, "loss", pytest.approx(0.1)),
+        (20, "loss", pytest.approx(0.05)),
+    ]
+    assert main(["watch", str(run), "--once", "--tensorboard", str(out)]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_tensorboard_gets_what_is_new_once(run, tmp_path):
+    """Spec A6: looking again writes only the lines that came since, a resumed stage's old ones not again."""
+    boards = Boards(tmp_path / "boards")
+    mirror(read_progress(run), boards)
+    log = next(run.glob("meta/.*/files/metrics.jsonl"))
+    kept = log.read_text().splitlines()[:5]
+    log.write_text("\n".join([*kept, '{"step": 6000, "success": 0.6}', '{"step": 10000, "success": 1.0}']) + "\n")
+    mirror(read_progress(run), boards)
+    boards.close()
+    found = [step for step, tag, _ in events(tmp_path / "boards/meta/layout-100-seed-0") if tag == "success"]
+    assert found == [1_000 * s for s in range(1, 11)]
+
+
+def test_without_the_extra(run, tmp_path, monkeypatch, capsys):
+    """Spec A6: one line that says what to install, and no folder."""
+    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.event_file_writer", None)
+    assert main(["watch", str(run), "--tensorboard", str(tmp_path / "boards")]) == 2
+    assert "pip install 'hypogoal[tensorboard]'" in capsys.readouterr().err
+    assert not (tmp_path / "boards").exists()

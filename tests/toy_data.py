@@ -9,7 +9,7 @@ from hypogoal.dataset import Collected, States, write_dataset
 SHAPE = (4, 5, 3)
 
 
-def write(path: Path, states: int = 7) -> Path:
+def write(path: Path, states: int = 7, domain: str = "toy") -> Path:
     """Two sub-goals, three sets of random states; ``path``."""
     rng = np.random.default_rng(0)
 
@@ -18,5 +18,5 @@ def write(path: Path, states: int = 7) -> Path:
         return States(images, rng.random((count, 2)) < 0.5, {"layout_seed": np.arange(count)})
 
     collected = Collected(SHAPE, ("one", "two"), some(states), some(states), some(states))
-    write_dataset(path, collected, domain="toy", config={"a": 1}, seed=3)
+    write_dataset(path, collected, domain=domain, config={"a": 1}, seed=3)
     return path

@@ -59,6 +59,13 @@ def train_ensemble(
     out: Out,
     diversity: Annotated[str | None, typer.Option(help="dbat, divdis, none, or module:function.")] = None,
     members: Annotated[int | None, typer.Option(help="Hypotheses per sub-goal (K).")] = None,
+    unlabelled: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Take the unlabelled states of this data file, or those visited by these options or this "
+            "meta-policy, instead of DATA's; repeatable."
+        ),
+    ] = None,
     preset: Preset = None,
     set_: Set = None,
     seed: Seed = 0,
@@ -83,7 +90,8 @@ def train_ensemble(
     with own_code.given(*typed, *own):  # and not what a preset says, which may be a stranger's file
         own_code.require_trust(config.diversity, "diversity objective")
         own_code.require_trust(config.network, "network")
-    stage(data, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
+    others = tuple(unlabelled or ())
+    stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)
 
 

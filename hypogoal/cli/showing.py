@@ -56,11 +56,15 @@ def verify(
 def watch(
     run: Annotated[Path, typer.Argument(help="A run, finished or not.")],
     once: Annotated[bool, typer.Option("--once", help="Print it once instead of following it.")] = False,
+    tensorboard: Annotated[
+        Path | None, typer.Option(help="Write the logs into this new folder too, for TensorBoard (an extra).")
+    ] = None,
 ) -> None:
     """Follow a run in the terminal: each artefact's steps and success or loss so far. Ctrl-C ends it."""
+    from hypogoal.core.boards import Boards
     from hypogoal.watching import watch as look
 
-    look(run, once=once)
+    look(run, once=once, boards=Boards(tensorboard) if tensorboard else None)
 
 
 @app.command()

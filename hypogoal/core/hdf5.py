@@ -61,21 +61,33 @@ class Foreign(Exception):
     """Something in an HDF5 file that is refused; the caller says where and what to do."""
 
 
+def fixed(text: str) -> NDArray[np.bytes_]:
+    """A text as HDF5 stores it in place, in fixed length (UTF-8): one of variable length lies in its global heap."""
+    import h5py
+
+    data = text.encode()
+    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+
+
+def set_attribute(file: Any, name: str, value: str | int | float | bool) -> None:
+    """An attribute of the root; a text in fixed length."""
+    stored = fixed(value) if isinstance(value, str) else np.asarray(value)
+    file.attrs.create(name, stored, dtype=stored.dtype)
+
+
 def attribute(file: Any, name: str) -> Any:
     """An attribute of the root: a text, an int, a float or a bool; None where there is none.
 
     Raises:
-        Foreign: it is something else, or larger than ``MAX_ATTRIBUTE_BYTES``.
+        Foreign: it is something else (a text of variable length too: HDF5 2.0 may read one from a damaged heap for
+            ever), or larger than ``MAX_ATTRIBUTE_BYTES``.
     """
-    import h5py
-
     try:
         if name not in file.attrs:
             return None
         stored = file.attrs.get_id(name)
-        text = h5py.check_string_dtype(stored.dtype) is not None
-        if stored.shape not in ((), (1,)) or not (text or stored.dtype.kind in "iufb"):
-            raise Foreign(f"the attribute {name!r} is no text or number")
+        if stored.shape not in ((), (1,)) or stored.dtype.kind not in "Siufb":
+            raise Foreign(f"the attribute {name!r} is no text of fixed length or number")
         if stored.get_storage_size() > MAX_ATTRIBUTE_BYTES:
             raise Foreign(f"the attribute {name!r} is too large")
         value = file.attrs[name]
@@ -89,8 +101,12 @@ def members(group: Any) -> list[str]:
     """The names in a group, sorted.
 
     Raises:
-        Foreign: too many, or names that are no plain ones.
+        Foreign: it is no group, has too many, or names that are no plain ones.
     """
+    import h5py
+
+    if not isinstance(group, h5py.Group):  # the names in a dataset would be its values, of which there may be 2^62
+        raise Foreign("a dataset is where a group should be")
     try:
         count = len(group)
         names = sorted(group) if count <= MAX_ENTRIES else []
@@ -128,11 +144,11 @@ def check_dataset(dataset: Any, kinds: str) -> int:
 
     Args:
         dataset: from :func:`find`.
-        kinds: the kinds of number allowed, letters of NumPy's ``dtype.kind``; ``T`` for one text.
+        kinds: the kinds of number allowed, letters of NumPy's ``dtype.kind``; ``S`` for texts of fixed length.
 
     Raises:
-        Foreign: another type (references among them), data outside the file, a filter that is a plugin, or more bytes
-            declared than what is stored can stand for.
+        Foreign: another type (references and texts of variable length among them), data outside the file, a filter
+            that is a plugin, or more bytes declared than what is stored can stand for.
     """
     import h5py
 
@@ -140,9 +156,8 @@ def check_dataset(dataset: Any, kinds: str) -> int:
         raise Foreign("a dataset is missing")
     try:
         dtype, shape, name = dataset.dtype, dataset.shape, dataset.name
-        text = h5py.check_string_dtype(dtype) is not None
         settings = dataset.id.get_create_plist()
-        if text != ("T" in kinds and shape == ()) or not (text or dtype.kind in kinds) or shape is None:
+        if dtype.kind not in kinds or shape is None:
             raise Foreign(f"{name!r} has values of an unexpected type ({dtype}, shape {shape})")
         if dataset.is_virtual or settings.get_external_count():
             raise Foreign(f"the data of {name!r} lie in another file")
@@ -155,7 +170,7 @@ def check_dataset(dataset: Any, kinds: str) -> int:
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
         raise Foreign("a dataset is not readable") from None
     ratio = MOST_RATIO if settings.get_nfilters() else 1
-    if not text and (stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES):
+    if stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES:
         raise Foreign(f"{name!r} declares {human(size)}, of which {human(stored)} are stored in {human(whole)}")
     return size
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.hdf5 import fixed
 from hypogoal.dataset import Split
 from hypogoal.evaluation.agents import Run, agent_curves, common_grid
 from hypogoal.evaluation.distance import Executions, fates
@@ -49,8 +50,8 @@ def write_states(
     group["labels"] = split.labels[index]
     seeds = split.origins.get("layout_seed")
     group["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
-    group["kinds"] = json.dumps([kind for _, kind in picked])
-    group["places"] = json.dumps([place_of(split.origins, state) for state in index])
+    group["kinds"] = fixed(json.dumps([kind for _, kind in picked]))
+    group["places"] = fixed(json.dumps([place_of(split.origins, state) for state in index]))
 
 
 def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:

@@ -58,6 +58,6 @@ def _metrics(path: Path) -> dict[str, Any]:
 def _arrays(path: Path, start: str) -> dict[str, NDArray[Any]]:
     with open_hdf5(path, "the evaluation's arrays", AGAIN) as file:
         try:
-            return {name: read_array(file, name, "uibfT") for name in walk(file) if name.startswith(start)}
+            return {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
         except Foreign as error:
             raise UserError(f"the evaluation's arrays are damaged ({error})", path, AGAIN) from None

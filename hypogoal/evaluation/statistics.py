@@ -120,7 +120,8 @@ def compare_pairs(
     it has no width, so the sign test stands beside it, which few pairs cannot make small.
 
     Args:
-        first, second: float (n,), pair by pair; pairs with a NaN are left out.
+        first: float (n,), pair by pair; pairs with a NaN are left out.
+        second: float (n,), of the other method.
         strata: n hashable marks.
         rng: draws the resamples.
         higher: the better value is the higher one.

@@ -71,9 +71,7 @@ class SubgoalReward(_Subgoal):
     ``info["subgoal"]`` says whether the sub-goal holds.
     """
 
-    def __init__(
-        self, env: Env, ensemble: Ensemble, by: str | int = "vote", *, scale: float = 1.0, add: bool = False
-    ):
+    def __init__(self, env: Env, ensemble: Ensemble, by: str | int = "vote", *, scale: float = 1.0, add: bool = False):
         super().__init__(env, ensemble, by, scale=scale, add=add)
         self.scale, self.add = scale, add
 

@@ -20,6 +20,7 @@ from hypogoal.options.light import LightLearner
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.running import MemberVerdicts
 from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
+from hypogoal.options.visited import Visited
 
 LOG_INTERVAL = 2_000  # environment steps
 LEARNERS: dict[str, type[LightLearner] | type[RecurrentLearner]] = {"light": LightLearner, "paper": RecurrentLearner}
@@ -44,6 +45,9 @@ class PlayConfig(OptionConfig):
         "members' verdicts, or the true sub-goals (upper bound)",
         source="E6",
         choices=("learned", "oracle"),
+    )
+    save_visited: int = setting(
+        0, "distinct states visited that are kept as a data file, to train ensembles with", source="Spec B7", low=0
     )
     random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="F5", low=0)
 
@@ -79,6 +83,11 @@ def build(
         if hasattr(engine, "reachable"):
             verdicts.of(engine.reachable())  # most of what will be visited, judged at once
     return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed)
+
+
+def visited_by(engine: Engine, config: PlayConfig, seed: int) -> Visited | None:
+    """Spec B7: what keeps visited states; None where none are to be kept."""
+    return Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None
 
 
 def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
+from hypogoal.options.visited import Visited
 
 NONE = -1
 RUNNING = ("option", "began", "age", "inside", "returns", "episode_reward", "episode_length", "counts")
@@ -190,6 +191,7 @@ class OptionLoop:
         config: timeouts, masks, whether options begin at start states.
         gamma: the meta-level's discount per environment step (E1).
         initiation: holds options back where they do not reach their sub-goals (D7); None, it holds none back.
+        visited: is shown every state (B7).
 
     Raises:
         UserError: options are to begin at start states, and the engine cannot begin an episode when asked.
@@ -205,8 +207,9 @@ class OptionLoop:
         config: OptionConfig,
         gamma: float,
         initiation: Initiation | None = None,
+        visited: Visited | None = None,
     ):
-        self.initiation = initiation
+        self.initiation, self.visited = initiation, visited
         self.engine, self.verdicts, self.learner, self.chooser = engine, verdicts, learner, chooser
         self.recorder, self.config, self.gamma = recorder, config, gamma
         if config.restart_options and not hasattr(engine, "restart"):
@@ -251,6 +254,8 @@ class OptionLoop:
         if self.config.restart_options:
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
             self.engine.restart(ended & ~over)  # type: ignore[attr-defined]
+        if self.visited:
+            self.visited.see(step.next_ids, actions, step.terminated | step.truncated)
         self.recorder.steps += len(ids)
         self._finish_options(step, reached, ended)
         self._finish_episodes(step)
@@ -350,5 +355,5 @@ class OptionLoop:
             setattr(self, name, values)
 
     def _parts(self) -> dict[str, Any]:
-        names = ("engine", "verdicts", "learner", "chooser", "recorder", *(("initiation",) if self.initiation else ()))
-        return {name: getattr(self, name) for name in names}
+        names = ("engine", "verdicts", "learner", "chooser", "recorder", "initiation", "visited")
+        return {name: part for name in names if (part := getattr(self, name)) is not None}

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of
@@ -18,12 +22,13 @@ from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import in_processes
-from hypogoal.dataset import open_dataset
+from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.networks import load_network
 from hypogoal.hypotheses.storage import write_ensemble
 from hypogoal.hypotheses.training import EnsembleConfig, fit
 from hypogoal.needs import ensemble_needs
+from hypogoal.options.visited import VISITED
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,7 @@ def train_ensemble(
     config: TrainEnsembleConfig,
     out: Path,
     *,
+    unlabelled: Sequence[Path] = (),
     seed: int = 0,
     force: bool = False,
     resume: bool = False,
@@ -46,6 +52,14 @@ def train_ensemble(
     device: str = "auto",
 ) -> list[dict[str, Any]]:
     """Train the ensembles of every sub-goal of a data file and write the artefact ``out``.
+
+    Args:
+        data: the data file.
+        config: see :class:`TrainEnsembleConfig`.
+        out: the artefact to write.
+        unlabelled: spec B7: data files, or artefacts with visited states, whose unlabelled states are taken instead
+            of those of ``data``.
+        seed, force, resume, quiet, device: as for every stage.
 
     Returns:
         Per sub-goal, the last losses.
@@ -63,6 +77,7 @@ def train_ensemble(
     for sub_goal in sub_goals:
         if sub_goal not in dataset.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
+    others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
     claim(out, force=force, resume=resume)
     about = as_dict(config) | {
         "sub_goals": list(sub_goals),
@@ -71,11 +86,13 @@ def train_ensemble(
         "domain_config": dataset.config,
     }
     workers = min(config.workers or os.cpu_count() or 1, len(sub_goals))
-    preflight("train-ensemble", out, ensemble_needs(data, config, len(sub_goals), workers), quiet=quiet)
+    preflight(
+        "train-ensemble", out, ensemble_needs(data, others or (data,), config, len(sub_goals), workers), quiet=quiet
+    )
     with create_artefact(
-        out, kind="ensemble", config=about, seed=seed, inputs=[data], force=force, resume=resume
+        out, kind="ensemble", config=about, seed=seed, inputs=[data, *others], force=force, resume=resume
     ) as folder:
-        jobs = [partial(_train_one, data, sub_goal, config, seed, folder) for sub_goal in sub_goals]
+        jobs = [partial(_train_one, data, others, sub_goal, config, seed, folder) for sub_goal in sub_goals]
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
         (folder.parent / FOLDER).mkdir(exist_ok=True)
         with Progress("train-ensemble", total=len(jobs), quiet=quiet) as progress:
@@ -89,6 +106,33 @@ def train_ensemble(
             for sub_goal in sub_goals:
                 joined.write(_metrics(folder, sub_goal).read_text(encoding="utf-8"))
     return summaries
+
+
+def unlabelled_file(path: Path, dataset: Dataset) -> Path:
+    """Spec B7: the data file whose unlabelled states to take: ``path``, or that of an artefact with visited states.
+
+    Raises:
+        UserError: there is none, or it is of another domain or shape than ``dataset``.
+    """
+    file = path / VISITED if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
+        raise UserError("no visited states", path, "Make it with --set save_visited=N.")
+    found = open_dataset(file)
+    for what, here, there in (
+        ("the domain", found.domain, dataset.domain),
+        ("observations of shape", found.observation_shape, dataset.observation_shape),
+    ):
+        if here != there:
+            raise UserError(f"{what} {here}, the data have {there}", file, "Give unlabelled states that fit the data.")
+    return file
+
+
+def joined_unlabelled(files: Sequence[Path]) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
+    """The unlabelled states (M, *obs) of some files one after another, and the origins that all of them have."""
+    found = [(dataset.unlabelled(), dataset.unlabelled_origins()) for dataset in map(open_dataset, files)]
+    names = set.intersection(*(set(origins) for _, origins in found))
+    joined = {name: np.concatenate([origins[name] for _, origins in found]) for name in sorted(names)}
+    return np.concatenate([states for states, _ in found]), joined
 
 
 def _metrics(folder: Path, sub_goal: str) -> Path:
@@ -115,12 +159,15 @@ class _Report:
         self.numbers = snapshot["numbers"]
 
 
-def _train_one(data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path) -> dict[str, Any]:
+def _train_one(
+    data: Path, others: Sequence[Path], sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path
+) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
     checkpoints = checkpoints_of(folder, sub_goal)
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
+    unlabelled, origins = joined_unlabelled(others or (data,))
     report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)))
     if not checkpoints.saved:
         report.log.restore(0)
@@ -128,12 +175,12 @@ def _train_one(data: Path, sub_goal: str, config: TrainEnsembleConfig, seed: int
         ensemble = fit(
             split.observations,
             split.labels,
-            dataset.unlabelled(),
+            unlabelled,
             config,
             seed_for(seed, "ensemble", sub_goal),
             report,
             origins=split.origins,
-            unlabelled_origins=dataset.unlabelled_origins(),
+            unlabelled_origins=origins,
             checkpoints=checkpoints,
         )
     write_ensemble(folder, sub_goal, ensemble)

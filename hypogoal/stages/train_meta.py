@@ -23,7 +23,7 @@ from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import reading
 from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments
+from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments, visited_by
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.needs import play_needs
 from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
@@ -100,14 +100,25 @@ def train_meta(
         policy = MetaPolicy(engine, verdicts.options, config, seed) if config.chooser == "ppo" else None
         chooser: Chooser = policy or RandomChooser(rng_for(seed, "random-choice"))
         initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        visited = visited_by(engine, config, seed)
         loop = OptionLoop(
-            engine, verdicts, learner, chooser, recorder, config, gamma=config.gamma, initiation=initiation
+            engine,
+            verdicts,
+            learner,
+            chooser,
+            recorder,
+            config,
+            gamma=config.gamma,
+            initiation=initiation,
+            visited=visited,
         )
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             play(loop, config.steps, log, progress, checkpoints_of(folder))
         log.close()
         recorder.write(folder, engine.images)
+        if visited:
+            visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
         if policy:
             save_tensors(folder / "meta.safetensors", policy.state())
@@ -135,7 +146,7 @@ def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> 
             trained.path,
             f"Train them from {source.path}.",
         )
-    for key in ("network", "termination", "layout_seed"):
+    for key in ("network", "termination", "layout_seed", "start"):
         if trained.config[key] != getattr(config, key):
             raise UserError(
                 f"these options were trained with {key}={trained.config[key]}, train-meta has {getattr(config, key)}",

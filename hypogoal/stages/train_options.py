@@ -16,7 +16,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments
+from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments, visited_by
 from hypogoal.needs import play_needs
 from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
 from hypogoal.options.initiation import Initiation
@@ -85,7 +85,10 @@ def train_options(
         rng = rng_for(seed, "random-choice")
         chooser = RandomChooser(rng) if config.chooser == "random" else EvenChooser(verdicts.options, rng)
         initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
-        loop = OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=1.0, initiation=initiation)
+        visited = visited_by(engine, config, seed)
+        loop = OptionLoop(
+            engine, verdicts, learner, chooser, recorder, config, gamma=1.0, initiation=initiation, visited=visited
+        )
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:
             play(loop, steps, log, progress, checkpoints_of(folder))
@@ -93,6 +96,8 @@ def train_options(
         recorder.write(folder, engine.images)
         if hasattr(engine, "positions") and hasattr(domain, "distance"):
             recorder.write_executions(folder, engine.positions, domain.distance)
+        if visited:
+            visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
         (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
     counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}

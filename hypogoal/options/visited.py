@@ -1,0 +1,121 @@
+"""Spec B7: states that a policy visited while it learned, kept to train ensembles with."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.seeding import seed_for
+from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.domains.base import Domain, Engine
+
+VISITED = "visited.h5"
+ORIGINS = ("action", "previous_action")  # that led to a state; -1 where there was none
+
+
+class Visited:
+    """A uniform sample of the distinct states visited: those whose hashes are the smallest (a bottom-k sketch).
+
+    Whether a state is kept depends neither on when nor on how often it was visited, and no random numbers are drawn.
+
+    Args:
+        engine: draws states; where it has positions, they are kept too.
+        most: how many states to keep.
+        layout_seed: an origin of the states of an engine without positions.
+        seed: another seed keeps other states.
+    """
+
+    def __init__(self, engine: Engine, most: int, layout_seed: int, seed: int):
+        self.engine, self.most, self.layout_seed = engine, most, layout_seed
+        self._key = seed_for(seed, "visited").to_bytes(16, "little")
+        self._forgets = hasattr(engine, "oldest")  # and gives every step a new id
+        self._known = np.zeros(1024, dtype=np.bool_)
+        self._before = np.full(engine.count, -1, dtype=np.int64)
+        self._kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.int64]]] = {}
+        self._worst: list[int] = []  # a heap of the hashes kept, negative: the largest first
+
+    def see(self, ids: NDArray[np.int64], actions: NDArray[np.int64], over: NDArray[np.bool_]) -> None:
+        """States (E,), the actions (E,) that led to them, and whether the episodes are over, bool (E,)."""
+        fresh = np.arange(len(ids)) if self._forgets else self._unknown(ids)
+        if len(fresh):
+            pictures, places = self.engine.images(ids[fresh]), self._places(ids[fresh])
+            steps = np.stack([actions[fresh], self._before[fresh]], axis=1)
+            for picture, origin in zip(pictures, np.concatenate([steps, places], axis=1), strict=True):
+                self._offer(picture, origin)
+        self._before = np.where(over, -1, actions)
+
+    def _unknown(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        highest = int(ids.max()) + 1
+        if highest > len(self._known):
+            self._known = np.concatenate([self._known, np.zeros(max(highest, len(self._known)), np.bool_)])
+        fresh = np.flatnonzero(~self._known[ids])
+        self._known[ids] = True
+        return fresh
+
+    def _places(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        if hasattr(self.engine, "positions"):
+            places: NDArray[np.int64] = self.engine.positions(ids)
+            return places
+        return np.full((len(ids), 1), self.layout_seed, dtype=np.int64)
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """What is kept of where states come from."""
+        return (*ORIGINS, *(("room", "x", "y") if hasattr(self.engine, "positions") else ("layout_seed",)))
+
+    def _offer(self, picture: NDArray[np.uint8], origin: NDArray[np.int64]) -> None:
+        digest = int.from_bytes(blake2b(picture.tobytes(), digest_size=7, key=self._key).digest(), "little")
+        if digest in self._kept or (len(self._kept) == self.most and digest > -self._worst[0]):
+            return
+        self._kept[digest] = (picture.copy(), origin)
+        heapq.heappush(self._worst, -digest)
+        if len(self._kept) > self.most:
+            del self._kept[-heapq.heappop(self._worst)]
+
+    def states(self) -> States:
+        """The states kept, in the order of their hashes; their labels are not known."""
+        kept = [self._kept[digest] for digest in sorted(self._kept)]
+        pictures = np.array([picture for picture, _ in kept], np.uint8).reshape(-1, *self.engine.observation_shape)
+        columns = np.array([origin for _, origin in kept], np.int64).reshape(-1, len(self.origins)).T
+        return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.origins, columns, strict=True)))
+
+    def write(self, folder: Path, domain: Domain, about: Mapping[str, Any], seed: int) -> None:
+        """``visited.h5`` into ``folder``: a data file whose states are all unlabelled ones.
+
+        Args:
+            folder: of the artefact.
+            domain: where it was played.
+            about: the ensemble manifest's configuration: what the domain and its collection were called.
+            seed: of the stage.
+        """
+        nothing = np.zeros((0, *self.engine.observation_shape), np.uint8)
+        none = States(nothing, np.zeros((0, len(domain.sub_goals)), np.bool_))
+        collected = Collected(self.engine.observation_shape, domain.sub_goals, none, self.states(), none)
+        named = {"domain": about["domain"], "config": about["domain_config"]}
+        write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly."""
+        digests = sorted(self._kept)
+        found = self.states()
+        return {
+            "known": self._known.copy(),
+            "before": self._before.copy(),
+            "digests": np.array(digests, np.int64),
+            "pictures": found.observations,
+            "origins": np.array([self._kept[digest][1] for digest in digests], np.int64),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of one made with the same arguments."""
+        self._known, self._before = snapshot["known"].copy(), snapshot["before"].copy()
+        rows = zip(snapshot["digests"].tolist(), snapshot["pictures"], snapshot["origins"], strict=True)
+        self._kept = {digest: (picture, origin) for digest, picture, origin in rows}
+        self._worst = [-digest for digest in self._kept]
+        heapq.heapify(self._worst)

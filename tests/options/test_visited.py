@@ -1,0 +1,129 @@
+"""Spec B7: what a policy visited while it learned, saved in the data format and learned from again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from corridor import Corridor, LongCorridor
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.dataset import open_dataset
+from hypogoal.options.visited import Visited
+from hypogoal.stages.train_ensemble import joined_unlabelled
+
+TESTS = Path(__file__).parents[1]
+
+
+def walk(visited: Visited, engine: Corridor, steps: int, seed: int = 0) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(steps):
+        actions = rng.integers(engine.n_actions, size=engine.count)
+        step = engine.step(actions)
+        visited.see(step.next_ids, actions, step.terminated | step.truncated)
+
+
+def cells(visited: Visited) -> list[int]:
+    """Which cell each kept image shows."""
+    wide = 14 if isinstance(visited.engine, LongCorridor) else 8
+    return (visited.states().observations[:, 0, :, 0].argmax(axis=1) // wide).tolist()
+
+
+def test_distinct_states_are_kept_once() -> None:
+    """Spec B7: six cells make six states, however often they are visited and whatever ids an engine gives them."""
+    for engine in (Corridor(3), LongCorridor(3)):
+        visited = Visited(engine, 100, layout_seed=7, seed=0)
+        walk(visited, engine, 300)
+        assert sorted(cells(visited)) == [0, 1, 2, 3, 4, 5]
+
+
+def test_too_many_are_a_fair_sample() -> None:
+    """Spec B7: over seeds every cell is among three of six as often as another, also the start, visited most often."""
+    counts = np.zeros(6)
+    for seed in range(400):
+        engine = Corridor(2)
+        visited = Visited(engine, 3, layout_seed=7, seed=seed)
+        walk(visited, engine, 60)
+        kept = cells(visited)
+        assert len({*kept}) == len(kept) == 3
+        counts[kept] += 1
+    # Binomial(400, 1/2): 200 +- 4 standard deviations of 10; far cells are at times not visited at all.
+    assert (np.abs(counts[1:4] - 200) < 60).all(), counts
+    assert counts[2] < 1.3 * counts[0], "the start state is favoured"
+
+
+def test_where_states_come_from() -> None:
+    """Spec B7: the two actions that led there (-1 where an episode began between), the layout or the position."""
+    engine = Corridor(1)
+    visited = Visited(engine, 100, layout_seed=7, seed=0)
+    for action in (1, 1, 0):  # cells 3, 4, 3
+        step = engine.step(np.array([action]))
+        visited.see(step.next_ids, np.array([action]), step.terminated)
+    origins, at = visited.states().origins, {cell: row for row, cell in enumerate(cells(visited))}
+    assert {name: values[at[3]] for name, values in origins.items()} == {
+        "action": 1, "previous_action": -1, "layout_seed": 7,
+    }  # fmt: skip
+    assert origins["previous_action"][at[4]] == 1
+    climber = LongCorridor(2)
+    visited = Visited(climber, 100, layout_seed=7, seed=0)
+    walk(visited, climber, 50)
+    origins = visited.states().origins
+    assert origins["x"].tolist() == cells(visited) and {*origins} == {"action", "previous_action", "room", "x", "y"}
+
+
+def test_it_goes_on_where_it_was() -> None:
+    """Spec G1: a snapshot in between changes nothing."""
+    whole, engine = Visited(e := LongCorridor(3), 4, 7, 0), e
+    walk(whole, engine, 20)
+    other = Visited(engine, 4, 7, 0)
+    other.restore(whole.snapshot())
+    for visited in (whole, other):
+        fresh = LongCorridor(3)
+        visited.engine = fresh
+        walk(visited, fresh, 30, seed=1)
+    first, second = whole.snapshot(), other.snapshot()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_an_ensemble_learns_from_what_was_visited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B7: options save what they visited, and an ensemble is trained with it, with the data's own or instead."""
+    monkeypatch.syspath_prepend(str(TESTS / "domains"))
+    monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
+    data, run = str(tmp_path / "data.h5"), tmp_path / "run"
+    assert main(["collect", "own_domain:DOMAIN", "--out", data, "-q"]) == 0
+    few = ["--set", "steps=20", "--set", "workers=1", "-q"]
+    assert main(["train-ensemble", data, "--out", str(run / "first"), *few]) == 0
+    played = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
+    saving = [*played, "--set", "save_visited=5"]
+    assert main(["train-options", str(run / "first"), "--out", str(run / "options"), *saving]) == 0
+    assert main(["train-meta", str(run / "first"), "--out", str(run / "meta"), *saving]) == 0
+    for name in ("options", "meta"):
+        found = open_dataset(run / name / "visited.h5")
+        assert len(np.unique(found.unlabelled(), axis=0)) == 5
+        assert found.counts()["labelled"]["left-end"] == {"states": 0, "positives": 0}
+    both = ["--unlabelled", data, "--unlabelled", str(run / "options")]
+    assert main(["train-ensemble", data, "--out", str(run / "second"), *both, *few]) == 0
+    assert main(["train-ensemble", data, "--out", str(run / "third"), *both[2:], *few]) == 0
+    assert (run / "second/left-end.safetensors").read_bytes() != (run / "first/left-end.safetensors").read_bytes()
+    second = open_artefact(run / "second", "ensemble")
+    assert [entry["kind"] for entry in second.manifest["inputs"]] == ["data", "data", "data"]
+    assert second.input("data") == Path(data), "what is evaluated is the data, not what was visited"
+    states, origins = joined_unlabelled([Path(data), run / "options/visited.h5"])
+    assert len(states) == len(open_dataset(Path(data)).unlabelled()) + 5 and origins == {}
+    assert main(["verify", str(run)]) == 0
+
+
+def test_states_that_do_not_fit_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: of another domain, none at all, and a folder without them: one line, exit code 2, nothing written."""
+    import toy_data
+
+    data, other = toy_data.write(tmp_path / "data.h5"), tmp_path / "other.h5"
+    toy_data.write(other, domain="another")
+    (tmp_path / "empty").mkdir()
+    for wrong, words in (
+        (other, "the domain another"), (tmp_path / "empty", "no visited"), (tmp_path / "no.h5", "no such"),
+    ):  # fmt: skip
+        command = ["train-ensemble", str(data), "--unlabelled", str(wrong), "--out", str(tmp_path / "out"), "-q"]
+        assert main(command) == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

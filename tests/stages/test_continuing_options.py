@@ -1,0 +1,71 @@
+"""Spec A4, A8: ``train-meta --options`` continues options only where they fit."""
+
+from pathlib import Path
+
+import pytest
+
+from hypogoal.cli import main
+
+TESTS = Path(__file__).parents[1]
+FEW = ("--set", "environments=4", "--set", "warm_up=50", "--set", "steps=200", "-q")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data, two ensembles, and options of the first."""
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        allow(patch)
+        data = str(folder / "data.h5")
+        assert main(["collect", "own_domain:DOMAIN", "--out", data, "-q"]) == 0
+        for name, seed in (("ensemble", "0"), ("other", "1")):
+            few = ("--set", "steps=3", "--set", "workers=1", "--seed", seed, "-q")
+            assert main(["train-ensemble", data, "--out", str(folder / name), *few]) == 0
+        assert main(["train-options", str(folder / "ensemble"), "--out", str(folder / "options"), *FEW]) == 0
+    return folder
+
+
+def allow(patch: pytest.MonkeyPatch) -> None:
+    """The corridor as a user's own domain."""
+    patch.syspath_prepend(str(TESTS))
+    patch.syspath_prepend(str(TESTS / "domains"))
+    patch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
+
+
+@pytest.mark.parametrize(
+    ("ensemble", "changes", "words"),
+    [
+        ("other", (), "another ensemble"),
+        ("ensemble", ("--set", "layout_seed=3"), "layout_seed=100, train-meta has 3"),
+        ("ensemble", ("--set", "termination=oracle"), "termination=learned, train-meta has oracle"),
+        ("ensemble", ("--set", "network=paper", "--set", "experience=own"), "network=light, train-meta has paper"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    ensemble: str,
+    changes: tuple[str, ...],
+    words: str,
+) -> None:
+    """Spec A8, G2: one line that says what differs, exit code 2, nothing written."""
+    allow(monkeypatch)
+    out = tmp_path / "meta"
+    command = ["train-meta", str(run / ensemble), "--options", str(run / "options"), "--out", str(out), *FEW, *changes]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_that_fit_are_continued(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A4: environment steps spent before count in the episodes' steps."""
+    allow(monkeypatch)
+    out = tmp_path / "meta"
+    command = ["train-meta", str(run / "ensemble"), "--options", str(run / "options"), "--out", str(out), *FEW]
+    assert main(command) == 0
+    before = (run / "options/episodes.csv").read_text()
+    after = (out / "episodes.csv").read_text()
+    assert after.startswith(before) and int(after.splitlines()[-1].split(",")[0]) > 200

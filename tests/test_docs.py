@@ -1,0 +1,140 @@
+"""The documentation's site: it builds without a warning, its commands run, its table of equations is true."""
+
+import importlib
+import re
+import shlex
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from hypogoal.cli import main
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+# Appended to the commands as they stand, so that they end in seconds: fewer states, steps, episodes.
+SHORT = {
+    "collect": ("heldout_layouts=1", "unlabelled_seeds=1"),
+    "train-ensemble": ("steps=3", "workers=1"),
+    "train-options": ("steps=400", "warm_up=100", "max_episode_steps=60", "random_episodes=2"),
+    "train-meta": ("steps=400", "warm_up=100", "max_episode_steps=60", "random_episodes=2"),
+    "train-baseline": ("steps=640", "max_episode_steps=60", "random_episodes=2"),
+}
+NOT_OURS = ("python3", ".venv/bin/pip", "pip", "make", "export")  # set-up: the Makefile's tests and CI do it
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of each command line in a page's ``sh`` blocks, comments left out."""
+    lines = [line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as CI builds it: a link that leads nowhere or a missing name is an error."""
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
+
+
+class Sources(HTMLParser):
+    """What a page makes a browser fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if tag in ("script", "img", "iframe"):
+            self.found.append(given.get("src") or "")
+        if tag == "link" and given.get("rel") in ("stylesheet", "icon", "preload", "preconnect"):
+            self.found.append(given.get("href") or "")
+
+
+def test_the_site_builds_and_needs_no_network(site: Path) -> None:
+    """Every page of the navigation is there, and none has a browser fetch anything from another host."""
+    pages = list(site.rglob("*.html"))
+    assert len(pages) >= 15
+    for page in pages:
+        sources = Sources()
+        sources.feed(page.read_text(encoding="utf-8"))
+        assert not [source for source in sources.found if re.match(r"(https?:)?//", source)], page
+
+
+def test_the_reference_is_that_of_the_code(site: Path) -> None:
+    """Every command and every setting of every stage is in the reference."""
+    from typer.main import get_command
+
+    from hypogoal.cli import app
+    from hypogoal.core.config import describe
+    from hypogoal.stages.run import STAGES, config_class_of
+
+    pages = {name: (site / f"reference/{name}.html").read_text(encoding="utf-8") for name in ("cli", "settings")}
+    for name in get_command(app).commands:  # type: ignore[attr-defined]
+        assert f"<code>hypogoal {name}</code>" in pages["cli"], name
+    for stage in STAGES:
+        for row in describe(config_class_of(stage)):
+            assert f"<code>{row['name']}</code>" in pages["settings"], (stage, row["name"])
+
+
+def test_the_tutorial_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every command of the tutorial, in its order, only shorter, and then its program."""
+    monkeypatch.chdir(tmp_path)
+    ran = set()
+    for words in commands(DOCS / "tutorial.md"):
+        assert words[0] == "hypogoal", words
+        short = [part for pair in SHORT.get(words[1], ()) for part in ("--set", pair)]
+        assert main([*words[1:], *short]) == 0, words
+        ran.add(words[1])
+    assert {*SHORT, "evaluate", "report", "watch", "show", "run"} <= ran
+    for block in blocks(DOCS / "tutorial.md", "python"):
+        exec(compile(block, "tutorial.md", "exec"), {})
+    assert (tmp_path / "runs/tutorial/report/index.html").is_file()
+
+
+def test_the_other_pages_name_commands_that_are_there() -> None:
+    """A command in any page is one of ours with options that it has."""
+    from typer.main import get_command
+
+    from hypogoal.cli import app
+
+    known = get_command(app).commands  # type: ignore[attr-defined]
+    seen = 0
+    for page in (*DOCS.rglob("*.md"), ROOT / "README.md"):
+        for words in commands(page):
+            if words[0].startswith(NOT_OURS):
+                continue
+            assert words[0] in ("hypogoal", "python"), (page.name, words)
+            if words[0] == "hypogoal":
+                options = {name for option in known[words[1]].params for name in option.opts}
+                given = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
+                assert given <= options, (page.name, words)
+                seen += 1
+    assert seen > 20
+
+
+def test_equations_lead_to_code() -> None:
+    """Spec, head: a reader finds each equation of the paper in ten seconds."""
+    rows = re.findall(
+        r"^\| [^|]+ \| ([^|]+`hypogoal/[^|]+|`hypogoal/[^|]+) \|$", (DOCS / "concepts.md").read_text(), re.M
+    )
+    assert len(rows) >= 15
+    for row in rows:
+        file = None
+        for name in re.findall(r"`([^`]+)`", row):
+            if "/" in name:
+                file = ROOT / name
+                assert file.is_file(), name
+            else:
+                module = importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
+                assert hasattr(module, name), (row, name)
