@@ -1,16 +1,71 @@
-"""The commands for what users bring: ``check``."""
+"""The commands for what users bring: ``check``, ``import``, ``export``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hypogoal.cli.common import Seed, Set, app
+from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
+
+
+@app.command("import")
+def import_(
+    source: Annotated[
+        Path, typer.Argument(help="A .npz file, a folder of .npy files or of images, or a Minari dataset's folder.")
+    ],
+    out: Out,
+    sub_goal: Annotated[
+        list[str] | None, typer.Option(help="A sub-goal's name, in the order of the labels' columns; repeatable.")
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=MODULE:FUNCTION", help="Of a Minari dataset: a sub-goal and who labels it."),
+    ] = None,
+    key: Annotated[str, typer.Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
+    heldout: Annotated[
+        float, typer.Option(min=0.01, max=0.9, help="Share of the labelled states held out, where none are given.")
+    ] = 0.2,
+    domain: Annotated[str, typer.Option(help="What the states are of, for train-options.")] = "imported",
+    seed: Seed = 0,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a data file of own states: arrays, images, or a Minari dataset with label functions."""
+    from hypogoal.core import own_code
+    from hypogoal.core.errors import UserError
+    from hypogoal.stages.import_data import import_data as stage
+
+    labels = dict(text.partition("=")[::2] for text in label or ())
+    if not all(name and function for name, function in labels.items()):
+        raise UserError(
+            "--label needs name=module:function", " ".join(label or ()), "For example --label won=mine:won."
+        )
+    with own_code.given(*labels.values()):
+        counts = stage(
+            source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,
+            force=force,
+        )  # fmt: skip
+    print_counts(counts, quiet)
+    typer.echo(out)
+
+
+@app.command()
+def export(
+    data: Annotated[Path, typer.Argument(help="A data file.")],
+    out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")],
+    force: Force = False,
+) -> None:
+    """Write a data file's states as NumPy arrays, for other software; 'import' takes them again."""
+    from hypogoal.stages.import_data import export_data as stage
+
+    stage(data, out, force=force)
+    typer.echo(out)
 
 
 @app.command()

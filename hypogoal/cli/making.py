@@ -19,6 +19,7 @@ from hypogoal.cli.common import (
     app,
     domain_of,
     is_complete,
+    print_counts,
     print_outcome,
     print_table,
     resolve_for,
@@ -45,11 +46,7 @@ def collect(
     found = load_domain(domain, given=True)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
     counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
-    if not quiet:
-        for split in ("labelled", "heldout"):
-            for sub_goal, row in counts[split].items():
-                typer.echo(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
-        typer.echo(f"unlabelled                     {counts['unlabelled']:7d} states")
+    print_counts(counts, quiet)
     typer.echo(out)
 
 
