@@ -12,7 +12,13 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import TypeVar
 
 T = TypeVar("T")
+KILLED = 9  # SIGKILL, which Windows has no name for
 PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
+
+
+def cores() -> int:
+    """Cores that this process may use; where the system does not say (macOS, Windows), all there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
@@ -49,13 +55,13 @@ def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone, which sends SIGTERM on
     die_with_parent()
     if os.getppid() != parent:
-        os._exit(128 + signal.SIGKILL)
+        os._exit(128 + KILLED)
 
 
 def die_with_parent() -> None:
     """Have the kernel kill this process when its parent dies: an orphan would go on writing beside its successor."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, KILLED)
 
 
 def _guarded(task: Callable[[], T]) -> T:

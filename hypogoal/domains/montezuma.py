@@ -8,7 +8,6 @@ and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``mon
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.workers import in_processes
+from hypogoal.core.workers import cores, in_processes
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
 from hypogoal.domains.montezuma_engine import MontezumaEngine
@@ -158,7 +157,7 @@ def collect(
             put(task, RoomStates(**states))
         else:
             left.append((task, place))
-    in_processes([task.gather for task, _ in left], config.workers or len(os.sched_getaffinity(0)), done)
+    in_processes([task.gather for task, _ in left], config.workers or cores(), done)
     heldout = _states_of(whole["heldout"])
     seen = np.full(len(heldout.labels), SEEN_NOWHERE)
     seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED

@@ -173,7 +173,11 @@ def _start(cell: Cell, logs: Path, *, force: bool, resume: bool) -> subprocess.P
     with (logs / f"{cell.name}.log").open("ab" if resume else "wb", buffering=0) as log:
         log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
         return subprocess.Popen(
-            command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, preexec_fn=die_with_parent
+            command,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            preexec_fn=die_with_parent if os.name == "posix" else None,
         )
 
 
