@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from test_docs import blocks, commands
 
 from hypogoal.cli import main
 from hypogoal.dataset import open_dataset
@@ -35,29 +36,53 @@ def settings(*pairs: str) -> list[str]:
     return [word for pair in pairs for word in ("--set", pair)]
 
 
-def test_unlock_pickup_goes_through_all_stages_in_few_lines(tmp_path: Path) -> None:
-    """Spec B6, A1-A5: an environment, two label functions and a way to wander are all that a user writes."""
-    assert code_lines(EXAMPLES / "unlock_pickup.py") < MOST_LINES
-    run = tmp_path / "run"
-    data, ensemble, options, meta = (str(run / name) for name in ("data.h5", "ensemble", "options", "meta"))
-    layouts = settings("labelled_seeds=0", "unlabelled_seeds=1", "heldout_seeds=2", "steps=600")
-    assert main(["collect", "unlock_pickup:DOMAIN", "--out", data, "-q", *layouts]) == 0
-    counts = open_dataset(Path(data)).counts()
-    for sub_goal in ("hold-key", "open-door"):
-        row = counts["labelled"][sub_goal]
-        assert 10 < row["positives"] < row["states"] - 10
-    assert counts["unlabelled"] > 50
-    few = settings("steps=20", "members=2", "workers=1")
-    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
-    play = settings("steps=240", "environments=2", "warm_up=50", "layout_seed=0", "max_episode_steps=60")
-    assert main(["train-options", ensemble, "--out", options, "-q", *play]) == 0
-    assert main(["train-meta", ensemble, "--options", options, "--out", meta, "-q", *play]) == 0
-    assert main(["evaluate", str(run), "-q"]) == 0
-    assert main(["report", str(run), "-q"]) == 0
+LAYOUTS = settings("labelled_seeds=0", "unlabelled_seeds=1", "heldout_seeds=2", "steps=600")
+PLAY = settings("steps=240", "environments=2", "warm_up=50", "layout_seed=0", "max_episode_steps=60")
+SHORT = {  # appended to the page's commands, so that they end in seconds
+    "collect": LAYOUTS,
+    "train-ensemble": settings("steps=20", "members=2", "workers=1"),
+    "train-options": PLAY,
+    "train-meta": PLAY,
+}
+
+
+def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec B6, A1-A5: an environment, two label functions and a way to wander, under 30 lines, are all one writes.
+
+    The page's commands in their order, but for ``check`` of the domain, which the next test does.
+    """
+    page = EXAMPLES.parent / "docs" / "own-domain.md"
+    example = EXAMPLES / "unlock_pickup.py"
+    assert blocks(page, "python")[0] == example.read_text(encoding="utf-8")
+    assert code_lines(example) < MOST_LINES
+    for name in ("unlock_pickup.py", "margin.py", "wide_network.py"):
+        (tmp_path / name).write_bytes((EXAMPLES / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    ran = []
+    for words in commands(page):
+        if words[0] == "export":
+            monkeypatch.setenv(*words[1].split("="))
+        elif words[:3] != ["hypogoal", "check", "unlock_pickup:DOMAIN"]:
+            assert main([*words[1:], *SHORT.get(words[1], ())]) == 0, words
+            ran.append(words[1])
+    stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
+    assert ran == [*stages, "check", "train-ensemble"]
+    run = tmp_path / "runs" / "unlock"
+    for goal, row in open_dataset(run / "data.h5").counts()["labelled"].items():
+        assert 10 < row["positives"] < row["states"] - 10, goal
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     assert [row["sub_goal"] for row in metrics["ensembles"][0]["sub_goals"]] == ["hold-key", "open-door"]
     assert metrics["agents"][0]["runs"]
     assert "open-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_example_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: the page's first command."""
+    assert main(["check", "unlock_pickup:DOMAIN", *LAYOUTS]) == 0
+    assert "FAIL" not in capsys.readouterr().out
 
 
 @pytest.mark.atari
