@@ -13,13 +13,26 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import OptionEnv, load_ensemble, load_options
+    from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+    from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 
 _LAZY = {
+    "GymnasiumDomain": "hypogoal.domains.gymnasium_domain",
     "load_ensemble": "hypogoal.api",
     "load_options": "hypogoal.api",
     "OptionEnv": "hypogoal.api",
+    "SubgoalReward": "hypogoal.api",
+    "SubgoalTermination": "hypogoal.api",
 }
-__all__ = ["OptionEnv", "__version__", "load_ensemble", "load_options"]
+__all__ = [
+    "GymnasiumDomain",
+    "OptionEnv",
+    "SubgoalReward",
+    "SubgoalTermination",
+    "__version__",
+    "load_ensemble",
+    "load_options",
+]
 
 
 def __getattr__(name: str) -> Any:

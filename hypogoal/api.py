@@ -7,11 +7,13 @@ from pathlib import Path
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.doorkey_registration import register
+from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
+from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 from hypogoal.options.env import OptionEnv, Options, make_policies
 
-__all__ = ["OptionEnv", "load_ensemble", "load_options"]
+__all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 
 register()
 
@@ -28,6 +30,14 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
 
     Raises:
         UserError: not an ensemble artefact, or no such sub-goal.
+
+    >>> import numpy, hypogoal
+    >>> ensemble = hypogoal.load_ensemble("runs/demo/ensemble", "open-red-door")
+    >>> observations = numpy.zeros((2, *ensemble.observation_shape), dtype="uint8")
+    >>> ensemble.predict(observations).shape  # P(sub-goal reached) of each state, per member
+    (2, 3)
+    >>> ensemble.verdicts(observations).dtype
+    dtype('bool')
     """
     artefact = open_artefact(Path(path), "ensemble").whole()
     return read_ensemble(artefact.path, artefact.config, sub_goal)
@@ -42,6 +52,11 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
 
     Raises:
         UserError: not such an artefact, the ensemble is gone, or the options end at the true sub-goals (oracle).
+
+    >>> import hypogoal
+    >>> options = hypogoal.load_options("runs/demo/meta")
+    >>> options.count, options.members, options.sub_goals[3], options.name(11)
+    (15, 3, 'open-red-door', 'open-red-door/2')
     """
     artefact = open_artefact(Path(path), ("options", "meta")).whole()
     config = artefact.config

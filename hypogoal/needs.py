@@ -71,6 +71,8 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
     weights = options * PAPER_POLICY if paper else 8e6
     frames = LEARNERS[config.network].reach(config, options) * prod(domain.observation_shape[:2])
     kept = frames if getattr(domain, "starts", ()) else 0
+    if hasattr(domain, "played_bytes"):
+        kept = domain.played_bytes(getattr(config, "steps", 0))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
     members = len(about["sub_goals"]) * about["members"] * MEMBER

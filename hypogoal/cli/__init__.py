@@ -14,11 +14,11 @@ from typing import Annotated
 
 import typer
 
-from hypogoal.cli import making, showing, sweeping
+from hypogoal.cli import bringing, making, showing, sweeping
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import NumericalError, UserError
 
-__all__ = ["app", "main", "making", "showing", "sweeping"]
+__all__ = ["app", "bringing", "main", "making", "showing", "sweeping"]
 
 
 def _version(value: bool) -> None:

@@ -110,6 +110,16 @@ def is_complete(out: Path, resume: bool, kind: str) -> bool:
     return True
 
 
+def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
+    """The numbers of states of a data file."""
+    if quiet:
+        return
+    for split in ("labelled", "heldout"):
+        for sub_goal, row in counts[split].items():
+            typer.echo(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
+    typer.echo(f"unlabelled                     {counts['unlabelled']:7d} states")
+
+
 def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
     if not quiet:
         text = ", ".join(

@@ -19,6 +19,7 @@ from hypogoal.cli.common import (
     app,
     domain_of,
     is_complete,
+    print_counts,
     print_outcome,
     print_table,
     resolve_for,
@@ -44,12 +45,8 @@ def collect(
         return
     found = load_domain(domain, given=True)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
-    counts = stage(found, config, out, seed=seed, force=force, resume=resume, quiet=quiet)
-    if not quiet:
-        for split in ("labelled", "heldout"):
-            for sub_goal, row in counts[split].items():
-                typer.echo(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
-        typer.echo(f"unlabelled                     {counts['unlabelled']:7d} states")
+    counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
+    print_counts(counts, quiet)
     typer.echo(out)
 
 
@@ -57,7 +54,7 @@ def collect(
 def train_ensemble(
     data: Annotated[Path, typer.Argument(help="The HDF5 file that 'collect' wrote.")],
     out: Out,
-    diversity: Annotated[str | None, typer.Option(help="dbat, divdis, none, or an own one.")] = None,
+    diversity: Annotated[str | None, typer.Option(help="dbat, divdis, none, or module:function.")] = None,
     members: Annotated[int | None, typer.Option(help="Hypotheses per sub-goal (K).")] = None,
     unlabelled: Annotated[
         list[Path] | None,
@@ -75,13 +72,21 @@ def train_ensemble(
     quiet: Quiet = False,
 ) -> None:
     """Train an ensemble of diverse classifiers for each sub-goal."""
+    from hypogoal.core import own_code
+    from hypogoal.domains.base import defaults_of
     from hypogoal.stages.train_ensemble import TrainEnsembleConfig
     from hypogoal.stages.train_ensemble import train_ensemble as stage
 
     if is_complete(out, resume, "ensemble"):
         return
     given = {"diversity": diversity, "members": members}
-    config = resolve_for(domain_of(data, "data"), TrainEnsembleConfig, "train-ensemble", preset, set_, given)
+    domain = domain_of(data, "data")
+    config = resolve_for(domain, TrainEnsembleConfig, "train-ensemble", preset, set_, given)
+    typed = [diversity or "", *(text.partition("=")[2] for text in set_ or ())]
+    own = [value for value in defaults_of(domain, "train-ensemble").values() if isinstance(value, str)]
+    with own_code.given(*typed, *own):  # and not what a preset says, which may be a stranger's file
+        own_code.require_trust(config.diversity, "diversity objective")
+        own_code.require_trust(config.network, "network")
     others = tuple(unlabelled or ())
     stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)

@@ -203,8 +203,13 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None
 
 
 def sync(path: Path) -> None:
-    """Have what was written to a file, or to a folder's list of files, on the disk itself."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Have what was written to a file, or to a folder's list of files, on the disk itself.
+
+    Windows opens no folders, and syncs only what was opened for writing.
+    """
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import shutil
@@ -24,9 +23,16 @@ from typing import Any, TextIO
 from hypogoal.core.checkpoints import FOLDER, sync
 from hypogoal.core.errors import NumericalError, UserError
 
+fcntl: Any  # on POSIX a module, elsewhere None
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 PARTIAL = ".partial"
 FILES, BEGUN, LOCK, OLD = "files", "begun.json", "lock", ".old"
 PATIENCE_SECONDS = 2.0  # for whoever is just letting go
+LOCKED_BYTE = 1 << 30
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that cannot lock
 GO_ON = "give the same command with --resume to go on"
 
@@ -218,6 +224,8 @@ def _locked(out: Path) -> Iterator[None]:
 
 
 def _try_lock(file: TextIO) -> bool:
+    if fcntl is None:
+        return _try_lock_byte(file)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -225,6 +233,20 @@ def _try_lock(file: TextIO) -> bool:
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
+    return True
+
+
+def _try_lock_byte(file: TextIO) -> bool:
+    """On Windows: a byte far behind the text, so that others can read who has the lock."""
+    try:
+        import msvcrt
+    except ImportError:  # a system that cannot lock: nobody is kept out
+        return True
+    os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
+    try:
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    except OSError:
+        return False
     return True
 
 

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
+KILLED = 9  # SIGKILL, which Windows has no name for
 PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
 
 
@@ -57,13 +58,13 @@ def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone, which sends SIGTERM on
     die_with_parent()
     if os.getppid() != parent:
-        os._exit(128 + signal.SIGKILL)
+        os._exit(128 + KILLED)
 
 
 def die_with_parent() -> None:
     """Have the kernel kill this process when its parent dies: an orphan would go on writing beside its successor."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, KILLED)
 
 
 def _guarded(task: Callable[[], T]) -> T:

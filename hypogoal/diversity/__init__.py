@@ -2,19 +2,19 @@
 
 An objective is a function ``pair_loss(logits_a, logits_b)`` of two members' logits (..., N, 2) on the same N
 unlabelled states. It returns a loss (...,), lower where the two members differ more, and must stay finite and
-differentiable at extreme logits and for N = 0. Other packages add theirs under the entry point group
-``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` with a ``pair_loss`` in it.
+differentiable at extreme logits and for N = 0 (``hypogoal check --diversity`` looks). An own one is named as
+``module:function``; other packages add theirs under the entry point group ``hypogoal.diversity``, as
+``name = "module:function"`` or ``name = "module"`` with a ``pair_loss`` in it.
 """
 
 from __future__ import annotations
 
-import importlib
 import pkgutil
 from collections.abc import Callable
-from importlib import metadata
 from typing import TYPE_CHECKING, TypeAlias
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load_own
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,28 +27,21 @@ OBJECTIVES: tuple[str, ...] = tuple(sorted(module.name for module in pkgutil.ite
 
 
 def load_objective(name: str) -> PairLoss:
-    """The diversity objective called ``name``: one of :data:`OBJECTIVES` or an installed entry point.
+    """The diversity objective called ``name``: one of :data:`OBJECTIVES`, an installed entry point, or own code.
 
     Args:
-        name: ``dbat``, ``divdis``, ``none`` or an entry point's name.
+        name: ``dbat``, ``divdis``, ``none``, an entry point's name, or ``module:function``.
 
     Returns:
         ``pair_loss(logits_a, logits_b)``: float (..., N, 2) twice -> float (...,).
 
     Raises:
-        UserError: no such objective, or the entry point cannot be loaded or is not an objective.
+        UserError: no such objective, it cannot be loaded or is none, or it is code that the user did not allow (see
+            :mod:`hypogoal.core.own_code`).
     """
-    if name in OBJECTIVES:
-        return importlib.import_module(f"{__name__}.{name}").pair_loss
-    entries = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
-    if name not in entries:
-        known = ", ".join(sorted({*OBJECTIVES, *entries}))
-        raise UserError("unknown diversity objective", name, f"Choose one of {known}.")
-    try:
-        found = entries[name].load()
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"the diversity objective cannot be loaded ({error})", name, "Check its package.") from None
+    built_in = {objective: f"{__name__}.{objective}" for objective in OBJECTIVES}
+    found = load_own(name, "diversity objective", ENTRY_POINTS, built_in)
     found = getattr(found, "pair_loss", found)
     if not callable(found):
-        raise UserError("the entry point is no diversity objective", name, "Give a pair_loss(logits_a, logits_b).")
+        raise UserError("this is no diversity objective", name, "Give a pair_loss(logits_a, logits_b).")
     return found

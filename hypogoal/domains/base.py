@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import os
 from collections.abc import Mapping
-from importlib import metadata
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import Collected
 
@@ -19,7 +17,6 @@ BUILT_IN = {
     "montezuma": "hypogoal.domains.montezuma:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
-ALLOWED = "HYPOGOAL_DOMAINS"
 
 
 class Step(NamedTuple):
@@ -71,22 +68,28 @@ class Engine(Protocol):
 
 @runtime_checkable
 class Domain(Protocol):
-    """What hypogoal needs to know of a domain.
+    """What hypogoal needs to know of a domain; :class:`hypogoal.GymnasiumDomain` makes one of an environment.
 
-    It may also have ``starts`` (names of places where episodes begin, one of which ``make_engine`` takes as ``start``),
-    ``distance`` (positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
-    sub-goal holds), ``picture`` (room -> uint8 (height, width, 3)) and ``pixel`` (positions -> column and row in that
-    picture (n, 2)), ``rooms_of`` (start -> the rooms to draw), ``kinds`` (names of the values of the origin ``kind``),
-    ``collected_bytes`` (config -> bytes of observations that ``collect`` will make, at the most), ``defaults`` (see
-    ``defaults_of``) and ``resumes``: where that is true, ``collect`` also takes ``kept``, a function from a name to the
-    ``Checkpoints`` in which the part of that name is kept until all are there.
+    ``hypogoal check`` tests it. It may also have
+
+    - ``env_id``: its Gymnasium environment;
+    - ``defaults``: settings of stages that suit it, see ``defaults_of``;
+    - ``collected_bytes``: config -> bytes of observations that ``collect`` will make, at the most;
+    - ``played_bytes``: steps -> bytes of pictures that an engine keeps while it plays them, at the most;
+    - ``resumes``: true where ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which
+      the part of that name is kept until all are there;
+    - ``kinds``: names of the values of the origin ``kind``;
+    - ``starts``: names of places where episodes begin, one of which ``make_engine`` takes as ``start``;
+    - ``distance``: positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
+      sub-goal holds;
+    - ``picture``: room -> uint8 (height, width, 3), ``pixel``: positions -> column and row in that picture (n, 2),
+      ``rooms_of``: start -> the rooms to draw.
     """
 
     name: str
     sub_goals: tuple[str, ...]
     observation_shape: tuple[int, ...]
     config_class: type
-    env_id: str
 
     def collect(self, config: Any, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states."""
@@ -98,9 +101,7 @@ class Domain(Protocol):
 def load_domain(name: str, *, given: bool = False) -> Domain:
     """A domain by its name, by an installed entry point (group ``hypogoal.domains``) or as ``module:object``.
 
-    ``module:object`` is code that will run. It is loaded where the user gave it, not because a data file or a
-    manifest, which may be a stranger's, names it: then the user allows it by the environment variable
-    ``HYPOGOAL_DOMAINS`` (several with commas between).
+    ``module:object`` is code that will run, see :mod:`hypogoal.core.own_code`.
 
     Args:
         name: the domain.
@@ -109,19 +110,8 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
     Raises:
         UserError: no such domain, code that the user did not allow, or the object is not a domain.
     """
-    entries = {entry.name: entry.value for entry in metadata.entry_points(group=ENTRY_POINTS)}
-    target = BUILT_IN.get(name) or entries.get(name)
-    if target is None and ":" in name:
-        _allow(name, given)
-        target = name
-    if target is None:
-        known = ", ".join(sorted({*BUILT_IN, *entries}))
-        raise UserError("unknown domain", name, f"Choose one of {known}, or give module:object.")
-    module, _, attribute = target.partition(":")
-    try:
-        domain = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(f"the domain cannot be loaded ({error})", name, "Check the module and the object.") from None
+    with own_code.given(*([name] if given else [])):
+        domain = own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
     return domain
@@ -133,7 +123,8 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
     Raises:
         UserError: the name is code that the user did not allow (see :func:`load_domain`).
     """
-    _allow(name, given)
+    if not given:
+        own_code.require_trust(name, "domain")
     try:
         return load_domain(name, given=given)
     except UserError:
@@ -148,8 +139,3 @@ def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str,
     """
     defaults: Mapping[str, Mapping[str, Any]] = getattr(installed_domain(domain, given=given), "defaults", {})
     return defaults.get(stage, {})
-
-
-def _allow(name: str, given: bool) -> None:
-    if ":" in name and not given and name not in os.environ.get(ALLOWED, "").split(","):
-        raise UserError("a file names code of its own as its domain", name, f"Do you trust it? Set {ALLOWED}={name}")

@@ -12,7 +12,6 @@ public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdi
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import metadata
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -22,6 +21,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load_own
 
 CLASSES = 2
 ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
@@ -93,20 +93,21 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
 
 
 def load_network(name: str) -> Callable[[int], Parts]:
-    """The function that makes network ``name``: one of :data:`NETWORKS` or an installed entry point.
+    """The function that makes network ``name``: one of :data:`NETWORKS`, an installed entry point, or own code.
+
+    Args:
+        name: of these, or ``module:function``.
 
     Raises:
-        UserError: no such network, or the entry point cannot be loaded.
+        UserError: no such network, it cannot be loaded, or it is code that the user did not allow (see
+            :mod:`hypogoal.core.own_code`).
     """
     if name in NETWORKS:
         return NETWORKS[name]
-    entries = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
-    if name not in entries:
-        raise UserError("unknown network", name, f"Choose one of {', '.join(sorted({*NETWORKS, *entries}))}.")
-    try:
-        found: Callable[[int], Parts] = entries[name].load()
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"the network cannot be loaded ({error})", name, "Check its package.") from None
+    built_in = {known: f"{__name__}:{function.__name__}" for known, function in NETWORKS.items()}
+    found: Callable[[int], Parts] = load_own(name, "network", ENTRY_POINTS, built_in)
+    if not callable(found):
+        raise UserError("this is no member network", name, "Give a function: channels -> (layers, hidden widths).")
     return found
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_fitting
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.execution import offered_options
 from hypogoal.options.exploration import actions_of
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork
@@ -129,28 +131,41 @@ def _paper_policies(
     return start
 
 
-class OptionEnv(gymnasium.Wrapper):
+class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A Gymnasium environment whose actions are options (Spec E1): ``Discrete(G*K)``.
 
     One step runs an option until its classifier says yes, its time is up or the episode ends. The reward is the sum
     of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so that an agent can bootstrap with
-    gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached.
+    gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached, ``info["option"]`` its name.
+
+    ``action_masks()`` is what sb3-contrib's MaskablePPO asks for; of ``gymnasium.vector.SyncVectorEnv`` it is
+    ``envs.call("action_masks")``.
 
     Args:
         env: an environment with the observations that the options were trained on.
         options: from :func:`hypogoal.load_options`.
         gamma: discount per environment step inside an option; 1 for the plain sum.
+
+    Raises:
+        UserError: its observations are others.
+
+    >>> import gymnasium, hypogoal
+    >>> options = hypogoal.load_options("runs/demo/meta")
+    >>> env = hypogoal.OptionEnv(gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=100), options)
+    >>> env.action_space, options.name(11)
+    (Discrete(15), 'open-red-door/2')
+    >>> observation, info = env.reset(seed=0)
+    >>> env.action_masks().shape
+    (15,)
+    >>> observation, reward, terminated, truncated, info = env.step(11)
+    >>> 1 <= info["duration"] <= options.timeout, info["option"]
+    (True, 'open-red-door/2')
     """
 
-    def __init__(self, env: gymnasium.Env, options: Options, gamma: float = 1.0):
-        super().__init__(env)
-        wanted = tuple(options.ensembles[0].observation_shape)
-        if env.observation_space.shape != wanted:
-            raise UserError(
-                "the environment's observations are not those the options know",
-                f"{env.observation_space.shape}, not {wanted}",
-                "Use the environment they were trained on.",
-            )
+    def __init__(self, env: gymnasium.Env[Any, Any], options: Options, gamma: float = 1.0):
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma)
+        gymnasium.Wrapper.__init__(self, env)
+        require_observations(env, tuple(options.ensembles[0].observation_shape))
         self.options, self.gamma = options, gamma
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._observation: NDArray[np.uint8] | None = None

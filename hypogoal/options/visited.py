@@ -85,19 +85,20 @@ class Visited:
         columns = np.array([origin for _, origin in kept], np.int64).reshape(-1, len(self.origins)).T
         return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.origins, columns, strict=True)))
 
-    def write(self, folder: Path, domain: Domain, config: Mapping[str, Any], seed: int) -> None:
+    def write(self, folder: Path, domain: Domain, about: Mapping[str, Any], seed: int) -> None:
         """``visited.h5`` into ``folder``: a data file whose states are all unlabelled ones.
 
         Args:
             folder: of the artefact.
             domain: where it was played.
-            config: of the collection that the ensembles learned from.
+            about: the ensemble manifest's configuration: what the domain and its collection were called.
             seed: of the stage.
         """
         nothing = np.zeros((0, *self.engine.observation_shape), np.uint8)
         none = States(nothing, np.zeros((0, len(domain.sub_goals)), np.bool_))
         collected = Collected(self.engine.observation_shape, domain.sub_goals, none, self.states(), none)
-        write_dataset(folder / VISITED, collected, domain=domain.name, config=config, seed=seed, force=True)
+        named = {"domain": about["domain"], "config": about["domain_config"]}
+        write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly."""

@@ -23,6 +23,7 @@ def collect(
     config: Any,
     out: Path,
     *,
+    name: str | None = None,
     seed: int = 0,
     force: bool = False,
     resume: bool = False,
@@ -34,6 +35,7 @@ def collect(
         domain: see :mod:`hypogoal.domains.base`.
         config: an instance of the domain's ``config_class``.
         out: the HDF5 file to write.
+        name: by which later stages find the domain; its own where None.
         seed: of whatever the domain draws at random.
         force: replace an existing file.
         resume: go on with what was begun, of a domain whose collecting can be resumed.
@@ -45,10 +47,10 @@ def collect(
     claim(out, force=force, resume=resume)
     size = getattr(domain, "collected_bytes", lambda config: 0)(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
-    about: dict[str, Any] = {"domain": domain.name, "config": as_dict(config), "seed": seed}
+    about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
         kept = {"kept": partial(checkpoints_of, work.files)} if getattr(domain, "resumes", False) else {}
-        with Progress(f"collect {domain.name}", total=1, quiet=quiet) as progress:
+        with Progress(f"collect {about['domain']}", total=1, quiet=quiet) as progress:
             collected = domain.collect(config, seed, progress, **kept)
         made = work.files / out.name
         write_dataset(made, collected, **about, force=True)

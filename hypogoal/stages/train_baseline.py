@@ -84,7 +84,7 @@ def train_baseline(
     size = math.prod(env.observation_space.shape or (1,))
     preflight("train-baseline", out, baseline_needs(size, getattr(chosen, "replay", 0)), quiet=quiet)
     about = as_dict(config) | {
-        "domain": played.name,
+        "domain": domain,
         "environments": chosen.environments,
         "hyperparameters": as_dict(chosen),
     }
@@ -104,7 +104,7 @@ def train_baseline(
         save_tensors(folder / "policy.safetensors", weights(agent))
         facts = {
             "layout_seed": config.layout_seed,
-            "shortest_path": engine.shortest_path(),
+            "shortest_path": engine.shortest_path() if hasattr(engine, "shortest_path") else None,
             "random_success": _random_success(engine, config, seed),
             "random_episodes": config.random_episodes,
         }
@@ -139,6 +139,6 @@ def _make_engine(domain: Domain, config: BaselineConfig, count: int) -> Any:
 
 
 def _random_success(engine: Any, config: BaselineConfig, seed: int) -> float | None:
-    if not config.random_episodes:
+    if not config.random_episodes or not hasattr(engine, "random_success"):
         return None
     return float(engine.random_success(config.random_episodes, rng_for(seed, "random-play")))

@@ -16,12 +16,14 @@ from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import given
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import cores, in_processes
 from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
+from hypogoal.hypotheses.networks import load_network
 from hypogoal.hypotheses.storage import write_ensemble
 from hypogoal.hypotheses.training import EnsembleConfig, fit
 from hypogoal.needs import ensemble_needs
@@ -66,7 +68,9 @@ def train_ensemble(
         NumericalError: a loss became NaN or Inf.
     """
     prepare(device)
-    load_objective(config.diversity)
+    with given(config.diversity, config.network):
+        load_objective(config.diversity)
+        load_network(config.network)
     dataset = open_dataset(data)
     sub_goals = config.sub_goals or dataset.sub_goals
     for sub_goal in sub_goals:
@@ -166,17 +170,18 @@ def _train_one(
     report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)))
     if not checkpoints.saved:
         report.log.restore(0)
-    ensemble = fit(
-        split.observations,
-        split.labels,
-        unlabelled,
-        config,
-        seed_for(seed, "ensemble", sub_goal),
-        report,
-        origins=split.origins,
-        unlabelled_origins=origins,
-        checkpoints=checkpoints,
-    )
+    with given(config.diversity, config.network):
+        ensemble = fit(
+            split.observations,
+            split.labels,
+            unlabelled,
+            config,
+            seed_for(seed, "ensemble", sub_goal),
+            report,
+            origins=split.origins,
+            unlabelled_origins=origins,
+            checkpoints=checkpoints,
+        )
     write_ensemble(folder, sub_goal, ensemble)
     report.log.close()
     return {"sub_goal": sub_goal, **report.numbers}

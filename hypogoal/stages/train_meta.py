@@ -83,7 +83,7 @@ def train_meta(
     about = as_dict(config) | {
         "sub_goals": source.config["sub_goals"],
         "members": verdicts.options // len(source.config["sub_goals"]),
-        "domain": domain.name,
+        "domain": source.config["domain"],
         "domain_config": source.config["domain_config"],
         "options_steps": trained.config["steps"] if trained else 0,
         "setting": config.network,
@@ -118,7 +118,7 @@ def train_meta(
         log.close()
         recorder.write(folder, engine.images)
         if visited:
-            visited.write(folder, domain, source.config["domain_config"], seed)
+            visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
         if policy:
             save_tensors(folder / "meta.safetensors", policy.state())

@@ -74,7 +74,7 @@ def train_options(
         "steps": steps,
         "sub_goals": source.config["sub_goals"],
         "members": members,
-        "domain": domain.name,
+        "domain": source.config["domain"],
         "domain_config": source.config["domain_config"],
         "setting": config.network,
     }
@@ -97,7 +97,7 @@ def train_options(
         if hasattr(engine, "positions") and hasattr(domain, "distance"):
             recorder.write_executions(folder, engine.positions, domain.distance)
         if visited:
-            visited.write(folder, domain, source.config["domain_config"], seed)
+            visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
         (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
     counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}

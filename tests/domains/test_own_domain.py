@@ -16,8 +16,7 @@ TESTS = Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TESTS))
-    monkeypatch.syspath_prepend(str(TESTS / "domains"))
-    monkeypatch.setenv("HYPOGOAL_DOMAINS", "own_domain:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
 
 
 def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
@@ -50,3 +49,14 @@ def test_what_is_no_domain_is_refused() -> None:
         load_domain("own_domain:CorridorConfig", given=True)
     with pytest.raises(UserError, match="cannot be loaded"):
         load_domain("own_domain:NOTHING", given=True)
+
+
+@pytest.mark.parametrize("agent", ["ppo", "dqn"])
+def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
+    """Spec E7, B6: on images that no 8 x 8 cells fill, of a layout whose shortest path nobody knows."""
+    train = ["train-baseline", "own_domain:ODD", "--agent", agent, "--out", str(tmp_path / agent), "-q"]
+    few = [word for pair in ("steps=128", "max_episode_steps=20") for word in ("--set", pair)]
+    assert main([*train, *few]) == 0
+    facts = json.loads((tmp_path / agent / "layout.json").read_text(encoding="utf-8"))
+    assert facts["shortest_path"] is None and facts["random_success"] is None
+    assert json.loads((tmp_path / agent / "manifest.json").read_text())["config"]["domain"] == "own_domain:ODD"

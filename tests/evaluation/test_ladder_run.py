@@ -26,7 +26,7 @@ QUIET = {"quiet": True}
 def trusted():
     """Spec B6, G2: the data name ladder_run:DOMAIN, code that the user must allow."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HYPOGOAL_DOMAINS", "ladder_run:DOMAIN")
+        patch.setenv("HYPOGOAL_TRUST", "ladder_run:DOMAIN")
         yield
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import corridor_env
 import pytest
 import torch
 from corridor import Corridor, LongCorridor
@@ -31,10 +32,18 @@ QUICK = {
 }
 OWN = {"experience": "own", "mask_reached": False}
 FAR = {**OWN, "n_step": 3, "exploration": "persistent", "restart_options": True, "option_timeout": 6}
-CASES: dict[str, tuple[type[Corridor], str, dict[str, object], str]] = {
+
+
+def gymnasium_corridor(count: int) -> Any:
+    """Environments that nobody can save: their episodes are played again."""
+    return corridor_env.DOMAIN.make_engine(0, count, 30)
+
+
+CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, ppo": (Corridor, "light", {"initiation": "learned"}, "ppo"),
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
     "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
+    "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
     "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
 }
 STEPS, BREAKS = 300, (23, 51, 80)  # environment steps, and the steps of the loop after which it breaks

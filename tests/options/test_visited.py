@@ -88,7 +88,7 @@ def test_it_goes_on_where_it_was() -> None:
 def test_an_ensemble_learns_from_what_was_visited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B7: options save what they visited, and an ensemble is trained with it, with the data's own or instead."""
     monkeypatch.syspath_prepend(str(TESTS / "domains"))
-    monkeypatch.setenv("HYPOGOAL_DOMAINS", "own_domain:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
     data, run = str(tmp_path / "data.h5"), tmp_path / "run"
     assert main(["collect", "own_domain:DOMAIN", "--out", data, "-q"]) == 0
     few = ["--set", "steps=20", "--set", "workers=1", "-q"]

@@ -29,7 +29,7 @@ def allow(patch: pytest.MonkeyPatch) -> None:
     """The corridor as a user's own domain."""
     patch.syspath_prepend(str(TESTS))
     patch.syspath_prepend(str(TESTS / "domains"))
-    patch.setenv("HYPOGOAL_DOMAINS", "own_domain:DOMAIN")
+    patch.setenv("HYPOGOAL_TRUST", "own_domain:DOMAIN")
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ class BlockConvolution(nn.Module):
     Args:
         channels: of the input (N, H, W, channels).
         out: of the output (N, H / size, W / size, out).
-        size: kernel and stride; divides H and W.
+        size: kernel and stride; what is left over at the lower and the right edge is not looked at.
     """
 
     def __init__(self, channels: int, out: int, size: int):
@@ -35,6 +35,7 @@ class BlockConvolution(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         count, height, width, channels = inputs.shape
         rows, columns = height // self.size, width // self.size
+        inputs = inputs[:, : rows * self.size, : columns * self.size]
         blocks = inputs.reshape(count, rows, self.size, columns, self.size, channels).transpose(2, 3)
         return self.linear(blocks.reshape(count, rows, columns, -1))
 

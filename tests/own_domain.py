@@ -42,4 +42,19 @@ class CorridorDomain:
         return TallCorridor(count, max_steps)
 
 
-DOMAIN = CorridorDomain()
+class OddCorridor(Corridor):
+    """The corridor in images that are not made of whole cells of 8 pixels."""
+
+    observation_shape = (20, 52, 3)
+
+
+class OddDomain(CorridorDomain):
+    """The corridor with these."""
+
+    observation_shape = OddCorridor.observation_shape
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> OddCorridor:
+        return OddCorridor(count, max_steps)
+
+
+DOMAIN, ODD = CorridorDomain(), OddDomain()

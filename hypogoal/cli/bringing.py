@@ -1,0 +1,118 @@
+"""The commands for what users bring: ``check``, ``import``, ``export``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
+
+if TYPE_CHECKING:
+    from hypogoal.testing import Verdict
+
+
+@app.command("import")
+def import_(
+    source: Annotated[
+        Path, typer.Argument(help="A .npz file, a folder of .npy files or of images, or a Minari dataset's folder.")
+    ],
+    out: Out,
+    sub_goal: Annotated[
+        list[str] | None, typer.Option(help="A sub-goal's name, in the order of the labels' columns; repeatable.")
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=MODULE:FUNCTION", help="Of a Minari dataset: a sub-goal and who labels it."),
+    ] = None,
+    key: Annotated[str, typer.Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
+    heldout: Annotated[
+        float, typer.Option(min=0.01, max=0.9, help="Share of the labelled states held out, where none are given.")
+    ] = 0.2,
+    domain: Annotated[str, typer.Option(help="What the states are of, for train-options.")] = "imported",
+    seed: Seed = 0,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a data file of own states: arrays, images, or a Minari dataset with label functions."""
+    from hypogoal.core import own_code
+    from hypogoal.core.errors import UserError
+    from hypogoal.stages.import_data import import_data as stage
+
+    labels = dict(text.partition("=")[::2] for text in label or ())
+    if not all(name and function for name, function in labels.items()):
+        raise UserError(
+            "--label needs name=module:function", " ".join(label or ()), "For example --label won=mine:won."
+        )
+    with own_code.given(*labels.values()):
+        counts = stage(
+            source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,
+            force=force,
+        )  # fmt: skip
+    print_counts(counts, quiet)
+    typer.echo(out)
+
+
+@app.command()
+def export(
+    data: Annotated[Path, typer.Argument(help="A data file.")],
+    out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")],
+    force: Force = False,
+) -> None:
+    """Write a data file's states as NumPy arrays, for other software; 'import' takes them again."""
+    from hypogoal.stages.import_data import export_data as stage
+
+    stage(data, out, force=force)
+    typer.echo(out)
+
+
+@app.command()
+def check(
+    domain: Annotated[str | None, typer.Argument(help="A domain: a name or module:object.")] = None,
+    diversity: Annotated[str | None, typer.Option(help="A diversity objective: a name or module:function.")] = None,
+    network: Annotated[str | None, typer.Option(help="A member network: a name or module:function.")] = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    layout_seed: Annotated[int, typer.Option(min=0, help="The layout that is played.")] = 0,
+) -> None:
+    """Check that an own domain, diversity objective or network keeps to its contract; exit code 2 when not.
+
+    --set changes how states of the domain are collected, as for 'collect'; they are collected twice.
+    """
+    from hypogoal.core import own_code
+    from hypogoal.core.errors import UserError
+
+    if domain is None and diversity is None and network is None:
+        raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
+    kept = True
+    with own_code.given(*(name for name in (domain, diversity, network) if name)):
+        for verdict in _verdicts(domain, diversity, network, set_ or [], seed, layout_seed):
+            for line in verdict.lines:
+                typer.echo(line)
+            kept &= verdict.ok
+    if not kept:
+        raise typer.Exit(2)
+
+
+def _verdicts(
+    domain: str | None, diversity: str | None, network: str | None, assignments: list[str], seed: int, layout_seed: int
+) -> Iterator[Verdict]:
+    from hypogoal.core.config import resolve
+    from hypogoal.testing import check_domain, check_network, check_objective
+
+    shape: tuple[int, ...] = (64, 64, 3)
+    if domain is not None:
+        from hypogoal.domains.base import load_domain
+
+        found = load_domain(domain, given=True)
+        config: object = resolve(found.config_class, stage="collect", assignments=assignments)
+        yield from check_domain(found, config, layout_seed=layout_seed, seed=seed)
+        shape = tuple(found.observation_shape)
+    if diversity is not None:
+        from hypogoal.diversity import load_objective
+
+        yield from check_objective(load_objective(diversity))
+    if network is not None:
+        yield from check_network(network, shape)

@@ -1,0 +1,80 @@
+"""Code of the user's own, named as ``module:object``, and code that others installed, named by an entry point.
+
+``module:object`` is code that will run. It is loaded where the user gave that name, not because a data file, a manifest
+or a preset, which may be a stranger's, has it in it: then the user allows it by the environment variable
+``HYPOGOAL_TRUST`` (several names with commas between). What is installed needs no permission.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
+from importlib import metadata
+from typing import Any
+
+from hypogoal.core.errors import UserError
+
+TRUST = "HYPOGOAL_TRUST"
+_given: ContextVar[frozenset[str]] = ContextVar("_given", default=frozenset())
+
+
+@contextlib.contextmanager
+def given(*names: str) -> Iterator[None]:
+    """Within the block these names are the user's own words: ``module:object`` among them may be loaded."""
+    token = _given.set(_given.get() | set(names))
+    try:
+        yield
+    finally:
+        _given.reset(token)
+
+
+def require_trust(name: str, what: str) -> None:
+    """Refuse to load ``module:object`` that the user neither gave nor allowed; other names pass.
+
+    Args:
+        name: what a file, or the user, calls it.
+        what: what it is to be, for the message ("domain").
+
+    Raises:
+        UserError: see above.
+    """
+    allowed = {entry.strip() for entry in os.environ.get(TRUST, "").split(",")}
+    if ":" in name and name not in _given.get() and name not in allowed:
+        raise UserError(f"a file names code of its own as its {what}", name, f"Do you trust it? Set {TRUST}={name}")
+
+
+def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> Any:
+    """What ``name`` stands for: one that comes with hypogoal, an installed entry point, or ``module:object``.
+
+    Modules of the current folder can be loaded too, whichever way hypogoal was started; installed ones come first.
+
+    Args:
+        name: as given.
+        what: what it is, for messages ("domain").
+        group: of the entry points.
+        built_in: those that come with hypogoal, name to ``module:object``.
+
+    Raises:
+        UserError: no such name, it cannot be loaded, or it is code that the user did not allow.
+    """
+    entries = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
+    target = built_in.get(name) or entries.get(name)
+    if target is None and ":" in name:
+        require_trust(name, what)
+        if "" not in sys.path and os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())
+        target = name
+    if target is None:
+        known = ", ".join(sorted({*built_in, *entries}))
+        raise UserError(f"unknown {what}", name, f"Choose one of {known}, or give module:object.")
+    module, _, attribute = target.partition(":")
+    try:
+        found = importlib.import_module(module)
+        return getattr(found, attribute) if attribute else found
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
+        do = "Check the module and the object."
+        raise UserError(f"the {what} cannot be loaded ({error})", name, do) from None

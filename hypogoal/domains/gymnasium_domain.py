@@ -1,0 +1,228 @@
+"""A domain from any Gymnasium environment and a label function for each sub-goal (Spec B6, B7)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import blake2b
+from math import prod
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import Collected, States
+from hypogoal.domains.gymnasium_engine import (
+    MEMORY,
+    GymnasiumEngine,
+    Label,
+    MakeEnv,
+    as_image,
+    labels_of,
+    make_checked,
+    shape_of,
+)
+
+Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
+"""What is played to collect states: (environment, observation, random numbers) -> action."""
+
+
+@dataclass(frozen=True)
+class GymnasiumConfig:
+    """What ``hypogoal collect`` can be told about such a domain."""
+
+    labelled_seeds: tuple[int, ...] = setting((0,), "layout seeds of the labelled states", source="Spec B3", low=0)
+    unlabelled_seeds: tuple[int, ...] = setting((1, 2), "layout seeds of the unlabelled states", source="B3", low=0)
+    heldout_seeds: tuple[int, ...] = setting(
+        tuple(range(1000, 1010)), "layout seeds of the held-out states", source="Spec B3", low=0
+    )
+    steps: int = setting(3_000, "steps that are played on each layout", unit="steps", low=1)
+    states: int = setting(
+        1_000, "distinct states kept of each layout, at the most: as many of each combination of sub-goals", low=2
+    )
+    explore: float = setting(0.25, "share of random actions, where the domain brings a policy", low=0.0, high=1.0)
+    max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)
+
+
+class GymnasiumDomain:
+    """Spec B6: all that hypogoal needs to know of a problem, from a Gymnasium environment.
+
+    Args:
+        make: makes an environment: observations uint8 (H, W, C) or (H, W), actions ``Discrete``. What ``seed`` of
+            ``reset`` fixes is the layout: the same seed and actions give the same episode.
+        sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state.
+        policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
+        defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
+        memory: distinct states that training keeps pictures of, see ``GymnasiumEngine``.
+        name: for messages; artefacts name the domain as the user named it to ``collect``.
+
+    Example, a domain that ``hypogoal collect my_module:DOMAIN`` knows::
+
+        DOMAIN = GymnasiumDomain(make, {"key": lambda env: env.unwrapped.carrying is not None})
+    """
+
+    config_class = GymnasiumConfig
+
+    def __init__(
+        self,
+        make: MakeEnv,
+        sub_goals: Mapping[str, Label],
+        *,
+        policy: Policy | None = None,
+        defaults: Mapping[str, Mapping[str, Any]] | None = None,
+        memory: int = MEMORY,
+        name: str = "own",
+    ):
+        self.make, self.policy, self.memory, self.name = make, policy, memory, name
+        self.sub_goals = tuple(sub_goals)
+        self._labels = tuple(sub_goals.values())
+        self.defaults = dict(defaults or {})
+
+    @cached_property
+    def observation_shape(self) -> tuple[int, ...]:
+        """(H, W, C)."""
+        env = make_checked(self.make)
+        env.close()
+        return shape_of(env)
+
+    def label(self, env: gymnasium.Env) -> NDArray[np.bool_]:
+        """Which sub-goals hold in an environment's current state, bool (G,)."""
+        return labels_of(env, self._labels)
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
+        """An engine of ``count`` environments of one layout; ``arguments``: ``memory``."""
+        settings = {"memory": self.memory, **arguments}
+        return GymnasiumEngine(self.make, self._labels, layout_seed, count, max_steps=max_steps, **settings)
+
+    def collected_bytes(self, config: GymnasiumConfig) -> int:
+        """Observations of a collection, at the most."""
+        layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)
+        return layouts * min(config.states, config.steps) * prod(self.observation_shape)
+
+    def played_bytes(self, steps: int) -> int:
+        """Pictures that training for so many steps keeps, at the most."""
+        return min(2 * self.memory, steps) * prod(self.observation_shape)
+
+    def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
+        """Labelled, unlabelled and held-out states: what play on each layout meets, each picture once.
+
+        Held-out states that look like one of those for learning are left out. Origins: ``layout_seed``, ``episode``
+        and ``step``, counted from 0.
+
+        Raises:
+            UserError: the labelled states have one class only of some sub-goal, or there are no unlabelled or no
+                held-out ones.
+        """
+        kinds = (config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds)
+        progress.expect(sum(map(len, kinds)) * config.steps)
+        env = make_checked(self.make)
+        seen: set[bytes] = set()
+        sets = []
+        for kind, seeds in enumerate(kinds):
+            own = [self._play(env, config, layout, seed, seen if kind == 2 else set(), progress) for layout in seeds]
+            sets.append(_joined(own, self.observation_shape, len(self.sub_goals)))
+            seen.update(map(_digest, sets[-1].observations))
+        env.close()
+        labelled, unlabelled, heldout = sets
+        self._require_classes(labelled, unlabelled, heldout, config)
+        return Collected(self.observation_shape, self.sub_goals, labelled, unlabelled, heldout)
+
+    def _play(
+        self, env: gymnasium.Env, config: GymnasiumConfig, layout: int, seed: int, known: set[bytes], progress: Any
+    ) -> States:
+        """The distinct states of one layout that are not ``known``: an even sample of each combination of sub-goals."""
+        rng, known = rng_for(seed, "play", layout), set(known)
+        groups: dict[bytes, _Sample] = {}
+        episode = step = 0
+
+        def look(observation: Any) -> None:
+            image = as_image(observation, self.observation_shape)
+            digest = _digest(image)
+            if digest not in known:
+                known.add(digest)
+                labels = self.label(env)
+                group = groups.setdefault(labels.tobytes(), _Sample(config.states, labels))
+                group.offer((image, layout, episode, step), rng)
+
+        observation, _info = env.reset(seed=layout)
+        look(observation)
+        for _ in range(config.steps):
+            if self.policy is None or rng.random() < config.explore:
+                action = int(rng.integers(env.action_space.n))  # type: ignore[attr-defined]
+            else:
+                action = int(self.policy(env, observation, rng))
+            observation, _reward, terminated, truncated, _info = env.step(action)
+            step += 1
+            look(observation)  # the last state of an episode, too: a sub-goal may lie there
+            progress.advance()
+            if terminated or truncated or step >= config.max_episode_steps:
+                observation, _info = env.reset(seed=layout)
+                episode, step = episode + 1, 0
+        return _shared_out(list(groups.values()), config.states, self.observation_shape, len(self.sub_goals))
+
+    def _require_classes(self, labelled: States, unlabelled: States, heldout: States, config: GymnasiumConfig) -> None:
+        for states, what in ((unlabelled, "unlabelled"), (heldout, "held-out")):
+            if not len(states.observations):
+                do = "Give other seeds, or more steps: states that look like those for learning do not count."
+                raise UserError(f"there are no {what} states", f"steps={config.steps}", do)
+        for index, sub_goal in enumerate(self.sub_goals):
+            positives = int(labelled.labels[:, index].sum())
+            if positives in (0, len(labelled.labels)):
+                what = "never" if positives == 0 else "always"
+                do = "Give --set steps=N with more steps, other labelled_seeds, or the domain a policy that gets there."
+                raise UserError(f"{sub_goal} {what} holds in the labelled states", f"steps={config.steps}", do)
+            if len(np.unique(heldout.labels[:, index])) < 2:
+                print(
+                    f"hypogoal: {sub_goal} has one class only in the held-out states, so it cannot be judged by them",
+                    file=sys.stderr,
+                )
+
+
+class _Sample:
+    """So many of the states offered, each as likely as another; all of one combination of sub-goals."""
+
+    def __init__(self, size: int, labels: NDArray[np.bool_]):
+        self.size, self.labels, self.offered = size, labels, 0
+        self.kept: list[tuple[NDArray[np.uint8], int, int, int]] = []
+
+    def offer(self, state: tuple[NDArray[np.uint8], int, int, int], rng: np.random.Generator) -> None:
+        """One more state, each once."""
+        self.offered += 1
+        if len(self.kept) < self.size:
+            self.kept.append(state)
+        else:
+            place = int(rng.integers(self.offered))
+            if place < self.size:
+                self.kept[place] = state
+
+
+def _shared_out(groups: list[_Sample], size: int, shape: tuple[int, ...], sub_goals: int) -> States:
+    """``size`` states of all groups, as evenly as they have them, in the order in which they were met."""
+    left, rows = size, []
+    for number, group in enumerate(sorted(groups, key=lambda group: len(group.kept))):
+        take = min(len(group.kept), left // (len(groups) - number))
+        rows += [(state, group.labels) for state in group.kept[:take]]
+        left -= take
+    rows.sort(key=lambda row: row[0][1:])
+    images = np.stack([row[0][0] for row in rows]) if rows else np.empty((0, *shape), np.uint8)
+    labels = np.array([row[1] for row in rows], dtype=np.bool_).reshape(-1, sub_goals)
+    whence = np.array([row[0][1:] for row in rows], dtype=np.int64).reshape(-1, 3)
+    names = ("layout_seed", "episode", "step")
+    return States(images, labels, {name: whence[:, column] for column, name in enumerate(names)})
+
+
+def _joined(sets: list[States], shape: tuple[int, ...], sub_goals: int) -> States:
+    sets = [_shared_out([], 0, shape, sub_goals), *sets]
+    origins = {name: np.concatenate([one.origins[name] for one in sets]) for name in sets[0].origins}
+    images, labels = (np.concatenate([getattr(one, name) for one in sets]) for name in ("observations", "labels"))
+    return States(images, labels, origins)
+
+
+def _digest(image: NDArray[np.uint8]) -> bytes:
+    return blake2b(image.tobytes(), digest_size=16).digest()

@@ -1,0 +1,231 @@
+"""Any Gymnasium environment as an engine: many of it stepped in turn, states by id, each distinct one kept once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from hashlib import blake2b
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Step
+
+MakeEnv = Callable[[], gymnasium.Env]
+Label = Callable[[gymnasium.Env], bool]
+MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
+
+
+def make_checked(make: MakeEnv) -> gymnasium.Env:
+    """An environment whose observations and actions hypogoal can work with.
+
+    Raises:
+        UserError: it cannot be made, its observations are no uint8 images, or its actions are not ``Discrete``.
+    """
+    try:
+        env = make()
+    except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
+        raise UserError(f"the environment cannot be made ({error})", None, "Mend the function that makes it.") from None
+    space, actions = env.observation_space, env.action_space
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
+        do = "Wrap it so that it gives images, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
+        raise UserError("observations must be images, uint8 (H, W, C) or (H, W)", space, do)
+    if not isinstance(actions, spaces.Discrete) or actions.start != 0:
+        raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
+    return env
+
+
+def shape_of(env: gymnasium.Env) -> tuple[int, ...]:
+    """(H, W, C) of an environment's observations."""
+    shape = env.observation_space.shape
+    assert shape is not None
+    return tuple(int(size) for size in (shape if len(shape) == 3 else (*shape, 1)))
+
+
+def as_image(observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """An observation as uint8 (H, W, C), in memory of its own.
+
+    Raises:
+        UserError: it is not what the environment's observation space says.
+    """
+    image = np.array(observation, order="C")
+    if image.dtype != np.uint8 or image.size != int(np.prod(shape)):
+        found = f"{image.dtype} {image.shape}"
+        do = f"Make the observation space and the observations agree; the space says uint8 {shape}."
+        raise UserError("the environment gave another observation than its space says", found, do)
+    return image.reshape(shape)
+
+
+def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
+    """Which sub-goals hold in an environment's current state, bool (G,)."""
+    return np.array([bool(label(env)) for label in labels], dtype=np.bool_)
+
+
+class GymnasiumEngine:
+    """Environments of one layout, stepped one after the other; see ``hypogoal.domains.base.Engine``.
+
+    Every episode begins with ``reset(seed=layout_seed)``. States are told apart by what is seen and by their labels:
+    the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
+    Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
+
+    Args:
+        make: makes an environment.
+        labels: G functions, see :func:`labels_of`.
+        layout_seed: the seed of every reset.
+        count: environments (E).
+        max_steps: steps after which an episode is truncated, where the environment does not do so earlier.
+        memory: distinct states, see above.
+    """
+
+    def __init__(
+        self,
+        make: MakeEnv,
+        labels: Sequence[Label],
+        layout_seed: int,
+        count: int,
+        *,
+        max_steps: int,
+        memory: int = MEMORY,
+    ):
+        self.count, self.max_steps, self.memory, self.layout_seed = count, max_steps, memory, layout_seed
+        self._envs = [make_checked(make) for _ in range(count)]
+        self._label_functions = tuple(labels)
+        self.observation_shape = shape_of(self._envs[0])
+        self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
+        self._ring: list[NDArray[np.uint8]] = []
+        self._labels = bytearray()
+        self._ids: dict[bytes, int] = {}
+        self._digests: list[bytes] = []  # of the states in the ring
+        self._played: list[list[int]] = [[] for _ in range(count)]
+        self.reset()
+
+    @property
+    def n_states(self) -> int:
+        """Ids known so far are 0 .. n_states - 1."""
+        return len(self._labels) // max(1, len(self._label_functions))
+
+    @property
+    def oldest(self) -> int:
+        """Ids below this one are forgotten: there are no images of them."""
+        return self.n_states - len(self._ring)
+
+    def reset(self) -> NDArray[np.int64]:
+        """Put every environment at the start of an episode; returns the ids, int64 (E,)."""
+        self.ids = np.array([self._begin(number) for number in range(self.count)], dtype=np.int64)
+        self.elapsed = np.zeros(self.count, dtype=np.int64)
+        return self.ids.copy()
+
+    def restart(self, where: NDArray[np.bool_]) -> None:
+        """Begin a new episode now in the environments ``where``, bool (E,)."""
+        ids, elapsed = self.ids.copy(), self.elapsed.copy()
+        for number in np.flatnonzero(where).tolist():
+            ids[number], elapsed[number] = self._begin(number), 0
+        self.ids, self.elapsed = ids, elapsed
+
+    def step(self, actions: NDArray[np.int64]) -> Step:
+        """Step every environment; where an episode ends, ``ids`` is a start state again afterwards."""
+        next_ids = np.empty(self.count, dtype=np.int64)
+        rewards = np.zeros(self.count, dtype=np.float32)
+        terminated, truncated = np.zeros((2, self.count), dtype=np.bool_)
+        ids, elapsed = np.empty_like(next_ids), self.elapsed + 1
+        for number, (env, action) in enumerate(zip(self._envs, actions.tolist(), strict=True)):
+            observation, reward, over, cut, _info = env.step(action)
+            self._played[number].append(action)
+            next_ids[number] = ids[number] = self._remember(env, observation)
+            rewards[number], terminated[number] = float(reward), bool(over)
+            truncated[number] = bool(cut) or elapsed[number] >= self.max_steps
+            if terminated[number] or truncated[number]:
+                ids[number], elapsed[number] = self._begin(number), 0
+        self.ids, self.elapsed = ids, elapsed
+        return Step(next_ids, rewards, terminated, truncated & ~terminated)
+
+    def _begin(self, number: int) -> int:
+        observation, _info = self._envs[number].reset(seed=self.layout_seed)
+        self._played[number] = []
+        return self._remember(self._envs[number], observation)
+
+    def _remember(self, env: gymnasium.Env, observation: Any) -> int:
+        """The id of what an environment is in now."""
+        image = as_image(observation, self.observation_shape)
+        labels = labels_of(env, self._label_functions).tobytes()
+        digest = blake2b(image.tobytes() + labels, digest_size=16).digest()
+        known = self._ids.get(digest)
+        if known is not None and known >= self.n_states - self.memory:
+            return known
+        identity = self.n_states
+        self._keep(identity, image, digest)
+        self._labels += labels
+        return identity
+
+    def _keep(self, identity: int, image: NDArray[np.uint8], digest: bytes) -> None:
+        place = identity % (2 * self.memory)
+        if place == len(self._ring):
+            self._ring.append(image)
+            self._digests.append(digest)
+        else:
+            forgotten = self._digests[place]
+            if self._ids.get(forgotten) == identity - 2 * self.memory:
+                del self._ids[forgotten]
+            self._ring[place], self._digests[place] = image, digest
+        self._ids[digest] = identity
+
+    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Observations uint8 (n, H, W, C) of states (n,), into ``out`` where given.
+
+        Raises:
+            ValueError: there is no such state, or it is forgotten.
+        """
+        if len(ids) and not self.oldest <= ids.min() <= ids.max() < self.n_states:
+            raise ValueError(f"states {self.oldest} to {self.n_states - 1} are kept, not {ids.min()} to {ids.max()}")
+        if out is None:
+            out = np.empty((len(ids), *self.observation_shape), np.uint8)
+        for row, identity in enumerate(ids.tolist()):
+            out[row] = self._ring[identity % (2 * self.memory)]
+        return out
+
+    def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """True sub-goal predicates, bool (n, G); of forgotten states too."""
+        every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._label_functions))
+        return every[ids].copy()
+
+    def snapshot(self) -> dict[str, Any]:
+        """What a resumed run needs to go on exactly: the states, and what was played since each episode began."""
+        return {
+            "ids": self.ids.copy(),
+            "elapsed": self.elapsed.copy(),
+            "images": np.stack(self._ring),
+            "labels": np.frombuffer(self._labels, np.uint8).copy(),
+            "played": [list(actions) for actions in self._played],
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of an engine made with the same arguments: episodes are played up to there.
+
+        Raises:
+            UserError: they did not lead to the same states, so the environment is not the same for the same seed.
+        """
+        width, size = len(self._label_functions), 2 * self.memory
+        self._labels = bytearray(snapshot["labels"].tobytes())
+        self._ring, self._digests, self._ids = list(snapshot["images"]), [b""] * len(snapshot["images"]), {}
+        for identity in range(self.oldest, self.n_states):
+            labels = self._labels[identity * width : (identity + 1) * width]
+            digest = blake2b(self._ring[identity % size].tobytes() + labels, digest_size=16).digest()
+            self._digests[identity % size] = digest
+            self._ids[digest] = identity
+        for number, actions in enumerate(snapshot["played"]):
+            env = self._envs[number]
+            observation, _info = env.reset(seed=self.layout_seed)
+            for action in actions:
+                observation = env.step(action)[0]
+            here, was = as_image(observation, self.observation_shape), int(snapshot["ids"][number])
+            if not np.array_equal(here, self._ring[was % size]):
+                raise UserError(
+                    "the environment does not do the same again for the same seed, so this cannot be gone on with",
+                    f"layout_seed={self.layout_seed}",
+                    "Begin anew with --force.",
+                )
+        self._played = [list(actions) for actions in snapshot["played"]]
+        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()

@@ -1,0 +1,102 @@
+"""Sub-goal classifiers as Gymnasium wrappers: as a reward, and as the end of an episode, for anyone's agent."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsFloat, TypeAlias
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.ensemble import Ensemble
+
+Env: TypeAlias = gymnasium.Env[Any, Any]
+RULES = ("any", "vote", "all", "mean")
+
+
+def require_observations(env: Env, shape: tuple[int, ...]) -> None:
+    """Refuse an environment whose observations are not those that networks were trained on.
+
+    Raises:
+        UserError: it is one.
+    """
+    space = env.observation_space
+    if space.shape != shape or space.dtype != np.uint8:
+        found = f"{space.dtype} {space.shape}, not uint8 {shape}"
+        do = "Use the environment they were trained on, with its wrappers."
+        raise UserError("the environment's observations are not those that these members know", found, do)
+
+
+class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """What both wrappers share: whether the sub-goal holds in an observation."""
+
+    def __init__(self, env: Env, ensemble: Ensemble, by: str | int, **arguments: Any):
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, ensemble=ensemble, by=by, **arguments)
+        gymnasium.Wrapper.__init__(self, env)
+        require_observations(env, ensemble.observation_shape)
+        if ensemble.needs_positions:
+            do = "Train it with localiser=learned."
+            raise UserError("the ensemble needs the agent's positions (localiser=ram)", None, do)
+        number = isinstance(by, int) and not isinstance(by, bool) and 0 <= by < len(ensemble)
+        if by not in RULES and not number:
+            do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
+            raise UserError("who is to say that the sub-goal holds?", f"by={by!r}", do)
+        self.ensemble, self.by = ensemble, by
+
+    def holds(self, observation: NDArray[np.uint8]) -> bool:
+        """Whether the sub-goal holds in an observation (H, W, C), by the members asked."""
+        if self.by == "mean":
+            return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
+        verdicts = self.ensemble.verdicts(observation[None])[0]
+        if isinstance(self.by, int):
+            return bool(verdicts[self.by])
+        return bool({"any": verdicts.any(), "all": verdicts.all(), "vote": verdicts.mean() > 0.5}[self.by])
+
+
+class SubgoalReward(_Subgoal):
+    """Reward where a sub-goal's classifier fires (Spec D1): ``scale`` there, 0 elsewhere.
+
+    An agent can stay where it is rewarded: wrap the result in :class:`SubgoalTermination` too where it is not to.
+
+    Args:
+        env: an environment with the observations that the ensemble was trained on.
+        ensemble: from :func:`hypogoal.load_ensemble`.
+        by: who says so: ``any`` member, more than half of them (``vote``), ``all``, their ``mean`` probability above
+            0.5, or one member by its number.
+        scale: the reward.
+        add: to the environment's own reward, instead of in its place.
+
+    ``info["subgoal"]`` says whether the sub-goal holds.
+    """
+
+    def __init__(self, env: Env, ensemble: Ensemble, by: str | int = "vote", *, scale: float = 1.0, add: bool = False):
+        super().__init__(env, ensemble, by, scale=scale, add=add)
+        self.scale, self.add = scale, add
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """As the environment's, with the reward changed."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        holds = self.holds(observation)
+        own = self.scale if holds else 0.0
+        return observation, float(reward) + own if self.add else own, terminated, truncated, info | {"subgoal": holds}
+
+
+class SubgoalTermination(_Subgoal):
+    """The episode terminates where a sub-goal's classifier fires (Spec D1).
+
+    Args:
+        env, ensemble, by: as of :class:`SubgoalReward`.
+
+    ``info["subgoal"]`` says whether the sub-goal holds.
+    """
+
+    def __init__(self, env: Env, ensemble: Ensemble, by: str | int = "vote"):
+        super().__init__(env, ensemble, by)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """As the environment's, ``terminated`` where the sub-goal holds."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        holds = self.holds(observation)
+        return observation, reward, terminated or holds, truncated, info | {"subgoal": holds}

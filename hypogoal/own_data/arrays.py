@@ -1,0 +1,107 @@
+"""NumPy arrays: a ``.npz`` file, or a folder of ``.npy`` files with the same names."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import require_file
+from hypogoal.core.preflight import free_memory, human
+from hypogoal.dataset import Dataset
+from hypogoal.own_data.parts import Parts
+
+NEEDED = ("observations", "labels", "unlabelled")
+OPTIONAL = ("heldout_observations", "heldout_labels")
+NAMES = "sub_goals"
+KNOWN = (*NEEDED, *OPTIONAL, NAMES)
+
+
+def read_arrays(path: Path) -> Parts:
+    """Arrays by name: those of ``NEEDED``, those of ``OPTIONAL`` where given, and ``sub_goals`` (G texts) where given.
+
+    Args:
+        path: a ``.npz`` file, or a folder of ``.npy`` files.
+
+    Raises:
+        UserError: missing, damaged, larger than memory, or holding Python objects (which would be code).
+    """
+    arrays = _folder(path) if path.is_dir() else _file(path)
+    missing = [name for name in NEEDED if name not in arrays]
+    if missing:
+        do = f"Give arrays called {', '.join(NEEDED)}, and {' and '.join(OPTIONAL)} where there are some."
+        raise UserError(f"no array {missing[0]!r}", path, do)
+    if ("heldout_observations" in arrays) != ("heldout_labels" in arrays):
+        raise UserError("held-out states need observations and labels", path, f"Give {' and '.join(OPTIONAL)}.")
+    named = tuple(map(str, arrays[NAMES].ravel())) if NAMES in arrays else ()
+    return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, sub_goals=named)
+
+
+def write_arrays(path: Path, dataset: Dataset) -> None:
+    """A data file's states as :func:`read_arrays` takes them, where its sub-goals share their states.
+
+    Raises:
+        UserError: they do not.
+    """
+    columns: dict[str, list[NDArray[np.bool_]]] = {"labelled": [], "heldout": []}
+    first: dict[str, NDArray[np.uint8]] = {}
+    for split, labels in columns.items():
+        for goal in dataset.sub_goals:
+            found = getattr(dataset, split)(goal)
+            if not np.array_equal(first.setdefault(split, found.observations), found.observations):
+                raise UserError("its sub-goals have states of their own", dataset.path, "Read it with h5py instead.")
+            labels.append(found.labels)
+    arrays: dict[str, Any] = {
+        "observations": first["labelled"],
+        "labels": np.stack(columns["labelled"], axis=1),
+        "unlabelled": dataset.unlabelled(),
+        "heldout_observations": first["heldout"],
+        "heldout_labels": np.stack(columns["heldout"], axis=1),
+        NAMES: np.array(dataset.sub_goals),
+    }
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def _file(path: Path) -> dict[str, NDArray[Any]]:
+    require_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, OSError):
+        raise UserError("this is no .npz file", path, "Write it with numpy.savez.") from None
+    _require_memory(size, path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files if name in KNOWN}
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, MemoryError) as error:
+        raise _damaged(path, error) from None
+
+
+def _folder(path: Path) -> dict[str, NDArray[Any]]:
+    arrays = {}
+    files = {name: path / f"{name}.npy" for name in KNOWN}
+    found = {name: file for name, file in files.items() if file.is_file()}
+    _require_memory(sum(file.stat().st_size for file in found.values()), path)
+    for name, file in found.items():
+        try:
+            arrays[name] = np.load(file, allow_pickle=False)
+        except (ValueError, OSError, EOFError, MemoryError) as error:
+            raise _damaged(file, error) from None
+    return arrays
+
+
+def _require_memory(size: int, path: Path) -> None:
+    free = free_memory()
+    if free is not None and size > free:
+        raise UserError(f"the arrays need {human(size)} of memory, {human(free)} are free", path, "Give fewer states.")
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    if "pickle" in str(error):
+        return UserError("an array holds Python objects, which are not read", path, "Give arrays of numbers.")
+    return UserError("the arrays are damaged", path, "Write them again with numpy.")

@@ -1,0 +1,167 @@
+"""What users bring, checked, as the sets of states that a data file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name
+from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import Collected, States
+
+FEW = 10  # states of a class, below which one is warned
+RARE = 0.05  # share of a class, below which one is warned
+
+
+@dataclass(frozen=True)
+class Parts:
+    """States as they were found, not yet looked at.
+
+    Attributes:
+        observations: (N, H, W, C) or (N, H, W), with labels.
+        labels: (N,) or (N, G).
+        unlabelled: (M, H, W, C) or (M, H, W).
+        heldout_observations, heldout_labels: as the first two; None, a share of the labelled states is held out.
+        sub_goals: their names, where they were found with them.
+    """
+
+    observations: NDArray[Any]
+    labels: NDArray[Any]
+    unlabelled: NDArray[Any]
+    heldout_observations: NDArray[Any] | None = None
+    heldout_labels: NDArray[Any] | None = None
+    sub_goals: tuple[str, ...] = ()
+
+
+def collected_of(
+    parts: Parts, sub_goals: Sequence[str], *, share: float = 0.2, seed: int = 0
+) -> tuple[Collected, list[str]]:
+    """The states in the form of a data file, and what is allowed but may surprise, a line each.
+
+    Args:
+        parts: what was found.
+        sub_goals: G names; may be left out for one.
+        share: of the labelled states that is held out where there are no held-out ones, of each class.
+        seed: of which ones.
+
+    Raises:
+        UserError: shapes, types or labels that cannot be used, or a class that is missing.
+    """
+    warned: list[str] = []
+    images = as_images(parts.observations, "the labelled observations")
+    shape = images.shape[1:]
+    labels = as_labels(parts.labels, len(images), "the labels")
+    goals = named(sub_goals or parts.sub_goals, labels.shape[1])
+    unlabelled = as_images(parts.unlabelled, "the unlabelled observations", shape)
+    if parts.heldout_observations is not None and parts.heldout_labels is not None:
+        heldout = as_images(parts.heldout_observations, "the held-out observations", shape)
+        known = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
+    else:
+        chosen = held_out(labels, share, seed)
+        heldout, known = images[chosen], labels[chosen]
+        images, labels = images[~chosen], labels[~chosen]
+        warned.append(
+            f"no held-out states were given: {int(chosen.sum())} of the labelled ones are held out, which says nothing "
+            "of other contexts"
+        )
+    require_classes(labels, goals, warned)
+    rows = [np.arange(len(part), dtype=np.int64) for part in (images, unlabelled, heldout)]
+    sets = (
+        States(images, labels, {"row": rows[0]}),
+        States(unlabelled, np.zeros((len(unlabelled), len(goals)), np.bool_), {"row": rows[1]}),
+        States(heldout, known, {"row": rows[2]}),
+    )
+    return Collected(tuple(shape), goals, *sets), warned
+
+
+def as_images(values: NDArray[Any], what: str, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
+    """Observations uint8 (N, H, W, C), of ``shape`` (H, W, C) where given.
+
+    Raises:
+        UserError: another type or shape, or none at all.
+    """
+    found = f"{values.dtype} {values.shape}"
+    if values.dtype.kind == "f":
+        do = "Where 0..1, give (255 * x).round().astype('uint8')."
+        raise UserError(f"{what} are no bytes", found, do)
+    if values.dtype.kind in "iu" and values.dtype != np.uint8 and len(values):
+        low, high = int(values.min()), int(values.max())
+        if low < 0 or high > 255:
+            raise UserError(f"{what} do not fit bytes ({low} to {high})", found, "Scale them to 0..255, uint8.")
+        values = values.astype(np.uint8)
+    if values.dtype != np.uint8:
+        raise UserError(f"{what} are no bytes", found, "Give uint8.")
+    if values.ndim == 3:
+        values = values[..., None]
+    if values.ndim != 4 or 0 in values.shape[1:]:
+        raise UserError(f"{what} are no images", found, "Give (N, height, width, channels) or (N, height, width).")
+    if values.shape[1] in (1, 3, 4) and values.shape[3] > 16:
+        raise UserError(f"{what} have their channels first", found, "Give x.transpose(0, 2, 3, 1).")
+    if not len(values):
+        raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")
+    if shape is not None and values.shape[1:] != shape:
+        raise UserError(f"{what} are of another shape than the labelled ones", f"{values.shape[1:]}, not {shape}")
+    return np.ascontiguousarray(values)
+
+
+def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = None) -> NDArray[np.bool_]:
+    """Labels bool (count, G).
+
+    Raises:
+        UserError: another number of them, or other values than 0 and 1.
+    """
+    found = f"{values.dtype} {values.shape}"
+    columns = values.reshape(len(values), -1) if values.ndim in (1, 2) else values
+    if columns.ndim != 2 or len(columns) != count or columns.shape[1] == 0:
+        raise UserError(f"{what} do not fit {count} states", found, f"Give ({count},), or ({count}, sub-goals).")
+    if columns.dtype.kind not in "biuf" or not np.isin(columns, (0, 1)).all():
+        odd = [] if columns.dtype.kind not in "biuf" else np.setdiff1d(columns, (0, 1))[:3].tolist()
+        raise UserError(f"{what} are not only 0 and 1", odd or found, "1 where the sub-goal holds, 0 where not.")
+    if goals is not None and columns.shape[1] != goals:
+        raise UserError(f"{what} are of {columns.shape[1]} sub-goals, not {goals}", found, "Give a column for each.")
+    return columns.astype(np.bool_)
+
+
+def named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
+    """The names of ``count`` sub-goals.
+
+    Raises:
+        UserError: not as many, the same one twice, or no plain names.
+    """
+    names = tuple(sub_goals) or (("sub-goal",) if count == 1 else ())
+    if len(names) != count or len(set(names)) != count or not all(map(plain_name, names)):
+        do = f"Give --sub-goal NAME {count} times, different plain names in the order of the labels' columns."
+        raise UserError(f"{count} sub-goals need as many names", ", ".join(names) or None, do)
+    return names
+
+
+def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.bool_]:
+    """Which states (N,) are held out: ``share`` of each combination of labels (N, G), at random."""
+    rng = rng_for(seed, "held-out")
+    chosen = np.zeros(len(labels), np.bool_)
+    for kind in np.unique(labels, axis=0):
+        rows = np.flatnonzero((labels == kind).all(axis=1))
+        chosen[rng.permutation(rows)[: round(share * len(rows))]] = True
+    return chosen
+
+
+def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], warned: list[str]) -> None:
+    """Each sub-goal (G,) must hold in some labelled states (N, G) and not in others; where few do, one is warned.
+
+    Raises:
+        UserError: a class is missing.
+    """
+    for column, goal in enumerate(goals):
+        positives = int(labels[:, column].sum())
+        fewest = min(positives, len(labels) - positives)
+        which = "positives" if positives <= len(labels) / 2 else "negatives"
+        if fewest == 0:
+            do = "Give states of both kinds."
+            raise UserError(f"{goal} has no {which} among {len(labels)} labelled states", None, do)
+        if fewest < FEW or fewest < RARE * len(labels):
+            warned.append(f"{goal} has {fewest} {which} among {len(labels)} labelled states: classes are unbalanced")

@@ -1,0 +1,87 @@
+"""Spec B6: states that users bring, as a data file, and a data file's states as arrays for other software."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.artefacts import claim
+from hypogoal.core.drafts import put_in_place
+from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load_own
+from hypogoal.dataset import open_dataset, write_dataset
+from hypogoal.own_data import MAIN_FILE, collected_of, read_arrays, read_images, read_minari, write_arrays
+
+DOMAIN = "imported"  # of states whose domain is not said
+LABELS = "hypogoal.labels"  # entry points of label functions
+
+
+def import_data(
+    source: Path,
+    out: Path,
+    *,
+    sub_goals: Sequence[str] = (),
+    labels: Mapping[str, str] | None = None,
+    key: str = "",
+    share: float = 0.2,
+    domain: str = DOMAIN,
+    seed: int = 0,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Write the states of ``source`` into the data file ``out``.
+
+    Args:
+        source: a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
+        out: the HDF5 file to write.
+        sub_goals: their names, in the order of the labels' columns.
+        labels: for a Minari dataset, by sub-goal ``module:function`` from an observation to a truth.
+        key: for a Minari dataset whose observations are dictionaries, which part is the image.
+        share: of the labelled states that is held out where no held-out ones are given.
+        domain: what the states are of, for ``train-options`` and later stages.
+        seed: of which states are held out.
+        force: replace an existing file.
+
+    Returns:
+        Numbers of states and positives per split and sub-goal.
+
+    Raises:
+        UserError: see ``hypogoal.own_data``.
+    """
+    claim(out, force=force)
+    if (source / MAIN_FILE).exists():
+        functions = [load_own(name, "label function", LABELS, {}) for name in (labels or {}).values()]
+        parts, sub_goals = read_minari(source, functions, key=key, seed=seed), tuple(labels or ())
+    elif labels or key:
+        raise UserError("no Minari dataset", source, "--label and --key are for the folder of one.")
+    elif (source / "positive").is_dir() or (source / "negative").is_dir():
+        parts = read_images(source)
+        sub_goals = sub_goals or (source.resolve().name,)
+    else:
+        parts = read_arrays(source)
+    collected, warned = collected_of(parts, sub_goals, share=share, seed=seed)
+    for line in warned:
+        print(f"hypogoal: {line}", file=sys.stderr)
+    config = {"source": source.name, **({"labels": dict(labels)} if labels else {})}
+    write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
+    return open_dataset(out).counts()
+
+
+def export_data(data: Path, out: Path, *, force: bool = False) -> None:
+    """Write the states of a data file as ``.npz``, which ``import_data`` takes again.
+
+    Raises:
+        UserError: ``out`` exists or is no ``.npz``, or the sub-goals do not share their states.
+    """
+    if out.suffix != ".npz":
+        raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
+    claim(out, force=force)
+    dataset = open_dataset(data)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    made = out.with_name(f".{out.name}.new")
+    try:
+        write_arrays(made, dataset)
+        put_in_place(made, out)
+    finally:
+        made.unlink(missing_ok=True)

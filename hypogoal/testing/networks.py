@@ -1,0 +1,101 @@
+"""What a member network must keep to, as a test that its author runs (Spec C5; ``hypogoal.hypotheses.networks``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from hypogoal.core.seeding import rng_for, torch_generator
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.networks import as_input, build_network
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.testing.verdict import Broken, Test, Verdict, run
+
+CLOSE = 1e-4
+TELL = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Flatten, nn.Linear)
+
+
+def check_network(name: str, observation_shape: tuple[int, ...] = (64, 64, 3)) -> Iterator[Verdict]:
+    """Whether a member network can be trained, stored, predicted with in every way, and explained.
+
+    Args:
+        name: as in ``--set network=NAME``.
+        observation_shape: (H, W, C) of the images it is to take.
+    """
+    return run(_Network(name, observation_shape).tests())
+
+
+class _Network:
+    def __init__(self, name: str, shape: tuple[int, ...]):
+        self.name, self.shape = name, shape
+
+    def tests(self) -> Iterator[Test]:
+        yield "builds", self.builds
+        yield "layers", self.layers
+        yield "same weights for the same seed", self.repeats
+        yield "same answers however asked", self.agrees
+        yield "gradients", self.gradients
+        yield "stored and read", self.stored
+
+    def ensemble(self, members: int = 2) -> Ensemble:
+        return Ensemble(self.name, self.shape, members, torch_generator(0, "check"))
+
+    def images(self, count: int) -> NDArray[np.uint8]:
+        return rng_for(0, "check").integers(256, size=(count, *self.shape), dtype=np.uint8)
+
+    def builds(self) -> str:
+        network = build_network(self.name, self.shape, torch_generator(0, "check"))
+        logits = network(as_input(torch.from_numpy(self.images(3))))
+        if logits.shape != (3, 2):
+            raise Broken(f"3 images give logits {tuple(logits.shape)}", "Leave the last layer to hypogoal: it gives 2.")
+        count = sum(weight.numel() for weight in network.parameters())
+        return f"{self.shape} images, {count} weights"
+
+    def layers(self) -> str:
+        network = build_network(self.name, self.shape, torch_generator(0, "check"))
+        odd = sorted({type(layer).__name__ for layer in network if not isinstance(layer, TELL)})
+        if odd:
+            allowed = ", ".join(kind.__name__ for kind in TELL)
+            raise Broken(f"layers that are not known to work: {', '.join(odd)}", f"Use {allowed}.")
+        if len({id(layer) for layer in network}) != len(network):
+            raise Broken("a layer is used twice", "Attribution needs modules of their own: make it twice.")
+        return f"{len(network)} plain layers"
+
+    def repeats(self) -> str:
+        one, other = (build_network(self.name, self.shape, torch_generator(0, "check")) for _ in range(2))
+        for left, right in zip(one.parameters(), other.parameters(), strict=True):
+            if not torch.equal(left, right):
+                raise Broken("two networks of one seed differ", "Make the layers anew at every call.")
+        return "weights come from the generator"
+
+    def agrees(self) -> str:
+        """One image, many, all members side by side: different code, the same function."""
+        ensemble = self.ensemble().eval()
+        images = self.images(300)
+        images[40:] = images[:260]  # repeated pictures take a way of their own
+        many, few = ensemble.predict(images), np.concatenate([ensemble.predict(images[i : i + 1]) for i in range(40)])
+        stacked = StackedMembers([ensemble]).predict(images[:40])
+        for other, way in ((few, "one by one"), (stacked, "all members at once")):
+            worst = float(np.abs(many[:40] - other).max())
+            if not worst < CLOSE:
+                raise Broken(f"probabilities asked {way} differ by {worst:.2g}", "Use layers that act on each image.")
+        return "one by one, in batches, all members at once"
+
+    def gradients(self) -> str:
+        network = build_network(self.name, self.shape, torch_generator(0, "check"))
+        network(as_input(torch.from_numpy(self.images(8)))).square().sum().backward()
+        for name, weight in network.named_parameters():
+            if weight.grad is None or not weight.grad.isfinite().all() or not weight.grad.any():
+                raise Broken(f"weight {name} gets no gradient", "Is it used, and not detached?")
+        return "every weight learns"
+
+    def stored(self) -> str:
+        ensemble = self.ensemble().eval()
+        again = Ensemble.from_state(self.name, self.shape, 2, ensemble.state())
+        if not np.array_equal(ensemble.predict(self.images(5)), again.predict(self.images(5))):
+            raise Broken("a stored network says something else", "Keep all state in parameters and buffers.")
+        return "the same after safetensors"

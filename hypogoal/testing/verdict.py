@@ -1,0 +1,79 @@
+"""What one check found, and how checks are run: one that fails ends those that build on it, not the program."""
+
+from __future__ import annotations
+
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from hypogoal.core.errors import UserError, printable
+
+Test = tuple[str, Callable[[], str]]
+
+
+class Broken(Exception):
+    """A promise that is not kept: what was found, and what to do about it."""
+
+    def __init__(self, what: str, do: str):
+        self.what, self.do = what, do
+        super().__init__(f"{what}. {do}")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One check.
+
+    Attributes:
+        name: what was looked at.
+        ok: whether the promise is kept.
+        text: what was found; of one that is not kept also what to do.
+        warnings: what is allowed and may still surprise.
+    """
+
+    name: str
+    ok: bool
+    text: str
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> list[str]:
+        """As ``hypogoal check`` prints it."""
+        first = f"{'ok  ' if self.ok else 'FAIL'} {self.name}: {self.text}"
+        return [printable(line) for line in (first, *(f"warn {self.name}: {text}" for text in self.warnings))]
+
+
+def run(tests: Iterable[Test]) -> Iterator[Verdict]:
+    """Run tests one after the other, until one fails: those after it build on what it found.
+
+    Args:
+        tests: name and function; the function says what it found, or raises. Warnings that it gives are kept.
+    """
+    for name, test in tests:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            try:
+                ok, text = True, test()
+            except Broken as error:
+                ok, text = False, str(error)
+            except UserError as error:
+                ok, text = False, str(error)
+            except Exception as error:  # noqa: BLE001 - what is checked is someone's code, and may raise anything
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                where = f"{Path(place.filename).name}, line {place.lineno}"
+                ok, text = False, f"{type(error).__name__}: {error} ({where}). Mend what raises it."
+        yield Verdict(name, ok, " ".join(text.split()), tuple(dict.fromkeys(str(one.message) for one in told)))
+        if not ok:
+            return
+
+
+def require(verdicts: Iterable[Verdict]) -> None:
+    """For a test-suite: pass where all promises are kept.
+
+    Raises:
+        AssertionError: one is not; it says which.
+    """
+    for verdict in verdicts:
+        if not verdict.ok:
+            raise AssertionError("\n".join(verdict.lines))

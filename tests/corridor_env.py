@@ -1,0 +1,84 @@
+"""The corridor as a Gymnasium environment, and domains of it: what a user would bring (Spec B6)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+
+LENGTH, SHAPE = 6, (48, 48, 3)
+
+
+class CorridorEnv(gymnasium.Env[np.ndarray, int]):
+    """Cells 0..5, start at 2; action 0 goes left, 1 right; the task ends at the right end with reward 1.
+
+    The agent's cell is white; a stripe below shows the layout, which ``seed`` draws from 0..7.
+    """
+
+    observation_space = spaces.Box(0, 255, SHAPE, np.uint8)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.cell, self.layout = 2, int(self.np_random.integers(8))
+        return self.image(), {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.cell = min(max(self.cell + (1 if action == 1 else -1), 0), LENGTH - 1)
+        over = self.cell == LENGTH - 1
+        return self.image(), float(over), over, False, {}
+
+    def image(self) -> np.ndarray:
+        picture = np.zeros(SHAPE, np.uint8)
+        picture[:40, 8 * self.cell : 8 * self.cell + 8] = 255
+        picture[40:, :, self.layout % 3] = 60 + 20 * self.layout
+        return picture
+
+
+def at_left(env: gymnasium.Env) -> bool:
+    return env.unwrapped.cell == 0  # type: ignore[attr-defined]
+
+
+def at_right(env: gymnasium.Env) -> bool:
+    return env.unwrapped.cell == LENGTH - 1  # type: ignore[attr-defined]
+
+
+SUB_GOALS = {"left-end": at_left, "right-end": at_right}
+DOMAIN = GymnasiumDomain(CorridorEnv, SUB_GOALS)
+
+
+class Floats(CorridorEnv):
+    """Its observations are no images of bytes."""
+
+    observation_space = spaces.Box(0, 1, SHAPE, np.float32)  # type: ignore[assignment]
+
+
+class Steered(CorridorEnv):
+    """Its actions are no numbers."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)  # type: ignore[assignment]
+
+
+class Restless(CorridorEnv):
+    """It draws its steps from nobody's seed."""
+
+    rng = np.random.default_rng(0)
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return super().step(int(self.rng.integers(2)))
+
+
+class Lying(CorridorEnv):
+    """What it shows is not what its space says."""
+
+    def image(self) -> np.ndarray:
+        return super().image().astype(np.int32)
+
+
+FLOATS, STEERED, RESTLESS, LYING = (GymnasiumDomain(env, SUB_GOALS) for env in (Floats, Steered, Restless, Lying))
+NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: False})
+ALWAYS = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "somewhere": lambda env: True})

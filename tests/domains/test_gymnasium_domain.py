@@ -1,0 +1,167 @@
+"""Domains made from Gymnasium environments: collection, the engine, and what users get wrong (Spec B6, B7)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import corridor_env
+import numpy as np
+import pytest
+from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.progress import Progress
+from hypogoal.dataset import Collected
+from hypogoal.domains.base import Domain
+from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium_engine import GymnasiumEngine
+
+SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
+
+
+def collected(domain: GymnasiumDomain = DOMAIN, config: GymnasiumConfig = SMALL, seed: int = 0) -> Collected:
+    return domain.collect(config, seed, Progress("collect", 1, quiet=True))
+
+
+def engine_of(count: int = 3, **arguments: int) -> GymnasiumEngine:
+    return DOMAIN.make_engine(0, count, 30, **arguments)
+
+
+def test_it_is_a_domain() -> None:
+    """Spec B6."""
+    assert isinstance(DOMAIN, Domain)
+    assert DOMAIN.sub_goals == ("left-end", "right-end")
+    assert DOMAIN.observation_shape == (48, 48, 3)
+
+
+def test_collection_has_each_picture_once_with_its_labels() -> None:
+    """Spec A1, B7: random play on each layout; held-out states are none of those for learning."""
+    found = collected()
+    assert found.labelled.observations.shape == (LENGTH, 48, 48, 3)
+    cells = found.labelled.observations[:, 0, ::8, 0].argmax(1)
+    assert sorted(cells.tolist()) == list(range(LENGTH))
+    np.testing.assert_array_equal(found.labelled.labels, np.stack([cells == 0, cells == LENGTH - 1], 1))
+    assert set(found.heldout.origins["layout_seed"].tolist()) <= {4, 5}
+    known = {image.tobytes() for states in (found.labelled, found.unlabelled) for image in states.observations}
+    assert not known & {image.tobytes() for image in found.heldout.observations}
+
+
+def test_collection_is_the_same_for_the_same_seed() -> None:
+    """Spec G1."""
+    one, same, other = (collected(seed=seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.labelled.origins["step"], same.labelled.origins["step"])
+    np.testing.assert_array_equal(one.heldout.observations, same.heldout.observations)
+    assert one.labelled.origins["step"].tolist() != other.labelled.origins["step"].tolist()
+
+
+def test_few_states_are_shared_out_among_combinations_of_sub_goals() -> None:
+    """Spec B3: of three states one is at each end, though most of what is met is in between."""
+    states = collected(config=GymnasiumConfig(heldout_seeds=(4,), steps=300, states=3)).labelled
+    assert sorted(map(tuple, states.labels.tolist())) == [(False, False), (False, True), (True, False)]
+
+
+def test_a_policy_collects() -> None:
+    """Spec B7: without exploration a policy that goes right never sees the left end, and that is said."""
+    right = GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=lambda env, observation, rng: 1)
+    with pytest.raises(UserError, match="left-end never holds in the labelled states"):
+        collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=80, explore=0.0))
+    assert collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=800, explore=0.6)).labelled.labels[:, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("FLOATS", "observations must be images"),
+        ("STEERED", "actions must be Discrete"),
+        ("LYING", "another observation than its space says"),
+        ("NEVER", "on-the-moon never holds"),
+        ("ALWAYS", "somewhere always holds"),
+    ],
+)
+def test_what_cannot_be_collected_is_one_line(name: str, message: str) -> None:
+    """Spec G2."""
+    with pytest.raises(UserError, match=message):
+        collected(getattr(corridor_env, name))
+
+
+def test_the_engine_is_the_environment() -> None:
+    """Spec B6: images, rewards, ends and labels are those of the environment stepped alone."""
+    engine, env, rng = engine_of(1), CorridorEnv(), np.random.default_rng(1)
+    observation, _ = env.reset(seed=0)
+    for _ in range(200):
+        np.testing.assert_array_equal(engine.images(engine.ids)[0], observation)
+        assert engine.labels(engine.ids)[0].tolist() == [env.cell == 0, env.cell == LENGTH - 1]
+        action = int(rng.integers(2))
+        step = engine.step(np.array([action]))
+        observation, reward, terminated, _, _ = env.step(action)
+        assert (step.rewards[0], step.terminated[0]) == (reward, terminated)
+        np.testing.assert_array_equal(engine.images(step.next_ids)[0], observation)
+        if terminated or step.truncated[0]:
+            observation, _ = env.reset(seed=0)
+    assert engine.n_states == LENGTH  # each picture once
+
+
+def test_the_engine_cuts_episodes() -> None:
+    """Spec B1: a time limit truncates, and is no end of the task."""
+    engine = DOMAIN.make_engine(0, 2, 3)
+    ends = [engine.step(np.zeros(2, np.int64)).truncated.tolist() for _ in range(4)]
+    assert ends == [[False] * 2, [False] * 2, [True] * 2, [False] * 2]
+    assert engine.elapsed.tolist() == [1, 1]
+
+
+def test_an_engine_goes_on_from_a_snapshot() -> None:
+    """Spec G1: the same ids, pictures and ends as the one that was not stopped."""
+    one, rng = engine_of(), np.random.default_rng(2)
+    actions = rng.integers(2, size=(40, 3))
+    for row in actions[:23]:
+        one.step(row)
+    other = engine_of()
+    other.restore(one.snapshot())
+    for row in actions[23:]:
+        for left, right in zip(one.step(row), other.step(row), strict=True):
+            np.testing.assert_array_equal(left, right)
+    known = np.arange(one.n_states)
+    np.testing.assert_array_equal(one.images(known), other.images(known))
+    np.testing.assert_array_equal(one.labels(known), other.labels(known))
+
+
+def test_an_environment_that_does_not_repeat_itself_is_not_gone_on_with() -> None:
+    """Spec G1: what cannot be resumed says so."""
+    engine, other = (corridor_env.RESTLESS.make_engine(0, 4, 30) for _ in range(2))
+    for _ in range(7):
+        engine.step(np.zeros(4, np.int64))
+    with pytest.raises(UserError, match="does not do the same again"):
+        other.restore(engine.snapshot())
+
+
+def test_the_engine_forgets_but_not_what_a_replay_holds() -> None:
+    """Spec D2: what was met within the last ``memory`` steps has its picture, whatever id it has."""
+    engine, rng = engine_of(1, memory=3), np.random.default_rng(0)
+    met: list[tuple[int, bytes]] = []
+    for _ in range(300):
+        step = engine.step(rng.integers(2, size=1))
+        met.append((int(step.next_ids[0]), engine.images(step.next_ids).tobytes()))
+        for identity, picture in met[-3:]:
+            assert engine.images(np.array([identity])).tobytes() == picture
+    assert engine.oldest > 0
+    with pytest.raises(ValueError, match="are kept"):
+        engine.images(np.array([0]))
+    restored = engine_of(1, memory=3)
+    restored.restore(engine.snapshot())
+    kept = np.arange(engine.oldest, engine.n_states)
+    np.testing.assert_array_equal(restored.images(kept), engine.images(kept))
+    for _ in range(50):
+        action = rng.integers(2, size=1)
+        assert restored.step(action).next_ids == engine.step(action).next_ids
+
+
+def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6: whichever way hypogoal was started."""
+    import sys
+
+    from hypogoal.domains.base import load_domain
+
+    (tmp_path / "domain_lying_here.py").write_text("from corridor_env import DOMAIN\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    assert load_domain("domain_lying_here:DOMAIN", given=True) is DOMAIN

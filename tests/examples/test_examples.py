@@ -1,0 +1,102 @@
+"""The examples go through the stages by the command line, as their readers would take them (Spec B6)."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+from test_docs import blocks, commands
+
+from hypogoal.cli import main
+from hypogoal.dataset import open_dataset
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+MOST_LINES = 30
+
+
+@pytest.fixture(autouse=True)
+def in_the_examples_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(EXAMPLES)  # modules of the current folder are found
+    monkeypatch.setenv("HYPOGOAL_TRUST", "unlock_pickup:DOMAIN,freeway:DOMAIN")
+
+
+def code_lines(path: Path) -> int:
+    """Lines of a module that are neither empty nor comments nor docstrings."""
+    text = path.read_text(encoding="utf-8")
+    lines = {number for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            lines -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return len(lines)
+
+
+def settings(*pairs: str) -> list[str]:
+    return [word for pair in pairs for word in ("--set", pair)]
+
+
+LAYOUTS = settings("labelled_seeds=0", "unlabelled_seeds=1", "heldout_seeds=2", "steps=600")
+PLAY = settings("steps=240", "environments=2", "warm_up=50", "layout_seed=0", "max_episode_steps=60")
+SHORT = {  # appended to the page's commands, so that they end in seconds
+    "collect": LAYOUTS,
+    "train-ensemble": settings("steps=20", "members=2", "workers=1"),
+    "train-options": PLAY,
+    "train-meta": PLAY,
+}
+
+
+def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec B6, A1-A5: an environment, two label functions and a way to wander, under 30 lines, are all one writes.
+
+    The page's commands in their order, but for ``check`` of the domain, which the next test does.
+    """
+    page = EXAMPLES.parent / "docs" / "own-domain.md"
+    example = EXAMPLES / "unlock_pickup.py"
+    assert blocks(page, "python")[0] == example.read_text(encoding="utf-8")
+    assert code_lines(example) < MOST_LINES
+    for name in ("unlock_pickup.py", "margin.py", "wide_network.py"):
+        (tmp_path / name).write_bytes((EXAMPLES / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    ran = []
+    for words in commands(page):
+        if words[0] == "export":
+            monkeypatch.setenv(*words[1].split("="))
+        elif words[:3] != ["hypogoal", "check", "unlock_pickup:DOMAIN"]:
+            assert main([*words[1:], *SHORT.get(words[1], ())]) == 0, words
+            ran.append(words[1])
+    stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
+    assert ran == [*stages, "check", "train-ensemble"]
+    run = tmp_path / "runs" / "unlock"
+    for goal, row in open_dataset(run / "data.h5").counts()["labelled"].items():
+        assert 10 < row["positives"] < row["states"] - 10, goal
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    assert [row["sub_goal"] for row in metrics["ensembles"][0]["sub_goals"]] == ["hold-key", "open-door"]
+    assert metrics["agents"][0]["runs"]
+    assert "open-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_example_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: the page's first command."""
+    assert main(["check", "unlock_pickup:DOMAIN", *LAYOUTS]) == 0
+    assert "FAIL" not in capsys.readouterr().out
+
+
+@pytest.mark.atari
+def test_freeway_goes_through_collect_ensembles_and_evaluation(tmp_path: Path) -> None:
+    """Spec B6: an Atari game other than Montezuma's Revenge, with sub-goals from its memory and defaults of its own."""
+    run = tmp_path / "run"
+    data, ensemble = str(run / "data.h5"), run / "ensemble"
+    layouts = settings("unlabelled_seeds=1", "heldout_seeds=2", "steps=400", "states=200")
+    assert main(["collect", "freeway:DOMAIN", "--out", data, "-q", *layouts]) == 0
+    few = settings("steps=10", "members=2", "workers=1")
+    assert main(["train-ensemble", data, "--out", str(ensemble), "-q", *few]) == 0
+    assert json.loads((ensemble / "manifest.json").read_text(encoding="utf-8"))["config"]["network"] == "montezuma"
+    assert main(["evaluate", str(run), "-q"]) == 0
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    rows = {row["sub_goal"]: row for row in metrics["ensembles"][0]["sub_goals"]}
+    assert set(rows) == {"half-way", "far-side"}
+    assert all(row["balanced_accuracy"]["best"] is not None for row in rows.values())

@@ -1,0 +1,217 @@
+"""Options and classifiers in the hands of other people's agents: Gymnasium, stable-baselines3, sb3-contrib."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from corridor_env import LENGTH, CorridorEnv
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import DQN
+
+import hypogoal
+from hypogoal.cli import main
+from hypogoal.core.artefacts import find_artefacts
+from hypogoal.core.errors import UserError
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.options.env import Options
+
+TESTS = Path(__file__).parents[1]
+MEMBERS = 2
+DEMO = "HYPOGOAL_DEMO_RUN"  # names the folder of a finished demo run, to be taken instead of a fresh one
+
+
+def settings(*pairs: str) -> list[str]:
+    return [word for pair in pairs for word in ("--set", pair)]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The corridor's ensembles and options, learned until they are good."""
+    run = tmp_path_factory.mktemp("runs") / "corridor"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(TESTS))
+        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+        layouts = settings("steps=200", "heldout_seeds=4,5")
+        assert main(["collect", "corridor_env:DOMAIN", "--out", str(run / "data.h5"), "-q", *layouts]) == 0
+        few = settings("steps=100", f"members={MEMBERS}", "workers=1", "learning_rate=1e-3")
+        assert main(["train-ensemble", str(run / "data.h5"), "--out", str(run / "ensemble"), "-q", *few]) == 0
+        play = settings("steps=3000", "environments=4", "warm_up=100", "update_interval=4", "layout_seed=0")
+        quick = settings("option_batch=32", "epsilon_steps=500", "max_episode_steps=30", "random_episodes=0")
+        assert main(["train-options", str(run / "ensemble"), "--out", str(run / "options"), "-q", *play, *quick]) == 0
+    return run
+
+
+@pytest.fixture(scope="module")
+def ensemble(run: Path) -> Ensemble:
+    return hypogoal.load_ensemble(run / "ensemble", "right-end")
+
+
+@pytest.fixture(scope="module")
+def options(run: Path) -> Options:
+    return hypogoal.load_options(run / "options")
+
+
+def corridor() -> gymnasium.Env[Any, Any]:
+    return TimeLimit(CorridorEnv(), 30)
+
+
+class SameLayout(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """Every episode is on layout 0, where the options were learned."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=0, options=options)
+
+
+def test_options_do_what_their_members_say(options: Options) -> None:
+    """Spec D1, E1: the learned options of both ends get there, the shortest way, and are masked where they are."""
+    for option in range(options.count):
+        env = hypogoal.OptionEnv(corridor(), options)
+        env.reset(seed=0)
+        assert env.action_masks().all()
+        _, reward, terminated, truncated, info = env.step(option)
+        right = option >= MEMBERS
+        assert info["reached"] and not truncated
+        assert (info["duration"], reward, terminated) == ((3, 1.0, True) if right else (2, 0.0, False))
+        assert info["option"] == f"{'right' if right else 'left'}-end/{option % MEMBERS}"
+        expected = [True, True, False, False] if right else [False, False, True, True]
+        assert env.action_masks().tolist() == expected
+
+
+def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) -> None:
+    """Spec E1: Gymnasium's checker, whose warnings are errors here, but for the one that says: wrapped."""
+    wrapped = [
+        hypogoal.OptionEnv(corridor(), options),
+        hypogoal.SubgoalReward(corridor(), ensemble),
+        hypogoal.SubgoalTermination(corridor(), ensemble),
+    ]
+    for env in wrapped:
+        with pytest.warns(UserWarning, match="different from the unwrapped version"):
+            check_env(env, skip_render_check=True)
+
+
+def test_a_registered_environment_can_be_made_again_with_its_wrapper() -> None:
+    """Gymnasium's ``spec`` of a wrapped environment knows the wrapper; without that its checker stops."""
+    from gymnasium.utils import RecordConstructorArgs
+
+    for kind in (hypogoal.OptionEnv, hypogoal.SubgoalReward, hypogoal.SubgoalTermination):
+        assert issubclass(kind, RecordConstructorArgs)
+
+
+def test_options_in_a_vector_of_environments(options: Options) -> None:
+    """Spec E1: several option environments step together, each with its own masks."""
+    envs = SyncVectorEnv([lambda: hypogoal.OptionEnv(corridor(), options) for _ in range(3)])
+    observations, _ = envs.reset(seed=[0, 0, 0])
+    assert observations.shape == (3, 48, 48, 3)
+    left, right = 0, MEMBERS
+    _, rewards, terminated, _, infos = envs.step(np.array([left, right, left]))
+    assert rewards.tolist() == [0, 1, 0] and terminated.tolist() == [False, True, False]
+    assert infos["duration"].tolist() == [2, 3, 2]
+    masks = np.stack(envs.call("action_masks"))
+    assert masks.tolist() == [[False, False, True, True], [True, True, False, False], [False, False, True, True]]
+    envs.close()
+
+
+@pytest.mark.parametrize("by", ["any", "vote", "all", "mean", 0, 1])
+def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) -> None:
+    """Spec D1: reward 1 where the classifier fires, else 0; with ``add`` the environment's own too."""
+    env = hypogoal.SubgoalReward(corridor(), ensemble, by)
+    env.reset(seed=0)
+    told = [env.step(action) for action in (0, 1, 1, 1, 1)]
+    assert [reward for _, reward, _, _, _ in told] == [0, 0, 0, 0, 1]
+    assert [info["subgoal"] for *_, info in told] == [False] * 4 + [True]
+    both = hypogoal.SubgoalReward(corridor(), ensemble, by, scale=0.5, add=True)
+    both.reset(seed=0)
+    assert [both.step(1)[1] for _ in range(3)] == [0, 0, 1.5]
+
+
+def test_a_classifier_ends_an_episode(run: Path) -> None:
+    """Spec D1: the left end is no end of the task, and of the episode only with the wrapper."""
+    env = hypogoal.SubgoalTermination(corridor(), hypogoal.load_ensemble(run / "ensemble", "left-end"))
+    env.reset(seed=0)
+    assert [env.step(0)[2] for _ in range(2)] == [False, True]
+
+
+def test_mistakes_are_one_line(options: Options, ensemble: Ensemble) -> None:
+    """Spec G2."""
+    other = gymnasium.wrappers.ResizeObservation(CorridorEnv(), (24, 24))
+    for make in (lambda: hypogoal.OptionEnv(other, options), lambda: hypogoal.SubgoalReward(other, ensemble)):
+        with pytest.raises(UserError, match=r"not those that these members know: uint8 \(24, 24, 3\)"):
+            make()
+    for by in ("most", 2, -1, True):
+        with pytest.raises(UserError, match="Choose one of any, vote, all, mean, or a member, 0 to 1"):
+            hypogoal.SubgoalTermination(CorridorEnv(), ensemble, by)
+
+
+def _first_choice(agent: MaskablePPO, env: hypogoal.OptionEnv) -> int:
+    observation, _ = env.reset()
+    return int(agent.predict(observation, action_masks=env.action_masks(), deterministic=True)[0])
+
+
+def test_maskable_ppo_learns_which_option_pays(options: Options) -> None:
+    """Spec E1: sb3-contrib's MaskablePPO on options: before training it goes left, afterwards straight to the goal."""
+    env = hypogoal.OptionEnv(SameLayout(corridor()), options, gamma=0.8)
+    agent = MaskablePPO("MlpPolicy", env, n_steps=64, batch_size=32, learning_rate=1e-3, gamma=0.8, seed=1)
+    before = [MaskablePPO("MlpPolicy", env, n_steps=64, batch_size=32, seed=seed) for seed in range(4)]
+    assert any(_first_choice(other, env) < MEMBERS for other in before), "a fresh agent may be wrong"
+    agent.learn(384)
+    assert _first_choice(agent, env) >= MEMBERS
+    assert env.step(_first_choice(agent, env))[2], "the task is over"
+
+
+def test_stable_baselines3_learns_a_classifiers_reward(run: Path) -> None:
+    """Spec D1: DQN, rewarded by the ensemble of the left end only, goes there; the environment pays at the right."""
+    left = hypogoal.load_ensemble(run / "ensemble", "left-end")
+    env = hypogoal.SubgoalTermination(hypogoal.SubgoalReward(SameLayout(corridor()), left), left)
+    agent = DQN(
+        "MlpPolicy", env, learning_starts=100, buffer_size=2000, train_freq=2, target_update_interval=50, gamma=0.8,
+        learning_rate=1e-3, exploration_fraction=0.6, seed=0,
+    )  # fmt: skip
+    agent.learn(500)
+    observation, _ = env.reset()
+    rewards, terminated = [], False
+    while not terminated and len(rewards) < LENGTH:
+        observation, reward, terminated, _, _ = env.step(int(agent.predict(observation, deterministic=True)[0]))
+        rewards.append(reward)
+    assert rewards == [0.0, 1.0]
+
+
+@pytest.mark.slow
+def test_maskable_ppo_reaches_the_goal_with_the_options_of_the_demo(tmp_path: Path) -> None:
+    """Spec E1, done when: MaskablePPO on OptionEnv, with options of the demo's recipe, solves the demo's layout.
+
+    Takes the run that HYPOGOAL_DEMO_RUN names, or makes the options anew (some ten minutes).
+    """
+    given = os.environ.get(DEMO)
+    run = Path(given) if given else tmp_path / "demo"
+    if not given:
+        data = tmp_path / "data.h5"
+        assert main(["collect", "doorkey", "--out", str(data), "--preset", "demo", "-q"]) == 0
+        assert main(["train-ensemble", str(data), "--out", str(run / "ensemble"), "--preset", "demo", "-q"]) == 0
+        learn = ["train-options", str(run / "ensemble"), "--out", str(run / "options"), "--preset", "demo", "-q"]
+        assert main([*learn, "--set", "steps=120000"]) == 0
+    found = [*find_artefacts(run, "meta"), *find_artefacts(run, "options")]
+    wanted = {"layout_seed": 100, "termination": "learned"}
+    meta = next(one.path for one in found if wanted.items() <= one.config.items())
+    learned = hypogoal.load_options(meta)
+    env = hypogoal.OptionEnv(gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=100), learned, gamma=0.99)
+    agent = MaskablePPO("CnnPolicy", env, n_steps=256, batch_size=64, gamma=0.95, ent_coef=0.01, seed=0)
+    agent.learn(4_096)
+    lengths = []
+    for _ in range(20):
+        observation, _ = env.reset()
+        steps, over = 0, False
+        while not over:
+            action, _ = agent.predict(observation, action_masks=env.action_masks())
+            observation, _, terminated, truncated, info = env.step(int(action))
+            steps += info["duration"]
+            over = terminated or truncated
+        lengths.append(steps if terminated else 500)
+    assert np.mean([length < 500 for length in lengths]) >= 0.9, lengths

@@ -1,0 +1,74 @@
+"""What the pages for users of the library show runs as it stands, on tiny artefacts; so do the doctests."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+from pathlib import Path
+
+import pytest
+from test_docs import blocks, commands
+
+from hypogoal.cli import main
+from hypogoal.dataset import open_dataset
+
+ROOT = Path(__file__).parents[2]
+
+
+def settings(*pairs: str) -> list[str]:
+    return [word for pair in pairs for word in ("--set", pair)]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``runs/demo/ensemble`` and ``runs/demo/meta``, as the demo leaves them, hardly trained."""
+    folder = tmp_path_factory.mktemp("demo")
+    data, run = str(folder / "data.h5"), folder / "runs" / "demo"
+    layouts = settings("heldout_layouts=1", "unlabelled_seeds=1")
+    assert main(["collect", "doorkey", "--out", data, "-q", *layouts]) == 0
+    few = settings("steps=2", "workers=1")
+    assert main(["train-ensemble", data, "--out", str(run / "ensemble"), "-q", *few]) == 0
+    play = settings("steps=320", "warm_up=100", "max_episode_steps=60", "random_episodes=2")
+    assert main(["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), "-q", *play]) == 0
+    return folder
+
+
+@pytest.fixture
+def in_demo(demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(demo)
+
+
+@pytest.mark.parametrize("name", ["hypogoal.api", "hypogoal.options.env"])
+def test_doctests(in_demo: None, name: str) -> None:
+    """The examples in docstrings of the Python interface."""
+    found = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
+    assert found.failed == 0 and found.attempted > 2
+
+
+def test_the_page_of_the_library(in_demo: None) -> None:
+    """docs/library.md: its blocks one after the other, as one program."""
+    space: dict[str, object] = {}
+    code = blocks(ROOT / "docs" / "library.md", "python")
+    assert len(code) >= 5
+    for block in code:
+        exec(compile(block, "library.md", "exec"), space)
+
+
+def test_the_page_of_own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/own-data.md: the arrays it makes, and its commands."""
+    page = ROOT / "docs" / "own-data.md"
+    monkeypatch.chdir(tmp_path)
+    for block in blocks(page, "python"):
+        exec(compile(block, "own-data.md", "exec"), {})
+    for words in commands(page):
+        short = settings("steps=2", "members=2") if words[1] == "train-ensemble" else []
+        assert main([*words[1:], *short]) == 0, words
+    assert open_dataset(tmp_path / "runs/own/data.h5").sub_goals == ("square-seen",)
+    assert (tmp_path / "states-again.npz").is_file()
+
+
+def test_the_page_of_own_domains_shows_a_test_that_runs() -> None:
+    """docs/own-domain.md: the test for one's own test-suite."""
+    space: dict[str, object] = {}
+    exec(compile(blocks(ROOT / "docs" / "own-domain.md", "python")[1], "own-domain.md", "exec"), space)
+    space["test_my_domain"]()  # type: ignore[operator]

@@ -1,0 +1,236 @@
+"""States that users bring: arrays, images, Minari's files; what is wrong with them is one line (Spec B6, G2)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from hypogoal.cli import main
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import open_dataset
+from hypogoal.own_data import Parts, collected_of, read_arrays, read_images
+
+SIDE = 48
+
+
+def pictures(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A white square at the left (label 0) or at the right (1) of grey noise."""
+    rng = np.random.default_rng(seed)
+    images = rng.integers(0, 60, size=(count, SIDE, SIDE, 3), dtype=np.uint8)
+    labels = np.arange(count) % 2 == 1
+    for image, right in zip(images, labels, strict=True):
+        image[10:30, (30 if right else 5) : (42 if right else 17)] = 255
+    return images, labels
+
+
+def arrays(**changes: Any) -> dict[str, Any]:
+    (images, labels), (others, _), (held, known) = pictures(40), pictures(20, 1), pictures(16, 2)
+    whole = {
+        "observations": images, "labels": labels, "unlabelled": others, "heldout_observations": held,
+        "heldout_labels": known,
+    }  # fmt: skip
+    return {name: value for name, value in (whole | changes).items() if value is not None}
+
+
+def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
+    """Spec B6, A2, A5: a .npz becomes a data file, an ensemble of it judges the held-out states."""
+    np.savez(tmp_path / "own.npz", **arrays())
+    run = tmp_path / "run"
+    data = str(run / "data.h5")
+    assert main(["import", str(tmp_path / "own.npz"), "--out", data, "--sub-goal", "at-right", "-q"]) == 0
+    found = open_dataset(Path(data))
+    np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
+    assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
+    train = ["train-ensemble", data, "--out", str(run / "ensemble"), "-q"]
+    few = [word for pair in ("steps=40", "members=2", "learning_rate=1e-3") for word in ("--set", pair)]
+    assert main([*train, *few]) == 0
+    assert main(["evaluate", str(run), "-q"]) == 0
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    assert metrics["ensembles"][0]["sub_goals"][0]["balanced_accuracy"]["worst"] > 0.9
+
+
+def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
+    """Spec B6: labels (N, G), a folder of .npy files, and the way back as .npz, names included."""
+    labels = np.stack([np.arange(40) % 2, np.arange(40) % 3 == 0], axis=1)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name, values in arrays(labels=labels, heldout_labels=np.stack([np.arange(16) % 2] * 2, 1)).items():
+        np.save(folder / f"{name}.npy", values)
+    data, again = tmp_path / "data.h5", tmp_path / "again.h5"
+    names = ["--sub-goal", "odd", "--sub-goal", "third"]
+    assert main(["import", str(folder), "--out", str(data), *names, "-q"]) == 0
+    assert main(["export", str(data), "--out", str(tmp_path / "out.npz")]) == 0
+    assert main(["import", str(tmp_path / "out.npz"), "--out", str(again), "-q"]) == 0
+    one, other = open_dataset(data), open_dataset(again)
+    assert one.sub_goals == other.sub_goals == ("odd", "third")
+    for split in ("labelled", "heldout"):
+        for goal in one.sub_goals:
+            left, right = getattr(one, split)(goal), getattr(other, split)(goal)
+            np.testing.assert_array_equal(left.observations, right.observations)
+            np.testing.assert_array_equal(left.labels, right.labels)
+    assert main(["export", str(data), "--out", str(tmp_path / "out.npz")]) == 2, "it exists"
+    assert main(["export", str(data), "--out", str(tmp_path / "out.csv")]) == 2
+
+
+def test_a_share_is_held_out_where_nothing_else_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B3: of each class, and it is said that this tells nothing of other contexts."""
+    np.savez(tmp_path / "own.npz", **arrays(heldout_observations=None, heldout_labels=None))
+    data = tmp_path / "data.h5"
+    assert main(["import", str(tmp_path / "own.npz"), "--out", str(data), "--heldout", "0.25", "-q"]) == 0
+    counts = open_dataset(data).counts()
+    assert counts["heldout"]["sub-goal"] == {"states": 10, "positives": 5}
+    assert counts["labelled"]["sub-goal"] == {"states": 30, "positives": 15}
+    assert "says nothing of other contexts" in capsys.readouterr().err
+
+
+def test_unbalanced_classes_are_warned_of() -> None:
+    """Spec B6."""
+    labels = np.arange(40) < 3
+    _, warned = collected_of(Parts(pictures(40)[0], labels, *(arrays()[name] for name in list(arrays())[2:])), ())
+    assert warned == ["sub-goal has 3 positives among 40 labelled states: classes are unbalanced"]
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"unlabelled": None}, "no array 'unlabelled'"),
+    ({"heldout_labels": None}, "held-out states need observations and labels"),
+    ({"observations": pictures(40)[0] / 255}, r"are no bytes: float64.*255 \* x"),
+    ({"observations": pictures(40)[0].astype(int) * 9}, "do not fit bytes"),
+    ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"channels first.*transpose\(0, 2, 3, 1\)"),
+    ({"observations": np.zeros((40, 9), np.uint8)}, "are no images"),
+    ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "another shape than the labelled ones"),
+    ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
+    ({"labels": np.arange(39) % 2}, "do not fit 40 states"),
+    ({"labels": np.arange(40) % 3}, r"are not only 0 and 1: \[2\]"),
+    ({"labels": np.full(40, np.nan)}, "are not only 0 and 1"),
+    ({"labels": np.zeros(40)}, "has no positives among 40 labelled states"),
+    ({"labels": np.ones(40)}, "has no negatives among 40 labelled states"),
+    ({"labels": np.stack([np.arange(40) % 2] * 2, 1)}, "2 sub-goals need as many names"),
+    ({"heldout_labels": np.stack([np.arange(16) % 2] * 2, 1)}, "are of 2 sub-goals, not 1"),
+    ({"labels": np.array([None] * 40)}, "Python objects"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), WRONG)
+def test_what_is_wrong_with_arrays_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    """Spec G2: shapes, types, label values; no pickle is read."""
+    np.savez(tmp_path / "own.npz", **arrays(**changes))
+    with pytest.raises(UserError, match=message):
+        collected_of(read_arrays(tmp_path / "own.npz"), ())
+
+
+def test_damaged_arrays_are_one_line(tmp_path: Path) -> None:
+    """Spec G2."""
+    path = tmp_path / "own.npz"
+    path.write_bytes(b"PK" + b"x" * 100)
+    with pytest.raises(UserError, match=r"no \.npz file"):
+        read_arrays(path)
+    np.savez(path, **arrays())
+    whole = bytearray(path.read_bytes())
+    whole[2000:4000] = bytes(2000)
+    path.write_bytes(whole)
+    with pytest.raises(UserError, match="damaged"):
+        read_arrays(path)
+    with pytest.raises(UserError, match="missing"):
+        read_arrays(tmp_path / "nowhere.npz")
+
+
+def save_images(folder: Path, *, held: bool = True, grey: bool = False) -> Path:
+    images, labels = pictures(24)
+    for number, (image, label) in enumerate(zip(images, labels, strict=True)):
+        names = ["positive" if label else "negative", *(["unlabelled"] if number % 3 == 0 else [])]
+        names += [f"heldout/{names[0]}"] if held and number >= 18 else []
+        for name in names:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            Image.fromarray(image[..., 0] if grey else image).save(folder / name / f"{number:02d}.png")
+    return folder
+
+
+def test_folders_of_images_become_states(tmp_path: Path) -> None:
+    """Spec B6: the folder's name is the sub-goal's; grey images have one channel; the ensemble trains."""
+    data, out = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
+    folder = save_images(tmp_path / "at-right")
+    assert main(["import", str(folder), "--out", data, "-q"]) == 0
+    found = open_dataset(Path(data))
+    assert found.sub_goals == ("at-right",)
+    images, labels = pictures(24)
+    np.testing.assert_array_equal(found.labelled("at-right").observations[:12], images[labels])
+    assert found.counts()["heldout"]["at-right"] == {"states": 6, "positives": 3}
+    assert main(["train-ensemble", data, "--out", out, "--set", "steps=2", "--set", "members=2", "-q"]) == 0
+    assert read_images(save_images(tmp_path / "grey", grey=True)).observations.shape == (24, SIDE, SIDE, 1)
+
+
+def test_what_is_wrong_with_images_is_one_line(tmp_path: Path) -> None:
+    """Spec G2: the file is named."""
+    folder = save_images(tmp_path / "images")
+    Image.new("RGB", (20, SIDE)).save(folder / "positive" / "zz.png")
+    with pytest.raises(UserError, match=r"the image is 48 x 20, others are 48 x 48: .*zz\.png"):
+        read_images(folder)
+    (folder / "positive" / "zz.png").write_bytes(b"no image")
+    with pytest.raises(UserError, match=r"no image, or a damaged one: .*zz\.png"):
+        read_images(folder)
+    for file in (folder / "unlabelled").iterdir():
+        file.unlink()
+    with pytest.raises(UserError, match=r"no images .*unlabelled"):
+        read_images(folder)
+
+
+def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, stored: str = "hdf5") -> Path:
+    """A dataset in Minari's own layout (0.5): data/metadata.json, and a group per episode in data/main_data.hdf5."""
+    (folder / "data").mkdir(parents=True)
+    about = {"data_format": stored, "total_episodes": episodes}
+    (folder / "data" / "metadata.json").write_text(json.dumps(about))
+    with h5py.File(folder / "data" / "main_data.hdf5", "w", track_order=True) as file:
+        for number in range(episodes):
+            group = file.create_group(f"episode_{number}")
+            images = pictures(6, number)[0]
+            if nested:
+                group.create_dataset("observations/image", data=images, chunks=True, maxshape=(None, *images.shape[1:]))
+            else:
+                group.create_dataset("observations", data=images, chunks=True, maxshape=(None, *images.shape[1:]))
+            group.create_dataset("actions", data=np.zeros(5, np.int64))
+    return folder
+
+
+def at_right(observation: np.ndarray) -> bool:
+    return bool(observation[20, 35, 0] == 255)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_minari_datasets_are_labelled_by_a_function(tmp_path: Path, nested: bool) -> None:
+    """Spec B6: whole episodes are labelled, unlabelled or held out, the same for the same seed."""
+    folder, data = save_minari(tmp_path / "own-v0", nested=nested), tmp_path / "data.h5"
+    given = ["import", str(folder), "--out", str(data), "--label", "right=test_import:at_right", "-q"]
+    given += ["--key", "image"] if nested else []
+    assert main(given) == 0
+    counts = open_dataset(data).counts()
+    assert counts["labelled"]["right"] == {"states": 24, "positives": 12}
+    assert counts["heldout"]["right"] == {"states": 12, "positives": 6}
+    assert counts["unlabelled"] == 24
+    before = open_dataset(data).unlabelled()
+    assert main([*given, "--force"]) == 0
+    np.testing.assert_array_equal(open_dataset(data).unlabelled(), before)
+    assert open_dataset(data).config["labels"] == {"right": "test_import:at_right"}
+
+
+def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2."""
+    label = ["--label", "right=test_import:at_right"]
+    cases = [
+        (save_minari(tmp_path / "a"), [], "has no labels"),
+        (save_minari(tmp_path / "b"), ["--label", "right"], "--label needs name=module:function"),
+        (save_minari(tmp_path / "c", nested=True), label, "Give --key, one of image"),
+        (save_minari(tmp_path / "d", stored="arrow"), label, "'arrow' is not read"),
+        (save_minari(tmp_path / "e", 2), label, "2 episodes cannot be"),
+        (save_minari(tmp_path / "f"), [*label, "--key", "x"], "no readable 'episode_0/observations/x'"),
+        (save_images(tmp_path / "g"), label, "no Minari dataset"),
+    ]
+    for folder, more, message in cases:
+        assert main(["import", str(folder), "--out", str(tmp_path / "data.h5"), *more]) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "data.h5").exists()

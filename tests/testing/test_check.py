@@ -1,0 +1,264 @@
+"""``hypogoal check``: what keeps its contract passes, and each broken promise is named (Spec B6, C1, C2)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from corridor import Corridor
+from own_domain import CorridorConfig, CorridorDomain, TallCorridor
+from torch import Tensor, nn
+
+from hypogoal.cli import main
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import Collected
+from hypogoal.diversity import load_objective
+from hypogoal.domains.base import Step
+from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
+
+TESTS = Path(__file__).parents[1]
+
+
+def domain_of(**engine_parts: Any) -> CorridorDomain:
+    """The corridor with an engine whose methods and attributes are replaced."""
+    engine = type("Broken", (TallCorridor,), engine_parts)
+
+    class Domain(CorridorDomain):
+        observation_shape = engine_parts.get("observation_shape", TallCorridor.observation_shape)
+
+        def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Any:
+            return engine(count, max_steps)
+
+    return Domain()
+
+
+def collecting(change: Any) -> CorridorDomain:
+    """The corridor with other collected states."""
+
+    class Domain(CorridorDomain):
+        def collect(self, config: CorridorConfig, seed: int, progress: Any) -> Collected:
+            return change(super().collect(config, seed, progress))
+
+    return Domain()
+
+
+def stepped(**changes: Any) -> dict[str, Any]:
+    """An engine whose steps are changed."""
+
+    def step(self: Any, actions: np.ndarray) -> Step:
+        found = Corridor.step(self, actions)
+        return found._replace(**{name: change(getattr(found, name)) for name, change in changes.items()})
+
+    return {"step": step}
+
+
+def first_fault(verdicts: Any) -> Verdict:
+    return next(verdict for verdict in verdicts if not verdict.ok)
+
+
+def never_ending(self: Any, actions: np.ndarray) -> Step:
+    self.max_steps = 10_000
+    return Corridor.step(self, actions)
+
+
+def forgetful(self: Any, snapshot: dict[str, Any]) -> None:
+    Corridor.restore(self, snapshot | {"ids": np.full_like(snapshot["ids"], 4)})
+
+
+NOBODYS = np.random.default_rng(5)
+
+
+def wandering(self: Any, actions: np.ndarray) -> Step:
+    return Corridor.step(self, NOBODYS.integers(2, size=len(actions)))
+
+
+def moved(states: Any, **changes: Any) -> Any:
+    return replace(states, **{name: change(getattr(states, name)) for name, change in changes.items()})
+
+
+def test_domains_that_keep_the_contract_pass() -> None:
+    """Spec B6; the corridor's held-out states are those for learning, and that is told."""
+    verdicts = list(check_domain(CorridorDomain()))
+    require(verdicts)
+    assert len(verdicts) == 12
+    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["heldout"]
+
+
+ENGINES = [
+    (domain_of(images=lambda self, ids, out=None: np.zeros((len(ids), 64, 64, 3), np.float32)), "images", "float32"),
+    (domain_of(images=lambda self, ids, out=None: TallCorridor.images(self, ids)), "images", "does not fill out"),
+    (domain_of(reset=lambda self: Corridor.reset(self).astype(np.int32)), "engine", "int32"),
+    (domain_of(n_actions=0), "engine", "n_actions is 0"),
+    (domain_of(**stepped(rewards=lambda values: values.astype(np.float64))), "steps", "float64"),
+    (domain_of(**stepped(rewards=lambda values: values * np.nan)), "steps", "finite"),
+    (domain_of(**stepped(terminated=lambda values: values.astype(np.int64))), "steps", "terminated of a step"),
+    (domain_of(step=never_ending), "steps", "went on after max_steps"),
+    (domain_of(labels=lambda self, ids: Corridor.labels(self, ids).astype(np.int64)), "labels", "int64"),
+    (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "labels", "(3, 1)"),
+    (domain_of(step=wandering), "determinism", "differ"),
+    (domain_of(restore=forgetful), "going on", "after restore"),
+    (domain_of(images=lambda self, ids, out=None: 1 // 0), "images", "ZeroDivisionError"),
+]
+COLLECTIONS = [
+    (collecting(lambda found: replace(found, sub_goals=("right-end", "left-end"))), "collection", "in their order"),
+    (
+        collecting(lambda found: replace(found, labelled=moved(found.labelled, labels=lambda x: x.astype(int)))),
+        "collection",
+        "labelled labels",
+    ),
+    (
+        collecting(lambda found: replace(found, heldout=moved(found.heldout, observations=lambda x: x[:0]))),
+        "collection",
+        "no held-out states",
+    ),
+    (
+        collecting(lambda found: replace(found, labelled=moved(found.labelled, labels=np.zeros_like))),
+        "classes",
+        "left-end has no positives",
+    ),
+    (
+        collecting(
+            lambda found: replace(
+                found, unlabelled=moved(found.unlabelled, observations=lambda x: NOBODYS.permutation(x))
+            )
+        ),
+        "collected again",
+        "unlabelled states differ",
+    ),
+]
+
+
+@pytest.mark.parametrize(("domain", "name", "message"), [*ENGINES, *COLLECTIONS])
+def test_each_broken_promise_is_named(domain: CorridorDomain, name: str, message: str) -> None:
+    """Spec B6: which check fails, and what was found."""
+    fault = first_fault(check_domain(domain))
+    assert fault.name == name
+    assert message in fault.text
+    with pytest.raises(AssertionError, match=f"FAIL {name}"):
+        require(check_domain(domain))
+
+
+def test_broken_names() -> None:
+    """Spec G2: names of sub-goals become names of files."""
+    domain = CorridorDomain()
+    domain.sub_goals = ("a/b", "c")
+    assert "a/b" in first_fault(check_domain(domain)).text
+
+
+def test_labels_that_cannot_be_seen_are_told() -> None:
+    """Spec B6: a picture with two labels is allowed, and no classifier can learn it."""
+
+    def hidden(self: Any, ids: np.ndarray) -> np.ndarray:
+        self.asked = getattr(self, "asked", 0) + 1
+        return np.stack([ids == 0, np.full(len(ids), self.asked % 2 == 0)], axis=1)
+
+    verdicts = {verdict.name: verdict for verdict in check_domain(domain_of(labels=hidden))}
+    assert "with different labels" in verdicts["labels"].warnings[0]
+
+
+@pytest.mark.parametrize("name", ["dbat", "divdis"])
+def test_our_objectives_keep_the_laws(name: str) -> None:
+    """Spec C2."""
+    require(check_objective(load_objective(name)))
+
+
+def _naive(a: Tensor, b: Tensor) -> Tensor:
+    p, q = a.softmax(-1)[..., 1], b.softmax(-1)[..., 1]
+    return -(p * (1 - q) + (1 - p) * q).log().sum(-1) / max(p.shape[-1], 1)
+
+
+def _as_printed(a: Tensor, b: Tensor) -> Tensor:
+    p, q = a.softmax(-1)[..., 1], b.softmax(-1)[..., 1]
+    return -(p * q + (1 - p) * (1 - q)).clamp(min=1e-9).log().sum(-1) / max(p.shape[-1], 1)
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return -(a.softmax(-1) - b.softmax(-1)).square().sum((-2, -1)) / max(a.shape[-2], 1)
+
+
+def _one_sided(a: Tensor, b: Tensor) -> Tensor:
+    return load_objective("dbat")(a.detach(), b)
+
+
+OBJECTIVES = [
+    (load_objective("none"), "disagreement lowers it"),
+    (_naive, "finite at extreme logits"),
+    (_as_printed, "disagreement lowers it"),
+    (_distance, "gradient does not vanish"),
+    (_one_sided, "finite at extreme logits"),
+    (lambda a, b: load_objective("dbat")(a, b).mean(), "shape"),
+    (lambda a, b: load_objective("dbat")(a, b) * a.shape[-2] / a.shape[-2], "empty sets"),
+    (lambda a, b: load_objective("dbat")(a, b) + 0.1 * a.square().sum((-2, -1)), "order does not matter"),
+]
+
+
+@pytest.mark.parametrize(("pair_loss", "name"), OBJECTIVES)
+def test_each_broken_law_is_named(pair_loss: Any, name: str) -> None:
+    """Spec C2: Eq. (1) as printed, probabilities instead of logits, and other ways to go wrong."""
+    assert first_fault(check_objective(pair_loss)).name == name
+
+
+def squeezed(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [nn.Conv2d(channels, 4, 8, 8), nn.Sigmoid()], (8,)
+
+
+def dead(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    layers = [nn.Conv2d(channels, 4, 8, 8), nn.ReLU()]
+    layers[0].weight.requires_grad_(False)  # type: ignore[union-attr]
+    return layers, (8,)
+
+
+@pytest.mark.parametrize(("name", "fault"), [("squeezed", "layers"), ("dead", "gradients"), ("missing", "builds")])
+def test_networks_are_checked(name: str, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5: what cannot be explained or learned is named."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", f"test_check:{name}")
+    assert first_fault(check_network(f"test_check:{name}")).name == fault
+
+
+def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: exit code 0 where all are kept, 2 where one is not; what the user named needs no permission."""
+    monkeypatch.chdir(TESTS)
+    small = [word for pair in ("steps=150", "heldout_seeds=4,5") for word in ("--set", pair)]
+    assert main(["check", "corridor_env:DOMAIN", *small]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert all(line.startswith("ok   ") for line in told) and len(told) == 13
+    assert main(["check", "corridor_env:RESTLESS", *small]) == 2
+    told = capsys.readouterr().out.splitlines()
+    assert told[-1].startswith("FAIL determinism") and "np_random" in told[-1]
+    assert main(["check", "corridor_env:FLOATS"]) == 2
+    assert "observations must be images" in capsys.readouterr().err
+    assert main(["check"]) == 2
+    assert "nothing to check" in capsys.readouterr().err
+
+
+def test_own_objectives_and_networks_train(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C1, C5: the examples are checked, trained with in processes of their own, read where they are allowed."""
+    from hypogoal import load_ensemble
+
+    monkeypatch.chdir(TESTS.parent / "examples")
+    assert main(["check", "--diversity", "margin:pair_loss", "--network", "wide_network:wide"]) == 0
+    data, out = tmp_path / "data.h5", tmp_path / "ensemble"
+    monkeypatch.syspath_prepend(str(TESTS))
+    assert main(["collect", "corridor_env:DOMAIN", "--out", str(data), "--set", "steps=150", "-q"]) == 0
+    train = ["train-ensemble", str(data), "--out", str(out), "--diversity", "margin:pair_loss", "-q"]
+    few = [word for pair in ("steps=20", "members=2", "workers=2") for word in ("--set", pair)]
+    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+    assert main([*train, *few, "--set", "network=wide_network:wide"]) == 0
+    with pytest.raises(UserError, match=r"names code of its own as its network.*HYPOGOAL_TRUST=wide_network:wide"):
+        load_ensemble(out, "left-end")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "wide_network:wide")
+    assert load_ensemble(out, "left-end").predict(np.zeros((1, 48, 48, 3), np.uint8)).shape == (1, 2)
+
+
+def test_a_preset_cannot_name_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: a preset may be a stranger's file; what it names is not loaded unless it is allowed."""
+    from toy_data import write
+
+    preset = tmp_path / "theirs.toml"
+    preset.write_text('[train-ensemble]\ndiversity = "evil:pair_loss"\n')
+    given = ["train-ensemble", str(write(tmp_path / "data.h5")), "--out", str(tmp_path / "out")]
+    assert main([*given, "--preset", str(preset)]) == 2
+    assert "a file names code of its own as its diversity objective: evil:pair_loss" in capsys.readouterr().err
