@@ -2,6 +2,7 @@
 PYTHON ?= python3
 JOBS ?= 2
 DEMO ?= runs/demo
+ONLY ?= doorkey montezuma training options loop startup
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -40,8 +41,8 @@ check: $(STAMP) ## linter, formatter, types, import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP) ## DoorKey steps per second, MiniGrid's and ours (BENCH=--short for a quick look)
-	$(BIN)/python -m benchmarks.doorkey $(BENCH)
+bench: $(STAMP) ## what is faster than what, in ratios (BENCH=--short for a quick look, ONLY="doorkey loop")
+	for name in $(ONLY); do $(BIN)/python -m benchmarks $$name $(BENCH) || exit 1; done
 
 docs: $(STAMP) ## the documentation as a site, in site/
 	$(BIN)/python -m mkdocs build --strict

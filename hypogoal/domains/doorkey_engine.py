@@ -73,7 +73,7 @@ class DoorKeyEngine:
     """
 
     n_actions = N_ACTIONS
-    observation_shape = OBSERVATION_SHAPE
+    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
 
     def __init__(
         self,

@@ -1,0 +1,144 @@
+"""End to end: agents that learn, environment steps per second of CPU time of one thread, in one run.
+
+    python -m benchmarks loop [--short] [--json PATH]
+
+On DoorKey ``train-meta`` in the light setting, 15 learned members, against stable-baselines3's PPO and DQN with its own
+defaults for pictures, on MiniGrid's class with ``RGBImgObsWrapper(tile_size=8)``: what one would use instead. On
+Montezuma's Revenge ``train-options`` against the emulator's ceiling, random actions with a stack at each step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks import timing
+
+timing.alone()
+
+from minigrid.wrappers import ImgObsWrapper, RGBImgObsWrapper  # noqa: E402
+
+from benchmarks.montezuma import time_ceiling  # noqa: E402
+from hypogoal.cli import main as hypogoal  # noqa: E402
+
+LAYOUT = 100
+WANTED = {"train-meta": 15.0}
+WANTED_OF_CEILING = 0.8
+
+
+def quietly(*command: object) -> None:
+    """A command of ours that must succeed."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        if hypogoal([*map(str, command), "-q"]):
+            raise SystemExit(f"failed: {command}")
+
+
+def per_step(steps: int, work: Any) -> float:
+    """CPU seconds of an environment step."""
+    begin = time.process_time()
+    work()
+    return (time.process_time() - begin) / steps
+
+
+def baseline(algorithm: str, steps: int) -> float:
+    """Stable-baselines3's own, learning."""
+    from stable_baselines3 import DQN, PPO
+
+    from hypogoal.domains.doorkey import DoorKeyGrid
+
+    env = ImgObsWrapper(RGBImgObsWrapper(DoorKeyGrid(layout_seed=LAYOUT), tile_size=8))
+    if algorithm == "ppo":
+        rollout = min(2048, steps)
+        agent: Any = PPO("CnnPolicy", env, seed=0, device="cpu", n_steps=rollout, batch_size=min(64, rollout))
+    else:
+        agent = DQN("CnnPolicy", env, seed=0, device="cpu", learning_starts=100, buffer_size=10_000)
+    return per_step(steps, lambda: agent.learn(steps))
+
+
+def meta(ensemble: Path, steps: int, folder: Path) -> float:
+    """Ours, start-up and the measures of the layout not counted: the difference of two runs."""
+    few = steps // 5
+
+    def seconds(count: int) -> float:
+        out = folder / f"meta-{count}-{time.monotonic_ns()}"
+        begin = time.process_time()
+        quietly(
+            *("train-meta", ensemble, "--out", out, "--layout-seed", LAYOUT),
+            *("--set", f"steps={count}", "--set", "random_episodes=1"),
+        )
+        return time.process_time() - begin
+
+    return (seconds(steps) - seconds(few)) / (steps - few)
+
+
+def climbing(ensemble: Path, steps: int, folder: Path) -> float:
+    """Option learning at a ladder, CPU seconds of an agent step, as of :func:`meta`."""
+    few = steps // 5
+
+    def seconds(count: int) -> float:
+        out = folder / f"options-{count}-{time.monotonic_ns()}"
+        begin = time.process_time()
+        quietly(
+            *("train-options", ensemble, "--out", out, "--set", "start=1L", "--set", "termination=oracle"),
+            *("--set", f"steps={count}", "--set", "random_episodes=0"),
+        )
+        return time.process_time() - begin
+
+    return (seconds(steps) - seconds(few)) / (steps - few)
+
+
+def ceiling(steps: int) -> float:
+    """CPU seconds of an agent step of the emulator itself."""
+    import numpy as np
+
+    from hypogoal.domains.montezuma_emulator import N_ACTIONS, Emulator
+    from hypogoal.domains.montezuma_ladders import LADDERS
+
+    actions = np.random.default_rng(0).integers(N_ACTIONS, size=steps).tolist()
+    return 1.0 / time_ceiling(Emulator(0), LADDERS[0].top, actions)
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = timing.arguments(__doc__, "loop")
+    repeats, ours, theirs = (1, 2_500, 256) if given.short else (3, 60_000, 4_096)
+    about = timing.machine("torch", "stable-baselines3", "minigrid", "ale-py")
+    print(", ".join(f"{name} {value}" for name, value in about.items()))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        quietly("collect", "doorkey", "--out", folder / "data.h5", "--set", "heldout_layouts=1")
+        learned = 3 if given.short else 150
+        quietly("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", "--set", f"steps={learned}")
+        found = timing.alternated(
+            {
+                "PPO, stable-baselines3 on MiniGrid": lambda: baseline("ppo", theirs),
+                "DQN, stable-baselines3 on MiniGrid": lambda: baseline("dqn", theirs),
+                "train-meta": lambda: meta(folder / "ensemble", ours, folder),
+            },
+            repeats,
+        )
+        rows = timing.rows_of(found, "PPO, stable-baselines3 on MiniGrid", WANTED)
+        rooms = ("groups=1", "states_per_room=60", "unlabelled_per_room=30", "heldout_per_room=6", "workers=1")
+        quietly("collect", "montezuma", "--out", folder / "rooms.h5", *(x for pair in rooms for x in ("--set", pair)))
+        few = ("--set", "steps=2", "--set", "members=1", "--set", "workers=1")
+        quietly("train-ensemble", folder / "rooms.h5", "--out", folder / "climbers", *few)
+        climbs = 2_500 if given.short else 10_000
+        climbed = timing.alternated(
+            {
+                "the emulator's ceiling": lambda: ceiling(1_000),
+                "train-options at a ladder": lambda: climbing(folder / "climbers", climbs, folder),
+            },
+            repeats,
+        )
+        climb = timing.rows_of(climbed, "the emulator's ceiling", {"train-options at a ladder": WANTED_OF_CEILING})
+    timing.show("\nDoorKey: an environment step, learning included", rows)
+    timing.show("\nMontezuma's Revenge: an agent step, learning included", climb)
+    timing.write(given.json, about, {"doorkey": rows, "montezuma": climb, "repeats": repeats})
+
+
+if __name__ == "__main__":
+    main()

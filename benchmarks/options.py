@@ -1,0 +1,258 @@
+"""Option learning: updates against a plain one, all members at once, verdicts, replay; in one run, one thread.
+
+    python -m benchmarks options [--short] [--json PATH]
+
+The plain update is the paper's network and Double-DQN as one would write them down, anew: the images of every step of
+32 executions up to the sampled step, float32 NCHW, three passes (the online network before and after the step, the
+target after it), Adam as it comes. Ours is ``RecurrentLearner``: distinct images once, in the memory order they came
+in. The light update is that of all members at once, with its own batch of 128. All are fed executions of random play.
+"""
+
+from __future__ import annotations
+
+import copy
+import resource
+import statistics
+import time
+from typing import Any
+
+from benchmarks import timing
+
+timing.alone()
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+from torch import Tensor, nn  # noqa: E402
+
+from hypogoal.core.config import resolve  # noqa: E402
+from hypogoal.core.seeding import rng_for  # noqa: E402
+from hypogoal.domains.doorkey import DoorKeyEngine  # noqa: E402
+from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
+from hypogoal.options.execution import OptionLoop, RandomChooser  # noqa: E402
+from hypogoal.options.light import LightLearner  # noqa: E402
+from hypogoal.options.recording import Recorder  # noqa: E402
+from hypogoal.options.recurrent import RecurrentLearner  # noqa: E402
+from hypogoal.options.verdicts import Verdicts  # noqa: E402
+from hypogoal.stages.train_options import TrainOptionsConfig  # noqa: E402
+
+LAYOUT = 100
+MEMBERS = (1, 5, 15, 30)
+WANTED = {"paper's network, ours": 2.0, "light, 15 members at once": 10.0}
+
+
+class PlainNetwork(nn.Module):
+    """The paper's network of one member, as one would write it down."""
+
+    def __init__(self, actions: int):
+        super().__init__()
+        self.features = nn.Sequential(
+            nn.Conv2d(3, 16, 3), nn.BatchNorm2d(16), nn.ReLU(), nn.MaxPool2d(2),
+            nn.Conv2d(16, 32, 3), nn.BatchNorm2d(32), nn.ReLU(), nn.MaxPool2d(2),
+            nn.Flatten(),
+        )  # fmt: skip
+        self.gru = nn.GRU(32 * 14 * 14, 512, batch_first=True)
+        self.values = nn.Sequential(nn.Linear(512, 128), nn.ReLU(), nn.Linear(128, actions))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """float32 (N, T, C, H, W) -> values (N, T, actions)."""
+        embedded = self.features(images.flatten(0, 1)).view(*images.shape[:2], -1)
+        return self.values(self.gru(embedded)[0])
+
+
+class PlainLearner:
+    """One member's Double DQN on sampled executions of a replay."""
+
+    def __init__(self, engine: DoorKeyEngine, replay: PrioritisedReplay, reached: Verdicts):
+        torch.manual_seed(0)
+        self.engine, self.replay, self.reached = engine, replay, reached
+        self.online = PlainNetwork(engine.n_actions)
+        self.target = copy.deepcopy(self.online).eval()
+        self.adam = torch.optim.Adam(self.online.parameters(), lr=2.5e-4)
+        self.rng = np.random.default_rng(0)
+
+    def _images(self, ids: NDArray[np.int64]) -> Tensor:
+        images = self.engine.images(ids.ravel()).reshape(*ids.shape, 64, 64, 3)
+        return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 1, 4, 2, 3))).float() / 255.0
+
+    def update(self) -> None:
+        """One update with 32 transitions."""
+        data = self.replay.data
+        indices, weights = self.replay.sample(32, self.rng)
+        place = data["place"][indices].astype(np.int64)
+        steps = np.minimum(np.arange(int(place.max()) + 1), place[:, None])  # padded with the last step
+        prefix = indices[:, None] - place[:, None] + steps
+        here, after = data["s"][prefix].astype(np.int64), data["next"][prefix].astype(np.int64)
+        row, last = torch.arange(32), torch.from_numpy(place)
+        self.online.train()
+        values = self.online(self._images(here))[row, last]
+        following = self._images(after)
+        with torch.no_grad():
+            best = self.online(following)[row, last].argmax(1)
+            ahead = self.target(following)[row, last].gather(1, best[:, None])[:, 0]
+        reward = torch.from_numpy(self.reached.of(data["next"][indices].astype(np.int64))[:, 0]).float()
+        end = torch.from_numpy(data["terminal"][indices])
+        goal = reward + 0.95 * ahead * ~end
+        taken = values.gather(1, torch.from_numpy(data["a"][indices].astype(np.int64))[:, None])[:, 0]
+        errors = nn.functional.huber_loss(taken, goal, reduction="none")
+        loss = (errors * torch.from_numpy(weights)).mean()
+        self.adam.zero_grad()
+        loss.backward()
+        self.adam.step()
+        self.replay.set_priorities(indices, (taken - goal).detach().abs().numpy())
+
+
+def config_of(*changes: str, preset: str | None = None) -> TrainOptionsConfig:
+    """Settings of option learning."""
+    return resolve(TrainOptionsConfig, stage="train-options", preset=preset, assignments=changes)
+
+
+def terminations(engine: DoorKeyEngine, options: int) -> Verdicts:
+    """So many options that end at the true sub-goals, in turn."""
+    return Verdicts(lambda ids: np.resize(engine.labels(ids).T, (options, len(ids))).T.copy(), options)
+
+
+def played(config: TrainOptionsConfig, options: int, steps: int) -> OptionLoop:
+    """A loop after ``steps`` of random play, nothing learned."""
+    engine = DoorKeyEngine(LAYOUT, config.environments)
+    verdicts = terminations(engine, options)
+    learner = (RecurrentLearner if config.network == "paper" else LightLearner)(engine, verdicts, config, 0)
+    chooser = RandomChooser(rng_for(0, "choice"))
+    loop = OptionLoop(engine, verdicts, learner, chooser, Recorder(options), config, gamma=1.0)
+    while loop.recorder.steps < steps:
+        loop.step(learn=False)
+    return loop
+
+
+def learning(loop: OptionLoop, updates: int) -> float:
+    """CPU seconds of an update: the median of some, the first left out."""
+    learner = loop.learner
+    times = []
+    for _ in range(updates + 1):
+        if isinstance(learner, RecurrentLearner):
+            learner.members[0].due = learner.config.update_interval
+        else:
+            assert isinstance(learner, LightLearner)
+            learner._due = learner.config.update_interval
+        times.append(timing.cpu_seconds(learner.learn))
+    return statistics.median(times[1:])
+
+
+def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The literal and the light update against the plain one; the light one by number of members."""
+    paper = played(config_of("warm_up=100", preset="paper"), 1, 2_000)
+    learner = paper.learner
+    assert isinstance(learner, RecurrentLearner) and isinstance(paper.engine, DoorKeyEngine)
+    plain = PlainLearner(paper.engine, copy.deepcopy(learner.members[0].replay), paper.verdicts)
+    light = {members: played(config_of("warm_up=100"), members, 4_000) for members in MEMBERS}
+
+    def plainly() -> float:
+        times = [timing.cpu_seconds(plain.update) for _ in range(count + 1)]
+        return statistics.median(times[1:])
+
+    found = timing.alternated(
+        {
+            "paper's network, plain": plainly,
+            "paper's network, ours": lambda: learning(paper, count),
+            "light, 15 members at once": lambda: learning(light[15], 20 * count),
+        },
+        repeats,
+    )
+    rows = timing.rows_of(found, "paper's network, plain", WANTED)
+    by_members = timing.alternated(
+        {
+            f"light, {members} members": lambda loop=loop: learning(loop, 20 * count)  # type: ignore[misc]
+            for members, loop in light.items()
+        },
+        repeats,
+    )
+    return rows, timing.rows_of(by_members, f"light, {MEMBERS[-1]} members", {})
+
+
+def verdict_share(steps: int) -> dict[str, float]:
+    """The share of CPU time of a light training step, 15 members, that is spent on terminations and masks.
+
+    ``learned`` networks judge each state once, when it is new; so the share falls as states repeat.
+    """
+    import tempfile
+    from pathlib import Path
+
+    from benchmarks.training import states
+    from hypogoal.hypotheses.config import EnsembleConfig
+    from hypogoal.hypotheses.training import fit
+    from hypogoal.options.verdicts import learned_terminations
+
+    config = config_of()
+    engine = DoorKeyEngine(LAYOUT, config.environments)
+    with tempfile.TemporaryDirectory() as folder:
+        split, unlabelled = states("doorkey", Path(folder))
+    settings = resolve(EnsembleConfig, stage="train-ensemble", assignments=["steps=2"])
+    ensemble = fit(split.observations, split.labels, unlabelled, settings, 0)
+    verdicts = Verdicts(learned_terminations(engine, [ensemble] * 5), 15)
+    spent = 0.0
+    plain = verdicts.of
+
+    def timed(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        nonlocal spent
+        begin = time.process_time()
+        answer = plain(ids)
+        spent += time.process_time() - begin
+        return answer
+
+    verdicts.of = timed  # type: ignore[method-assign]
+    learner = LightLearner(engine, verdicts, config, 0)
+    loop = OptionLoop(engine, verdicts, learner, RandomChooser(rng_for(0, "c")), Recorder(15), config, gamma=1.0)
+    begin = time.process_time()
+    verdicts.of(engine.reachable())
+    before = time.process_time() - begin
+    spent, begin = 0.0, time.process_time()
+    while loop.recorder.steps < steps:
+        loop.step()
+    whole = time.process_time() - begin
+    return {"share": spent / whole, "of reachable states, before, seconds": before, "steps": steps}
+
+
+def replay_figures(repeats: int) -> dict[str, float]:
+    """Memory of 15 full replays of 1e5 transitions, and a sample of 32 with its new priorities."""
+    fields = {"s": np.int32, "a": np.int8, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
+              "place": np.int16, "execution": np.int32}  # fmt: skip
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    replays = [PrioritisedReplay(100_000, fields, alpha=0.6, beta=0.4) for _ in range(15)]
+    rng = np.random.default_rng(0)
+    for replay in replays:
+        for _ in range(100):
+            replay.add(**{name: rng.integers(0, 2, 1_000).astype(kind) for name, kind in fields.items()})
+    held = sum(values.nbytes for replay in replays for values in (*replay.data.values(), replay.tree.nodes))
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+
+    def sampled() -> None:
+        for _ in range(200):
+            indices, _ = replays[0].sample(32, rng)
+            replays[0].set_priorities(indices, rng.random(32))
+
+    times = [timing.cpu_seconds(sampled) / 200 for _ in range(repeats)]
+    sampling = 1e3 * statistics.median(times)
+    return {"MB held": held / 1e6, "MB grown": grown / 1e6, "ms to sample 32 and update": sampling}
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = timing.arguments(__doc__, "options")
+    repeats, count = (1, 2) if given.short else (5, 10)
+    about = timing.machine("torch", "numpy")
+    print(", ".join(f"{name} {value}" for name, value in about.items()))
+    replay = replay_figures(3 if given.short else 20)
+    rows, members = updates(repeats, count)
+    share = verdict_share(4_000 if given.short else 40_000)
+    timing.show("\na Double-DQN update", rows)
+    timing.show("\nthe light update by number of members, all learning from every transition", members)
+    print(f"\nterminations and masks: {share['share']:.1%} of a training step's time (wanted: under 10 %);")
+    print(f"before, all states that can be reached, once: {share['of reachable states, before, seconds']:.1f} s")
+    print(f"15 replays of 1e5 DoorKey transitions: {replay['MB held']:.0f} MB (wanted: under 300);")
+    print(f"a sample of 32 and its priorities: {replay['ms to sample 32 and update']:.3f} ms (wanted: under 0.3)")
+    results = {"updates": rows, "members": members, "verdicts": share, "replay": replay, "repeats": repeats}
+    timing.write(given.json, about, results)
+
+
+if __name__ == "__main__":
+    main()
