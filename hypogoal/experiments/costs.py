@@ -54,12 +54,15 @@ def cost_lines(cells: Sequence[Cell], workers: int, factor: float) -> list[str]:
         parts.append(f"{human(disk)} of disk" if disk else "")
         told = ", ".join(part for part in parts if part) or "not known"
         lines.append(f"  {stage:15s} {len(own):5d} x {told}")
-    seconds, disk = factor * sum(cell.cost.seconds for cell in cells), sum(cell.cost.disk for cell in cells)
+    seconds = factor * sum(cell.cost.seconds for cell in cells)
     unknown = sum(cell.cost.seconds == 0 and cell.stage != "report" for cell in cells)
     wall = duration(wall_seconds(cells, workers, factor))
     told = f"about {duration(seconds)} of one core, {wall} with {workers} at once" if seconds else "time not known"
-    text = f"{len(cells)} commands: {told}"
-    text += f", at most {human(disk)} of disk" if disk else ""
+    memory, disk = (
+        sum(sorted((getattr(cell.cost, what) for cell in cells), reverse=True)[:workers]) for what in ("memory", "disk")
+    )
+    most = f"; at once at most {human(memory)} of memory, {human(disk)} of disk, checkpoints included" if disk else ""
+    text = f"{len(cells)} commands: {told}{most}"
     text += f" ({factor:.2g} times what docs/performance.md's machine takes)" if seconds else ""
     lines.append(text + (f"; {unknown} of unknown length" if unknown and seconds else ""))
     return lines

@@ -11,6 +11,7 @@ from typing import Any
 from hypogoal.core.config import setting
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell
+from hypogoal.learners.baselines.settings import hyperparameters
 from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "doorkey"
@@ -23,7 +24,6 @@ PER_BASELINE_STEP = {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45
 PER_MEMBER_STEP = 0.2
 PER_COLLECTION = 15.0
 PER_EVALUATION = 20.0
-REPLAYED = {"ppo": 2_048, "dqn": 100_000}  # steps that an agent on the primitive actions keeps, at the most
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,8 @@ def cells(
         for layout, seed in cases:
             arguments = ("train-baseline", DOMAIN, "--agent", agent, "--set", f"setting={kind}")
             picture = prod(domain.observation_shape)
-            costs = Cost(steps * PER_BASELINE_STEP[baseline], *baseline_needs(picture, REPLAYED[agent]))
+            kept = getattr(hyperparameters(agent, kind), "replay", 0)
+            costs = Cost(steps * PER_BASELINE_STEP[baseline], *baseline_needs(picture, kept))
             agents.append(add(baseline, (*arguments, "--set", f"steps={budget}"), seed, layout, (), costs))
     evaluating = Cost(PER_EVALUATION * len(ensembles), BASE + 300e6 + 2 * states, 2 * LOGS)
     return planned + closing_cells(out, (*ensembles.values(), *agents), evaluating)

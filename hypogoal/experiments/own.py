@@ -29,6 +29,7 @@ KEYS = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": 
 CELL_KEYS = {"name": str, "command": str, "axes": list, "minutes": (int, float), "memory_gb": (int, float)}
 RESERVED = ("--out", "--force", "--resume")
 TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *Number._fields)  # axes become columns
+TAKEN_NAMES = ("evaluation", "report", "logs", "slurm")  # what else is in a run's folder
 MAX_CELLS = 20_000
 MOST = 1e7  # minutes, gigabytes
 MEND = "Mend the file, see docs/formats.md."
@@ -80,6 +81,10 @@ def own_plan(path: Path, out: Path, assignments: Sequence[str] = ()) -> Plan:
             raise UserError(f"more than {MAX_CELLS} cells", path, "Take fewer values.")
         for values in product(*(axes[axis] for axis in group.axes)):
             planned.append(_cell(group, dict(zip(group.axes, values, strict=True)), groups, out))
+    names = [cell.name for cell in planned]
+    if len({*names, "evaluate", "report"}) != len(names) + 2:
+        twice = next(name for name in (*names, "evaluate", "report") if [*names, "evaluate", "report"].count(name) > 1)
+        raise UserError("two cells would have the same name", twice, MEND)
     if not planned:
         raise UserError("no cells in this experiment", path, MEND)
     if evaluate:
@@ -136,7 +141,7 @@ def _group(row: Any, axes: Mapping[str, Any], known: Mapping[str, _Group], path:
     _check_keys(row, CELL_KEYS, path)
     name, command, own = row.get("name", ""), row.get("command", ""), row.get("axes", [])
     where = f"cells {name!r} in {path}"
-    if not plain_name(name) or not re.fullmatch(r"[\w-]+", name) or name in (*known, *axes, "evaluation", "report"):
+    if not plain_name(name) or not re.fullmatch(r"[\w-]+", name) or name in (*known, *axes, *TAKEN_NAMES):
         raise UserError("cells need a name of their own, of letters, digits, - and _", where, MEND)
     if not all(isinstance(axis, str) and axis in axes for axis in own) or len({*own}) != len(own):
         raise UserError("cells over an axis that is not there", where, MEND)

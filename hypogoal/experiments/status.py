@@ -127,6 +127,8 @@ def lines(status: Status) -> list[str]:
     if status.count(RUNNING, STOPPED, WAITING):
         unknown = status.seconds_left is None
         text.append("time left: not known yet" if unknown else f"time left: about {duration(status.seconds_left or 0)}")
+        if not status.count(RUNNING):
+            text.append("nothing runs now; what is not queued goes on when the sweep is started again")
     for state in (RUNNING, FAILED):
         shown = [one for one in status.states if one.state == state]
         for one in shown[:MOST_SHOWN]:

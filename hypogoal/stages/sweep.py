@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import sys
@@ -26,7 +27,7 @@ from hypogoal.experiments.engines import slurm
 from hypogoal.experiments.engines.local import run_cells
 from hypogoal.experiments.finished import left_of
 from hypogoal.experiments.own import own_plan
-from hypogoal.experiments.records import FINISHED, LOGS, check_same, read_plan, read_record, write_plan
+from hypogoal.experiments.records import FINISHED, LOGS, RESULTS, check_same, read_plan, read_record, write_plan
 from hypogoal.experiments.results import write_results
 from hypogoal.experiments.status import is_there
 
@@ -182,14 +183,15 @@ def sweep(
         except KeyboardInterrupt as error:
             error.add_note(f"what is done is kept: {go_on}")
             raise
-        results = gather(out)
+        with contextlib.suppress(*([UserError] if outcome.failed else [])):  # which is told below
+            gather(out)
     if outcome.failed:
         name, why = next(iter(outcome.failed.items()))
         rest = f", {len(outcome.waiting)} wait for them" if outcome.waiting else ""
         what = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {why}"
         raise UserError(what, None, "Mend it, then start again: what is done is kept.")
     say(f"all {len(planned.cells)} cells done")
-    return results
+    return out / RESULTS
 
 
 def submit(
@@ -221,8 +223,8 @@ def _begin(
         raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
     if not force:
         check_same(out, planned.cells)
-    factor = machine_factor()
     todo = planned.cells if force else [cell for cell in planned.cells if not is_there(cell)]
+    factor = machine_factor() if todo else 1.0
     if len(todo) < len(planned.cells):
         say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
     if todo:

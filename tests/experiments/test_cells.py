@@ -82,7 +82,8 @@ def test_the_cost_is_that_of_the_cells_given_shared_among_the_workers() -> None:
     ]
     assert cost_lines(cells, 2, 1.0)[-1].startswith("3 commands: about 4.0 h of one core, 2.0 h with 2 at once")
     assert cost_lines(cells, 4, 1.5)[-1].startswith("3 commands: about 6.0 h of one core, 3.0 h with 4 at once")
-    assert "at most 3.0 GB of disk" in cost_lines(cells, 4, 1.0)[-1]
+    assert "at once at most 6.0 GB of memory, 3.0 GB of disk" in cost_lines(cells, 4, 1.0)[-1]
+    assert "at once at most 4.0 GB of memory, 2.0 GB of disk" in cost_lines(cells, 2, 1.0)[-1]
     assert cost_lines(cells, 4, 1.0)[0].split()[:5] == ["collect", "3", "x", "80", "min,"]
     unknown = [Cell("x", ("collect",), OUT / "x")]
     assert cost_lines(unknown, 2, 1.0)[-1] == "1 commands: time not known"

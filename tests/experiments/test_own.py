@@ -81,6 +81,8 @@ def test_the_example_is_one() -> None:
         ("layout =", "value =", "cannot be called this"),
         ('name = "agent"', 'name = "data"', "name of their own"),
         ('name = "agent"', 'name = "../agent"', "name of their own"),
+        ('name = "agent"', 'name = "logs"', "name of their own"),
+        ("cells = [", 'cells = [{ name = "ensemble-seed-0", command = "collect doorkey" },', "the same name"),
         ("collect doorkey", "collect 'doorkey", "cannot be read"),
         ("collect doorkey", "collect os:path", "code of its own"),
         ("cells = [", "cells = [ [", "not valid TOML"),
