@@ -99,7 +99,7 @@ def mirror(rows: Iterable[Progressing], boards: Boards) -> None:
             place = f"{row.name}/{line['sub_goal']}" if "sub_goal" in line else row.name
             by_place.setdefault(place, []).append(line)
         for place, lines in by_place.items():
-            boards.add(place, lines)
+            boards.add(place, lines, time.time())
 
 
 def finished(run: Path) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -36,12 +35,13 @@ class Boards:
         self._writers: dict[str, Any] = {}
         self._steps: dict[str, int] = {}
 
-    def add(self, place: str, lines: Iterable[Mapping[str, Any]]) -> None:
+    def add(self, place: str, lines: Iterable[Mapping[str, Any]], now: float) -> None:
         """What is new in a log; one that was cut off and is written again has the same numbers at the same steps.
 
         Args:
             place: its folder within ``out``.
             lines: the log so far.
+            now: the time of day, in seconds since 1970, which TensorBoard shows.
         """
         for line in lines:
             step = line.get("step")
@@ -55,7 +55,7 @@ class Boards:
                 if key != "step" and isinstance(value, int | float)
             ]
             summary = self._summary(value=values)
-            self._writers[place].add_event(self._event(wall_time=time.time(), step=step, summary=summary))
+            self._writers[place].add_event(self._event(wall_time=now, step=step, summary=summary))
             self._steps[place] = step
         if place in self._writers:
             self._writers[place].flush()

@@ -7,7 +7,6 @@ the lock goes on to the cell's own processes, so it ends with the last of them. 
 
 from __future__ import annotations
 
-import fcntl
 import json
 import socket
 import time
@@ -21,6 +20,12 @@ from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, replace_text
 from hypogoal.experiments.cells import Cell, Cost, Plan, moved
+
+fcntl: Any  # on POSIX a module, elsewhere None
+try:
+    import fcntl
+except ImportError:  # Windows: as on a file system that cannot lock
+    fcntl = None
 
 FORMAT_VERSION = 1
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
@@ -94,7 +99,7 @@ def open_log(run: Path, cell: Cell) -> BinaryIO:
     path.parent.mkdir(parents=True, exist_ok=True)
     log = path.open("ab", buffering=0)
     until = time.monotonic() + PATIENCE_SECONDS  # for those that are just dying, or only look
-    while not _lock(log, fcntl.LOCK_EX):
+    while not _lock(log, shared=False):
         if time.monotonic() > until:
             log.close()
             host = read_record(run, cell).host
@@ -110,7 +115,7 @@ def is_running(run: Path, cell: Cell) -> bool:
     """
     try:
         with log_of(run, cell).open("rb") as log:
-            return not _lock(log, fcntl.LOCK_SH)
+            return not _lock(log, shared=True)
     except _NoLocks:
         record = read_record(run, cell)
         return record.attempts > 0 and record.code is None
@@ -122,15 +127,17 @@ class _NoLocks(Exception):
     pass
 
 
-def _lock(file: BinaryIO, kind: int) -> bool:
+def _lock(file: BinaryIO, *, shared: bool) -> bool:
     try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
+        if fcntl is None:
+            raise OSError(NO_LOCKS[0], "no locks")
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
-        if kind == fcntl.LOCK_SH:
+        if shared:
             raise _NoLocks from None
     return True
 

@@ -68,7 +68,7 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Runn
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env=environment,
-            preexec_fn=_follow(os.getpid()),
+            preexec_fn=_follow(os.getpid()) if os.name == "posix" else None,
         )
     except BaseException:
         log.close()
