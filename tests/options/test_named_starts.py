@@ -13,7 +13,7 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import ALLOWED
+from hypogoal.core.own_code import TRUST
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import write_ensemble
 from hypogoal.options.recording import EXECUTION_COLUMNS
@@ -61,7 +61,7 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
 @pytest.fixture(autouse=True)
 def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The manifests here name this module's domain."""
-    monkeypatch.setenv(ALLOWED, DOMAIN.name)
+    monkeypatch.setenv(TRUST, DOMAIN.name)
 
 
 @pytest.fixture(scope="module")
