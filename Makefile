@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench docs clean
+.PHONY: help setup demo test slurm check bench docs clean
 
 help: ## what one can make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,8 +32,11 @@ $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 demo: $(STAMP) ## three-key DoorKey from nothing to a report, in runs/demo
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
 
-test: $(STAMP) ## the tests, without those marked slow
+test: $(STAMP) ## the tests, without those marked slow or slurm
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(TESTS)
+
+slurm: $(STAMP) ## the test of sweeps on a real Slurm, where there is one (some minutes)
+	$(BIN)/python -m pytest -m slurm tests/experiments/test_slurm.py
 
 check: $(STAMP) ## linter, formatter, types, import contracts
 	$(BIN)/ruff check .
