@@ -59,36 +59,27 @@ def baseline(algorithm: str, steps: int) -> float:
     return per_step(steps, lambda: agent.learn(steps))
 
 
-def meta(ensemble: Path, steps: int, folder: Path) -> float:
-    """Ours, start-up and the measures of the layout not counted: the difference of two runs."""
+def stage(steps: int, folder: Path, *command: object) -> float:
+    """Ours, CPU seconds of a step; start-up and the measures at the end are not counted: the difference of two runs."""
     few = steps // 5
 
     def seconds(count: int) -> float:
-        out = folder / f"meta-{count}-{time.monotonic_ns()}"
         begin = time.process_time()
-        quietly(
-            *("train-meta", ensemble, "--out", out, "--layout-seed", LAYOUT),
-            *("--set", f"steps={count}", "--set", "random_episodes=1"),
-        )
+        quietly(*command, "--out", folder / f"out-{time.monotonic_ns()}", "--set", f"steps={count}")
         return time.process_time() - begin
 
     return (seconds(steps) - seconds(few)) / (steps - few)
+
+
+def meta(ensemble: Path, steps: int, folder: Path) -> float:
+    """An environment step of ``train-meta`` on DoorKey."""
+    return stage(steps, folder, "train-meta", ensemble, "--layout-seed", LAYOUT, "--set", "random_episodes=1")
 
 
 def climbing(ensemble: Path, steps: int, folder: Path) -> float:
-    """Option learning at a ladder, CPU seconds of an agent step, as of :func:`meta`."""
-    few = steps // 5
-
-    def seconds(count: int) -> float:
-        out = folder / f"options-{count}-{time.monotonic_ns()}"
-        begin = time.process_time()
-        quietly(
-            *("train-options", ensemble, "--out", out, "--set", "start=1L", "--set", "termination=oracle"),
-            *("--set", f"steps={count}", "--set", "random_episodes=0"),
-        )
-        return time.process_time() - begin
-
-    return (seconds(steps) - seconds(few)) / (steps - few)
+    """An agent step of ``train-options`` at a ladder."""
+    changes = ("start=1L", "termination=oracle", "random_episodes=0")
+    return stage(steps, folder, "train-options", ensemble, *(word for pair in changes for word in ("--set", pair)))
 
 
 def ceiling(steps: int) -> float:
