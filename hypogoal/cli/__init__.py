@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         message, code = _refused(error)
         return _fail("; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message, code)
-    except Interrupted as stop:
+    except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
         return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)

@@ -20,7 +20,7 @@ from hypogoal.experiments.records import read_plan
 
 WARNING = signal.SIGUSR2
 SLOW = "nothing new could be saved before the time limit: give a longer --time, or an earlier --warn"
-SAVED = 128 + signal.SIGTERM  # how a stage ends that was told to stop, and did
+TOLD = (128 + signal.SIGTERM, -signal.SIGTERM)  # how a stage ends that was told to stop; the latter: before it listened
 
 
 class _Signals:
@@ -65,7 +65,7 @@ def run_element(run: Path, name: str) -> None:
     signals.running = start(cell, run, cores=int(processors) if processors.isdigit() else 1)
     signals.tell()  # what came in between
     code = signals.running.process.wait()
-    again = code == SAVED and signals.warned and not signals.stopped
+    again = code in TOLD and signals.warned and not signals.stopped
     if again and (not unfinished(cell.out) or _saved(cell) == before):  # it would come here for ever
         signals.running.log.write(f"hypogoal: {SLOW}\n".encode())
         again, code = False, 1
