@@ -49,8 +49,10 @@ def register() -> None:
     Done by ``import hypogoal`` where Gymnasium is imported already, else by the first use of hypogoal's interface.
     """
     from hypogoal.domains.doorkey_registration import register as register_doorkey
+    from hypogoal.domains.montezuma_registration import register as register_montezuma
 
     register_doorkey()
+    register_montezuma()
 
 
 if "gymnasium" in sys.modules:

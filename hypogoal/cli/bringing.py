@@ -1,10 +1,10 @@
-"""The commands for what users bring: ``check``, ``import``, ``export``."""
+"""The commands for what users bring: ``check``, ``label``, ``import``, ``export``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -66,6 +66,62 @@ def export(
 
     stage(data, out, force=force)
     typer.echo(out)
+
+
+@app.command()
+def label(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="States to look at: a data file, a .npz file or a folder of images. Or what to play: a domain, a "
+            "Gymnasium environment's id, or module:object."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
+    layout_seed: Annotated[int, typer.Option(min=0, help="The layout that is played first.")] = 0,
+    arg: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Of the environment, such as --arg start=2-6.")
+    ] = None,
+    heldout: Annotated[bool, typer.Option("--heldout", help="The states are for evaluation.")] = False,
+    fps: Annotated[
+        int, typer.Option(min=0, max=60, help="Play in real time, so many steps a second; 0: a step for each key.")
+    ] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a folder that there is.")] = False,
+) -> None:
+    """Mark states by hand, in a window: p positive, n negative, u unlabelled; 'import' takes the folder.
+
+    Every mark is on the disk at once. --heldout adds states of other layouts to a folder, to judge members by.
+    """
+    from hypogoal.core import own_code
+    from hypogoal.stages.label import label as stage
+
+    with own_code.given(source):
+        counts = stage(
+            source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout, fps=fps,
+            resume=resume,
+        )  # fmt: skip
+    typer.echo(", ".join(f"{count} {kind}" for kind, count in counts.items()))
+    if all(counts.values()):
+        typer.echo(f"next: hypogoal import {out} --out {out.with_suffix('.h5')}")
+    typer.echo(out)
+
+
+def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
+    """``KEY=VALUE``, the value as JSON where it is some, else as text."""
+    import json
+
+    from hypogoal.core.errors import UserError
+
+    found: dict[str, Any] = {}
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
+        if not (equals and name.isidentifier()):
+            raise UserError("--arg needs KEY=VALUE", assignment, "For example --arg layout_seed=3.")
+        try:
+            found[name] = json.loads(value)
+        except ValueError:
+            found[name] = value
+    return found
 
 
 @app.command()

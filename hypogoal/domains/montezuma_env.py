@@ -191,6 +191,12 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         self.elapsed = 0
         self._picture: NDArray[np.uint8] | None = None
 
+    def get_action_meanings(self) -> list[str]:
+        """What the actions are called, as Gymnasium's Atari environments tell it."""
+        import ale_py
+
+        return [ale_py.Action(number).name for number in range(N_ACTIONS)]
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:

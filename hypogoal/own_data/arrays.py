@@ -13,7 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import require_file
 from hypogoal.core.preflight import free_memory, human
 from hypogoal.dataset import Dataset
-from hypogoal.own_data.parts import Parts
+from hypogoal.own_data.parts import Parts, as_images
 
 NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
@@ -39,6 +39,19 @@ def read_arrays(path: Path) -> Parts:
         raise UserError("held-out states need observations and labels", path, f"Give {' and '.join(OPTIONAL)}.")
     named = tuple(map(str, arrays[NAMES].ravel())) if NAMES in arrays else ()
     return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, sub_goals=named)
+
+
+def read_states(path: Path) -> NDArray[np.uint8]:
+    """The states (N, H, W, C) of a ``.npz`` file that nobody has labelled: ``unlabelled``, or else ``observations``.
+
+    Raises:
+        UserError: see :func:`read_arrays`.
+    """
+    arrays = _file(path)
+    for name in ("unlabelled", "observations"):
+        if name in arrays:
+            return as_images(arrays[name], f"the array {name!r}")
+    raise UserError("no array 'unlabelled' or 'observations'", path, "Give one, uint8 (N, H, W, C).")
 
 
 def write_arrays(path: Path, dataset: Dataset) -> None:

@@ -11,6 +11,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.own_data.parts import Parts
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
+ARRAY = ".npy"  # a state that no image file holds, such as a stack of four frames
+DO = "Remove it, or write it again."
 
 
 def read_images(folder: Path) -> Parts:
@@ -26,12 +28,13 @@ def read_images(folder: Path) -> Parts:
     heldout = folder / "heldout"
     if heldout.is_dir():
         wanted |= {f"heldout/{name}": _files(heldout / name) for name in ("positive", "negative")}
-    colour = not all(_is_grey(file) for files in wanted.values() for file in files)
-    read = {name: _read(files, colour) for name, files in wanted.items()}
-    sizes = {images.shape[1:3]: name for name, images in read.items()}
+    images = {name: _read(files) for name, files in wanted.items()}
+    sizes = {_size(some[0]): name for name, some in images.items()}
     if len(sizes) > 1:
-        text = ", ".join(f"{name} {height} x {width}" for (height, width), name in sizes.items())
+        text = ", ".join(f"{name} {size}" for size, name in sizes.items())
         raise UserError("the images are of different sizes", text, "Make them all one size.")
+    colour = any(image.shape[2] == 3 for some in images.values() for image in some)
+    read = {name: np.stack([_coloured(image) if colour else image for image in some]) for name, some in images.items()}
     parts = [_labelled(read["positive"], read["negative"])]
     if heldout.is_dir():
         parts.append(_labelled(read["heldout/positive"], read["heldout/negative"]))
@@ -46,36 +49,61 @@ def _files(folder: Path) -> list[Path]:
     do = "Put images into positive/, negative/ and unlabelled/, and, for evaluation, into heldout/positive/ and so on."
     if not folder.is_dir():
         raise UserError("no such folder", folder, do)
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != ".")
+    return image_files(folder, do)
+
+
+def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Path]:
+    """The files of a folder that :func:`read_image` may read, in the order of their names.
+
+    Raises:
+        UserError: there are none; ``do`` is what to do then.
+    """
+    files = sorted(
+        file for file in folder.iterdir() if file.suffix.lower() in (*SUFFIXES, ARRAY) and file.name[0] != "."
+    )
     if not files:
         raise UserError(f"no images ({', '.join(SUFFIXES)})", folder, do)
     return files
 
 
-def _is_grey(file: Path) -> bool:
+def read_image(file: Path) -> NDArray[np.uint8]:
+    """One state, uint8 (H, W, C): of an image its grey or its three colours, of an array what is in it.
+
+    Args:
+        file: an image, or a ``.npy`` file with an array uint8 (H, W, C).
+
+    Raises:
+        UserError: it cannot be read.
+    """
     from PIL import Image
 
     try:
+        if file.suffix == ARRAY:
+            values = np.load(file, mmap_mode="r", allow_pickle=False)
+            if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
+                raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
+            return np.array(values)
         with Image.open(file) as image:
-            return image.mode in ("1", "L")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise UserError("this is no image, or a damaged one", file, "Remove it, or write it again.") from None
+            values = np.asarray(image.convert("L" if image.mode in ("1", "L") else "RGB"), dtype=np.uint8)
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError):
+        raise UserError("this is no image, or a damaged one", file, DO) from None
+    return values.reshape(*values.shape[:2], -1)
 
 
-def _read(files: list[Path], colour: bool) -> NDArray[np.uint8]:
-    """uint8 (N, H, W, 1 or 3)."""
-    from PIL import Image
-
+def _read(files: list[Path]) -> list[NDArray[np.uint8]]:
     images: list[NDArray[np.uint8]] = []
     for file in files:
-        try:
-            with Image.open(file) as image:
-                values = np.asarray(image.convert("RGB" if colour else "L"), dtype=np.uint8)
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            raise UserError("this is no image, or a damaged one", file, "Remove it, or write it again.") from None
-        if images and values.shape[:2] != images[0].shape[:2]:
-            (height, width), (other_height, other_width) = values.shape[:2], images[0].shape[:2]
-            what = f"the image is {height} x {width}, others are {other_height} x {other_width}"
+        images.append(read_image(file))
+        if _size(images[-1]) != _size(images[0]):
+            what = f"the image is {_size(images[-1])}, others are {_size(images[0])}"
             raise UserError(what, file, "Make them all one size.")
-        images.append(values.reshape(*values.shape[:2], -1))
-    return np.stack(images)
+    return images
+
+
+def _coloured(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+
+
+def _size(image: NDArray[np.uint8]) -> str:
+    """Height and width, and the number of channels where it is not that of an image."""
+    return " x ".join(map(str, image.shape[: 2 if image.shape[2] in (1, 3) else 3]))

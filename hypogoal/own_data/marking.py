@@ -1,0 +1,164 @@
+"""The window in which a person marks states: the state, what is known of it, and the keys (Spec B6)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.own_data.marks import Marks
+from hypogoal.own_data.states_to_mark import Source
+
+PICTURE = 520  # pixels of a picture's height, about
+TEXT, LINE, WIDTH = 15, 20, 680
+BACKGROUND, INK, MUTED = (250, 250, 250), (34, 34, 34), (110, 110, 110)
+COLOURS = {"positive": (0, 120, 80), "negative": (190, 70, 0), "unlabelled": (0, 100, 170)}
+UNSEEN = ("offscreen", "dummy")  # what pygame takes where there is no screen, and says nothing
+WAIT_MS = 100  # so long a key is waited for before Ctrl-C in the terminal is noticed
+REPEAT_MS = (300, 80)  # a key that stays down
+
+
+def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) -> None:
+    """Show the states of ``source`` and mark them by keyboard, until the window is closed.
+
+    Args:
+        source: the states.
+        marks: where the marks go, each at once.
+        sub_goal: its name.
+        fps: steps a second that are played whether a key is held or not; 0: one step for each key.
+
+    Raises:
+        UserError: there is no screen, or no pygame.
+    """
+    keys = {kind[0]: kind for kind in marks.kinds}  # p, n, u
+    modes: list[str | None] = [None, *(kind for kind in ("negative", "unlabelled", "positive") if kind in marks.kinds)]
+    mode: str | None = None
+    with _Window(f"hypogoal: {sub_goal}") as window:
+        while True:
+            current = marks.of(source.state)
+            lines = _lines(source, marks, sub_goal, mode, keys, current)
+            window.draw(as_rgb(source.state), lines)
+            key, held = window.next_key(fps)
+            if key == "escape":
+                return
+            moved = False
+            if key in keys:
+                marks.mark(source.state, keys[key])
+                source.marked()
+            elif key == "backspace":
+                marks.undo()
+            elif key == "m":
+                mode = modes[(modes.index(mode) + 1) % len(modes)]
+            elif key:
+                moved = source.press(key, held)
+            elif fps:
+                moved = source.idle()
+            if moved and mode is not None and marks.of(source.state) is None:
+                marks.mark(source.state, mode)
+
+
+def _lines(
+    source: Source, marks: Marks, sub_goal: str, mode: str | None, keys: dict[str, str], current: str | None
+) -> list[tuple[str, tuple[int, int, int]]]:
+    """What is written below the picture, each line with its colour."""
+    counts = ", ".join(f"{count} {kind}" for kind, count in marks.counts().items())
+    says = ", ".join(f"{key}: {kind}" for key, kind in keys.items())
+    meanwhile = f"every new state is marked {mode}" if mode else "states are marked by hand only"
+    lines = [
+        (f"{sub_goal}: {current or 'not marked'}", COLOURS.get(current or "", INK)),
+        (f"{source.note}", INK),
+        (f"marked: {counts}", INK),
+        (f"m: {meanwhile}", COLOURS.get(mode or "", MUTED)),
+        (f"{says}, backspace: undo, escape: end", MUTED),
+    ]
+    return lines + [(line, MUTED) for line in source.help]
+
+
+def as_rgb(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A state (H, W, C) as a picture (H', W', 3): of a stack of frames the last one large, those before beside it."""
+    channels = state.shape[2]
+    if channels == 3:
+        return state
+    *before, last = (state[..., channel] for channel in range(channels))
+    if before:
+        large = last.repeat(channels - 1, axis=0).repeat(channels - 1, axis=1)
+        last = np.concatenate([large, np.concatenate(before, axis=0)], axis=1)
+    return np.repeat(last[..., None], 3, axis=2)
+
+
+class _Window:
+    """A window of pygame: a picture with lines of text below it, and the keys."""
+
+    def __init__(self, title: str):
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        try:
+            import pygame
+        except ImportError:
+            raise UserError("no pygame, which makes the window", None, "pip install pygame-ce") from None
+        self._pygame, self._title = pygame, title
+        self._surface: Any = None
+
+    def __enter__(self) -> _Window:
+        pygame = self._pygame
+        try:
+            pygame.display.init()
+            pygame.font.init()
+            pygame.key.set_repeat(*REPEAT_MS)
+            pygame.display.set_caption(self._title)
+            driver = pygame.display.get_driver()
+            if driver in UNSEEN and os.environ.get("SDL_VIDEODRIVER") != driver:
+                raise pygame.error("no screen")
+            self._surface = pygame.display.set_mode((WIDTH, PICTURE))
+        except pygame.error as error:
+            pygame.quit()
+            raise UserError(
+                f"no window can be opened: {error}", None, "Use a machine with a screen, or ssh -X."
+            ) from None
+        self._font = pygame.font.SysFont("dejavusans, arial, sans", TEXT)
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._pygame.quit()
+
+    def draw(self, picture: NDArray[np.uint8], lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
+        """The picture (H, W, 3), as large as fits by a whole factor, and the lines."""
+        pygame: Any = self._pygame
+        height, width = picture.shape[:2]
+        factor = max(1, min(PICTURE // height, WIDTH // width))
+        whole = (max(WIDTH, width * factor), height * factor + LINE * (len(lines) + 1))
+        if self._surface.get_size() != whole:
+            self._surface = pygame.display.set_mode(whole)
+        self._surface.fill(BACKGROUND)
+        large = picture.repeat(factor, axis=0).repeat(factor, axis=1)
+        left = (whole[0] - width * factor) // 2
+        self._surface.blit(pygame.surfarray.make_surface(large.swapaxes(0, 1)), (left, 0))
+        for number, (line, colour) in enumerate(lines):
+            drawn = self._font.render(line, True, colour)
+            self._surface.blit(drawn, (10, height * factor + LINE // 2 + number * LINE))
+        pygame.display.flip()
+
+    def next_key(self, fps: int) -> tuple[str, frozenset[str]]:
+        """The next key that goes down, and those held; in real time an empty one where none does in time.
+
+        Closing the window is ``escape``.
+        """
+        pygame: Any = self._pygame
+        while True:
+            event = pygame.event.wait(1000 // fps if fps else WAIT_MS)
+            if event.type == pygame.QUIT:
+                return "escape", frozenset()
+            if event.type == pygame.KEYDOWN:
+                return pygame.key.name(event.key), self._held()
+            if fps and event.type == pygame.NOEVENT:
+                held = self._held()
+                return next(iter(sorted(held)), ""), held
+
+    def _held(self) -> frozenset[str]:
+        pygame: Any = self._pygame
+        pressed = pygame.key.get_pressed()
+        known = ("up", "down", "left", "right", "w", "a", "s", "d", "space")
+        return frozenset(name for name in known if pressed[pygame.key.key_code(name)])

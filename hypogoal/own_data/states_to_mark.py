@@ -1,0 +1,196 @@
+"""What a person looks at while marking states: recorded ones, one after another, or an environment that is played."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence, Set
+from pathlib import Path
+from typing import Protocol
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.gymnasium_engine import as_image, make_checked, shape_of
+from hypogoal.own_data.arrays import read_states
+from hypogoal.own_data.images import image_files, read_image
+
+GRID_KEYS = {
+    "left": ("left", "a"),
+    "right": ("right", "d"),
+    "forward": ("up", "w"),
+    "toggle": ("space",),
+    "pickup": ("page up", "e"),
+    "drop": ("page down", "q"),
+    "done": ("return",),
+}
+"""Keys of actions that have these names, as MiniGrid's have; the first as MiniGrid's own manual control."""
+
+DIRECTIONS = {"UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s")}
+FIRE = ("space",)
+
+
+class Source(Protocol):
+    """A state at a time."""
+
+    @property
+    def state(self) -> NDArray[np.uint8]:
+        """The one that is shown, uint8 (H, W, C)."""
+
+    @property
+    def note(self) -> str:
+        """Where it is from."""
+
+    @property
+    def help(self) -> tuple[str, ...]:
+        """Which keys do what, in lines."""
+
+    def press(self, key: str, held: Set[str]) -> bool:
+        """What a key does, of those ``held`` down; false where nothing."""
+
+    def idle(self) -> bool:
+        """What happens when no key is held, in real time; false where nothing."""
+
+    def marked(self) -> None:
+        """The state was marked."""
+
+
+class Recorded:
+    """States that were recorded before, (N, H, W, C); a marked one makes way for the next."""
+
+    help: tuple[str, ...] = ("left, right: the state before, the next one", "page up, page down: ten at once")
+
+    def __init__(self, states: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]):
+        self._states, self._index = states, 0
+
+    @property
+    def state(self) -> NDArray[np.uint8]:
+        """The one shown."""
+        state: NDArray[np.uint8] = self._states[self._index]
+        return state
+
+    @property
+    def note(self) -> str:
+        """Which one."""
+        return f"state {self._index + 1} of {len(self._states)}"
+
+    def press(self, key: str, held: Set[str]) -> bool:
+        """One or ten on, or back."""
+        steps = {"left": -1, "right": 1, "page up": -10, "page down": 10}
+        if key not in steps:
+            return False
+        before = self._index
+        self._index = int(np.clip(before + steps[key], 0, len(self._states) - 1))
+        return self._index != before
+
+    def idle(self) -> bool:
+        """Nothing."""
+        return False
+
+    def marked(self) -> None:
+        """On to the next."""
+        self.press("right", frozenset())
+
+
+class Played:
+    """An environment that is played by keyboard; its states are those that an agent would see.
+
+    Args:
+        make: makes it: observations uint8 (H, W, C) or (H, W), actions ``Discrete``.
+        layout_seed: what ``reset`` is given; the next layout is one more.
+
+    Raises:
+        UserError: observations or actions are others.
+    """
+
+    def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
+        self._env = make_checked(make)
+        self._names = action_names(self._env)
+        self._layout = layout_seed
+        self.help: tuple[str, ...] = (*action_help(self._names), "r: begin again, l: next layout")
+        self._begin()
+
+    def _begin(self) -> None:
+        observation, _info = self._env.reset(seed=self._layout)
+        self.state = as_image(observation, shape_of(self._env))
+        self._steps, self._over = 0, False
+
+    @property
+    def note(self) -> str:
+        """Layout and step."""
+        over = "; the episode is over, any action begins another" if self._over else ""
+        return f"layout seed {self._layout}, step {self._steps}{over}"
+
+    def press(self, key: str, held: Set[str]) -> bool:
+        """Play the action of a key, or of the keys held together."""
+        if key in ("r", "l"):
+            self._layout += key == "l"
+            self._begin()
+            return True
+        action = action_of(self._names, key, held)
+        if action is None:
+            return False
+        return self._play(action)
+
+    def idle(self) -> bool:
+        """Play NOOP where there is one."""
+        return not self._over and "NOOP" in self._names and self._play(self._names.index("NOOP"))
+
+    def _play(self, action: int) -> bool:
+        if self._over:
+            self._begin()
+            return True
+        observation, _reward, terminated, truncated, _info = self._env.step(action)
+        self.state = as_image(observation, shape_of(self._env))
+        self._steps, self._over = self._steps + 1, bool(terminated or truncated)
+        return True
+
+    def marked(self) -> None:
+        """Nothing: one plays on."""
+
+
+def action_names(env: gymnasium.Env) -> tuple[str, ...]:
+    """What an environment calls its actions, else their numbers: MiniGrid has ``actions``, Atari its meanings."""
+    inner = env.unwrapped
+    count = int(env.action_space.n)  # type: ignore[attr-defined]
+    if hasattr(inner, "get_action_meanings"):
+        names = tuple(map(str, inner.get_action_meanings()))
+    else:
+        names = tuple(str(getattr(action, "name", action)) for action in getattr(inner, "actions", ()))
+    return names if len(names) == count else tuple(map(str, range(count)))
+
+
+def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
+    """The action that a key stands for: by name as MiniGrid's, by the keys held together as Atari's, or by number."""
+    if "NOOP" in names:
+        down = {key, *held}
+        parts = [name for name, keys in DIRECTIONS.items() if down & set(keys)]
+        vertical = next((name for name in parts if name in ("UP", "DOWN")), "")
+        level = next((name for name in parts if name in ("RIGHT", "LEFT")), "")
+        name = vertical + level + ("FIRE" if down & set(FIRE) else "")
+        return names.index(name) if name in names else None
+    for index, name in enumerate(names):
+        if key in GRID_KEYS.get(name, ()) or key == name:
+            return index
+    return None
+
+
+def action_help(names: Sequence[str]) -> tuple[str, ...]:
+    """Which keys play which actions, in lines."""
+    if "NOOP" in names:
+        return ("arrows or w a s d, space: move, fire; together, too",)
+    told = [f"{' or '.join(GRID_KEYS[name]) if name in GRID_KEYS else name}: {name}" for name in names]
+    return tuple(", ".join(told[first : first + 3]) for first in range(0, len(told), 3))
+
+
+def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]] | NDArray[np.uint8]:
+    """The unlabelled states of a data file or of a ``.npz`` file, or the images of a folder.
+
+    Raises:
+        UserError: none of these, or there are no states.
+    """
+    if path.is_dir():
+        return [read_image(file) for file in image_files(path)]
+    if path.suffix == ".npz":
+        return read_states(path)
+    return open_dataset(path).unlabelled()

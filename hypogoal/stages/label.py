@@ -1,0 +1,84 @@
+"""Spec B6: states marked by hand, in the folder of images that ``import`` takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+import hypogoal
+from hypogoal.core import own_code
+from hypogoal.core.drafts import sole_writer
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name
+from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS
+from hypogoal.own_data import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
+
+HELD_OUT = "heldout"
+
+
+def label(
+    source: str,
+    out: Path,
+    *,
+    layout_seed: int = 0,
+    arguments: Mapping[str, Any] | None = None,
+    heldout: bool = False,
+    fps: int = 0,
+    resume: bool = False,
+) -> dict[str, int]:
+    """Show states in a window and keep what a person says of them.
+
+    Args:
+        source: a data file, a ``.npz`` file or a folder of images, whose states are shown one after another; or what is
+            played: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
+            environment.
+        out: the folder; its name is the sub-goal's.
+        layout_seed: of the layout that is played.
+        arguments: of the environment.
+        heldout: the marks are for evaluation: ``out/heldout``.
+        fps: steps a second in real time; 0: a step for each key.
+        resume: go on with a folder that there is.
+
+    Returns:
+        How many states of each kind are marked.
+
+    Raises:
+        UserError: no such source, ``out`` exists, or there is no screen.
+    """
+    if not plain_name(out.resolve().name):
+        raise UserError("the folder's name must be able to be a sub-goal's", out, "Give another --out.")
+    if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
+        raise UserError("it exists already", out, "Give --resume to go on with it, or another --out.")
+    states = _source(source, layout_seed, arguments or {})
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with sole_writer(out):
+        marks = Marks(out / HELD_OUT, KINDS[:2]) if heldout else Marks(out)
+        mark_states(states, marks, out.resolve().name, fps=fps)
+        return marks.counts()
+
+
+def _source(source: str, layout_seed: int, arguments: Mapping[str, Any]) -> Source:
+    if Path(source).exists():
+        return Recorded(recorded_states(Path(source)))
+    return Played(partial(_environment, source, arguments), layout_seed)
+
+
+def _environment(source: str, arguments: Mapping[str, Any]) -> Any:
+    """An environment by its id, of a domain, or by the function that makes it."""
+    hypogoal.register()
+    if source in gymnasium.registry:
+        return gymnasium.make(source, **arguments)
+    try:
+        found = own_code.load_own(source, "environment", ENTRY_POINTS, BUILT_IN)
+    except UserError as error:
+        if ":" in source:
+            raise
+        do = "Give a data file, a .npz file, a folder of images, a domain, an environment's id or module:object."
+        raise UserError("neither a file nor an environment", source, do) from error
+    if hasattr(found, "env_id"):
+        return gymnasium.make(found.env_id, **arguments)
+    return getattr(found, "make", found)(**arguments)
