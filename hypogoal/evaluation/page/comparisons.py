@@ -41,7 +41,7 @@ def comparison_tables(
     last: tuple[str, ...] | None = None
     for entry in pairs:
         key = tuple(texts[name](entry) for name in shown)
-        places = (digits or {}).get(entry["quantity"], 3)
+        places = max((digits or {}).get(entry["quantity"], 3), 1)  # a difference may be small where the numbers are not
         lines.append(
             row(
                 *(key if key != last else [""] * len(key)),
@@ -79,4 +79,4 @@ def _between(bounds: Sequence[float | None], digits: int) -> str:
 
 
 def _signed(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:+.{digits}f}"
+    return "–" if value is None else f"{round(value, digits) + 0.0:+.{digits}f}"  # + 0.0: no "-0"
