@@ -146,7 +146,7 @@ def test_the_table_says_each_method_once():
     length = [line["cells"] for line in table["rows"]][2:4]
     assert length[0][:2] == ["length (lower is better)", "b"]
     assert length[1][:2] == ["", "c"]
-    assert length[0][2]["text"] == "1.00" and length[0][3] == "1–0–0" and length[0][5]["text"] == "-2"
+    assert length[0][2]["text"] == "1.00" and length[0][3] == "1–0–0" and length[0][5]["text"] == "-2.0"
     (told,) = comparison_tables([*rows, {**rows[0], "first": "b", "where": "N=1"}], "seed", "layouts")
     assert [column["name"] for column in told["columns"]][:4] == ["quantity", "of", "first", "second"]
     assert comparison_tables([], "seed", "layouts") == []
