@@ -29,7 +29,8 @@ from hypogoal.core.config import resolve  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
-from hypogoal.options.execution import OptionLoop, RandomChooser  # noqa: E402
+from hypogoal.options.choosers import RandomChooser  # noqa: E402
+from hypogoal.options.execution import OptionLoop  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
 from hypogoal.options.recurrent import RecurrentLearner  # noqa: E402

@@ -18,8 +18,9 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import Step
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.execution import OptionLoop, RandomChooser
+from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.verdicts import Verdicts, oracle_terminations

@@ -16,7 +16,8 @@ from hypogoal.domains.base import Domain
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build
 from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.execution import Chooser, Learner, OptionLoop, RandomChooser
+from hypogoal.options.choosers import RandomChooser
+from hypogoal.options.execution import Chooser, Learner, OptionLoop
 from hypogoal.options.recording import Recorder
 
 REPLAY = 1_000  # nothing is learned: a small one

@@ -26,7 +26,8 @@ from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments, visited_by
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.needs import play_needs
-from hypogoal.options.execution import Chooser, OptionLoop, RandomChooser
+from hypogoal.options.choosers import RandomChooser
+from hypogoal.options.execution import Chooser, OptionLoop
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 

@@ -18,7 +18,8 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments, visited_by
 from hypogoal.needs import play_needs
-from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
+from hypogoal.options.choosers import EvenChooser, RandomChooser
+from hypogoal.options.execution import OptionLoop
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 

@@ -16,8 +16,9 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.meta import playing
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
+from hypogoal.options.execution import OptionLoop
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 from hypogoal.options.verdicts import Verdicts, oracle_terminations

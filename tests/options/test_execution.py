@@ -11,8 +11,9 @@ from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.execution import OptionLoop, Outcome, RandomChooser, offered_options
+from hypogoal.options.execution import OptionLoop, Outcome, offered_options
 from hypogoal.options.light import LightLearner
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, apply_to_states
 from hypogoal.options.recording import Recorder

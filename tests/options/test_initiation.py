@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.execution import OptionLoop, RandomChooser
+from hypogoal.options.execution import OptionLoop
 from hypogoal.options.initiation import FEWEST, Initiation
 from hypogoal.options.recording import Recorder
 from hypogoal.options.verdicts import Verdicts, oracle_terminations

@@ -13,9 +13,10 @@ from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.env import make_policies
-from hypogoal.options.execution import EvenChooser, OptionLoop, RandomChooser
+from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
 from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels

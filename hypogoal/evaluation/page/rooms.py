@@ -21,8 +21,14 @@ from hypogoal.evaluation.page.blocks import (
     table,
 )
 from hypogoal.evaluation.page.comparisons import comparison_tables
+from hypogoal.evaluation.page.room_details import (
+    SCOPES,
+    group_name,
+    kinds_tables,
+    members_table,
+    room_tables,
+)
 
-SCOPES = {"unseen": "unseen rooms", "all": "all rooms"}
 SCORES = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}
 WHICH = {
     "best": "best member",
@@ -30,7 +36,6 @@ WHICH = {
     "mean": "mean of members",
     "worst": "worst member",
 }
-SEEN = {0: "no", 1: "unlabelled", 2: "labelled"}
 PAPER = (
     "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
     "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
@@ -57,19 +62,14 @@ def rooms_section(material: Material) -> Block:
         own = [entry for entry in rows if entry["sub_goal"] == sub_goal]
         blocks += [_best(material, own), _four(material, own), *(_table(own, scope) for scope in SCOPES)]
         blocks += [_intervals(own), _differences(own)]
-        blocks += _kinds(material, own) + _rooms(material, own)
+        blocks += kinds_tables(material, own) + room_tables(material, own)
     blocks += comparison_tables(material.comparisons("rooms"), "ensemble seed and N", "sub-goals")
-    blocks.append(_members(material))
+    blocks.append(members_table(material))
     return section("rooms", title, [text], blocks)
 
 
 def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(entry["method"] for entry in rows))
-
-
-def _numbers(rows: Sequence[Mapping[str, Any]]) -> list[int | None]:
-    """The Ns of some rows, ascending, None (no such thing) last."""
-    return sorted({entry["groups"] for entry in rows}, key=lambda groups: (groups is None, groups or 0))
 
 
 def panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str, which: str) -> Panel:
@@ -159,7 +159,7 @@ def _table(rows: Sequence[Mapping[str, Any]], scope: str) -> Block:
         lines.append(
             row(
                 entry["method"] if entry["method"] != last else "",
-                _number(entry["groups"]),
+                group_name(entry["groups"]),
                 *(deviation(found[score][which], 2) for score in SCORES for which in WHICH),
                 str(entry["ensembles"]),
                 mark="first" if entry["method"] != last else "",
@@ -188,10 +188,6 @@ def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
     return f"Never saying yes has accuracy {listed(told)}. " if told else ""
 
 
-def _number(groups: int | None) -> str:
-    return "–" if groups is None else str(groups)
-
-
 def _intervals(rows: Sequence[Mapping[str, Any]]) -> Block:
     lines, last = [], ""
     for entry in rows:
@@ -199,7 +195,7 @@ def _intervals(rows: Sequence[Mapping[str, Any]]) -> Block:
         lines.append(
             row(
                 entry["method"] if entry["method"] != last else "",
-                _number(entry["groups"]),
+                group_name(entry["groups"]),
                 *(interval(own[which], 3) for own in found for which in ("best", "validated", "mean")),
                 mark="first" if entry["method"] != last else "",
             )
@@ -223,7 +219,7 @@ def _differences(rows: Sequence[Mapping[str, Any]]) -> Block:
         lines.append(
             row(
                 entry["method"] if entry["method"] != last else "",
-                _number(entry["groups"]),
+                group_name(entry["groups"]),
                 deviation(entry["disagreement_unlabelled"], 3),
                 deviation(entry["disagreement_heldout"], 3),
                 fixed(entry["tied"], 1),
@@ -240,137 +236,4 @@ def _differences(rows: Sequence[Mapping[str, Any]]) -> Block:
         caption="Share of states on which two members' verdicts differ, mean over pairs; mean over seeds ± standard "
         "deviation. Tied: members with the same, highest balanced accuracy in the rooms of labelled groups, of which "
         "the first counts as validated; where all are tied, validation chooses nothing.",
-    )
-
-
-def _ensembles(material: Material, entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The sub-goal rows of all ensembles (seeds) behind a row of the table."""
-    found = []
-    for ensemble in material.metrics["ensembles"]:
-        if ensemble.get("method") == entry["method"] and ensemble["groups"] == entry["groups"]:
-            found += [goal for goal in ensemble["sub_goals"] if goal["sub_goal"] == entry["sub_goal"]]
-    return found
-
-
-def _kinds(material: Material, rows: Sequence[Mapping[str, Any]]) -> list[Block]:
-    blocks = []
-    for place, groups in enumerate(_numbers(rows)):
-        here = [entry for entry in rows if entry["groups"] == groups]
-        found = [[goal["rooms"] for goal in _ensembles(material, entry)] for entry in here]
-        kinds = {
-            (one["scope"], one["kind"]): one["negatives"]
-            for own in found
-            for rooms in own
-            for one in rooms["false_positives"]
-        }
-        lines: list[dict[str, Any]] = []
-        for (scope, kind), negatives in kinds.items():
-            cells = []
-            for own in found:
-                shares = [_shares(rooms, scope, kind) for rooms in own]
-                cells.append(_percent([float(np.mean(share)) for share, _ in shares]))
-                cells.append(_percent([picked for _, picked in shares if picked is not None]))
-            first = not lines or lines[-1]["scope"] != scope
-            line = row(SCOPES[scope] if first else "", kind, f"{negatives:,}", *cells, mark="first" if first else "")
-            lines.append({**line, "scope": scope})
-        if lines:
-            name = f"False positives by kind, N={_number(groups)}"
-            columns = [f"{entry['method']}: {which}" for entry in here for which in ("mean", "validated")]
-            blocks.append(
-                table(
-                    ("held-out states of", "negatives", "states", *columns),
-                    lines,
-                    texts=2,
-                    tight=True,
-                    heading=name if place == 0 else "",
-                    folded="" if place == 0 else name,
-                    caption="Share of each kind of negatives that a member calls reached, in %: mean over members and "
-                    "seeds, and of the validated member, mean over seeds. Balanced accuracy hides these: a "
-                    "member that says yes on the ladder ends an option half-way.",
-                )
-            )
-    return blocks
-
-
-def _shares(rooms: Mapping[str, Any], scope: str, kind: str) -> tuple[list[float], float | None]:
-    """Of one ensemble every member's share, and the validated member's."""
-    for one in rooms["false_positives"]:
-        if (one["scope"], one["kind"]) == (scope, kind):
-            validated = rooms["validated"]["member"]
-            return one["share"], None if validated is None else one["share"][validated]
-    return [float("nan")], None
-
-
-def _percent(values: Sequence[float]) -> str:
-    known = [value for value in values if not np.isnan(value)]
-    return f"{100 * float(np.mean(known)):.1f}" if known else "–"
-
-
-def _rooms(material: Material, rows: Sequence[Mapping[str, Any]]) -> list[Block]:
-    blocks = []
-    for groups in _numbers(rows):
-        here = [entry for entry in rows if entry["groups"] == groups]
-        found = [[goal["rooms"]["by_room"] for goal in _ensembles(material, entry)] for entry in here]
-        lines = []
-        for index, room in enumerate(found[0][0] if found and found[0] else ()):
-            cells = []
-            for own in found:
-                for score in ("balanced_accuracy", "accuracy"):
-                    values = [value for by_room in own for value in by_room[index][score] if value is not None]
-                    cells.append(fixed(float(np.mean(values)) if values else None, 2))
-            about = (str(room["room"]), SEEN.get(room["seen"], str(room["seen"])))
-            lines.append(row(*about, f"{room['states']:,}", f"{room['positives']:,}", *cells))
-        if lines:
-            columns = [f"{entry['method']}: {name}" for entry in here for name in ("bal. acc.", "accuracy")]
-            blocks.append(
-                table(
-                    ("room", "in training", "states", "positives", *columns),
-                    lines,
-                    texts=2,
-                    tight=True,
-                    folded=f"Every room, N={_number(groups)}",
-                    caption="Mean over members and ensemble seeds, on the room's held-out states. Rooms without a "
-                    "ladder base have no positives and so no balanced accuracy.",
-                )
-            )
-    return blocks
-
-
-def _members(material: Material) -> Block:
-    lines = []
-    count = 0
-    for ensemble in material.metrics["ensembles"]:
-        for goal in ensemble["sub_goals"]:
-            if "rooms" not in goal:
-                continue
-            count += 1
-            scopes, validated = goal["rooms"]["scopes"], goal["rooms"]["validated"]["member"]
-            for index, member in enumerate(goal["members"]):
-                scores = [
-                    fixed(scopes[scope]["members"][index][score], 3)
-                    for scope, names in (
-                        ("unseen", ("balanced_accuracy", "accuracy", "precision", "recall")),
-                        ("all", ("balanced_accuracy", "accuracy", "precision", "recall")),
-                        ("labelled", ("balanced_accuracy",)),
-                    )
-                    for score in names
-                ]
-                lines.append(
-                    row(
-                        ensemble["path"] if index == 0 else "",
-                        f"{index}{' (validated)' if index == validated else ''}",
-                        *scores,
-                        fixed(member["says_yes_unlabelled"], 3),
-                        mark="first" if index == 0 else "",
-                    )
-                )
-    columns = [f"{scope}: {score}" for scope in ("unseen", "all") for score in ("bal. acc.", "acc.", "prec.", "recall")]
-    return table(
-        ("ensemble", "member", *columns, "validation: bal. acc.", "yes, unlabelled"),
-        lines,
-        texts=2,
-        tight=True,
-        folded=f"Every member of {count} ensembles",
-        caption="Validation: held-out states in rooms of labelled groups. The last column is the share of unlabelled "
-        "states that the member calls positive.",
     )
