@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+from keyboard import label
 
 import hypogoal
 from hypogoal.cli import main
@@ -22,30 +21,10 @@ from hypogoal.own_data import Marks, read_images
 from hypogoal.own_data.marking import as_rgb
 from hypogoal.own_data.states_to_mark import action_names, action_of
 
-pygame = pytest.importorskip("pygame")
-
 
 @pytest.fixture(autouse=True)
 def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
-def label(keys: str, *arguments: str) -> int:
-    """``hypogoal label`` while somebody presses these keys, then escape."""
-
-    def press() -> None:
-        until = time.monotonic() + 60
-        while not (pygame.display.get_init() and pygame.display.get_surface()) and time.monotonic() < until:
-            time.sleep(0.01)
-        for key in [*keys.split(), "escape"]:
-            code = pygame.key.key_code(key)
-            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=code, unicode="", mod=0, scancode=0))
-
-    hand = threading.Thread(target=press, daemon=True)
-    hand.start()
-    code = main(["label", *arguments])
-    hand.join()
-    return code
 
 
 def played(actions: Sequence[int], layout_seed: int) -> list[np.ndarray]:
