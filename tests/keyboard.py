@@ -14,7 +14,7 @@ def label(keys: str, *arguments: str) -> int:
     """``hypogoal label`` while somebody presses these keys, then escape; needs SDL_VIDEODRIVER=dummy."""
 
     def press() -> None:
-        until = time.monotonic() + 60
+        until = time.monotonic() + 300  # a loaded machine takes long to begin
         while not (pygame.display.get_init() and pygame.display.get_surface()) and time.monotonic() < until:
             time.sleep(0.01)
         for key in [*keys.split(), "escape"]:
