@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from hypogoal.cli import bringing, making, showing, sweeping
+from hypogoal.cli import making, sweeping, showing, bringing  # isort: skip  # so --help has the stages first
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import NumericalError, UserError
 
