@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ COLOURS = {"positive": (0, 120, 80), "negative": (190, 70, 0), "unlabelled": (0,
 UNSEEN = ("offscreen", "dummy")  # what pygame takes where there is no screen, and says nothing
 WAIT_MS = 100  # so long a key is waited for before Ctrl-C in the terminal is noticed
 REPEAT_MS = (300, 80)  # a key that stays down
+HELD = ("up", "down", "left", "right", "w", "a", "s", "d", "space")  # keys that may be held together
 
 
 def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) -> None:
@@ -101,6 +103,7 @@ class _Window:
             raise UserError("no pygame, which makes the window", None, "pip install pygame-ce") from None
         self._pygame, self._title = pygame, title
         self._surface: Any = None
+        self._tick = 0.0  # when the last one was, in real time
 
     def __enter__(self) -> _Window:
         pygame = self._pygame
@@ -142,23 +145,28 @@ class _Window:
         pygame.display.flip()
 
     def next_key(self, fps: int) -> tuple[str, frozenset[str]]:
-        """The next key that goes down, and those held; in real time an empty one where none does in time.
+        """The next key that goes down, and those held; closing the window is ``escape``.
 
-        Closing the window is ``escape``.
+        In real time keys that play count once a tick, however long they are held; a tick without any is an empty key.
         """
         pygame: Any = self._pygame
+        tapped: set[str] = set()
         while True:
-            event = pygame.event.wait(1000 // fps if fps else WAIT_MS)
+            left = max(0.0, self._tick + 1 / fps - time.monotonic()) if fps else WAIT_MS / 1000
+            event = pygame.event.wait(max(1, round(1000 * left)))
             if event.type == pygame.QUIT:
                 return "escape", frozenset()
             if event.type == pygame.KEYDOWN:
-                return pygame.key.name(event.key), self._held()
-            if fps and event.type == pygame.NOEVENT:
-                held = self._held()
-                return next(iter(sorted(held)), ""), held
+                key = pygame.key.name(event.key)
+                if not fps or key not in HELD:
+                    return key, self._held()
+                tapped.add(key)
+            if fps and time.monotonic() >= self._tick + 1 / fps:
+                self._tick = time.monotonic()
+                held = self._held() | tapped
+                return next(iter(sorted(held)), ""), frozenset(held)
 
     def _held(self) -> frozenset[str]:
         pygame: Any = self._pygame
         pressed = pygame.key.get_pressed()
-        known = ("up", "down", "left", "right", "w", "a", "s", "d", "space")
-        return frozenset(name for name in known if pressed[pygame.key.key_code(name)])
+        return frozenset(name for name in HELD if pressed[pygame.key.key_code(name)])
