@@ -86,12 +86,13 @@ def baseline_needs(observation: int, replay: int) -> Needs:
     return Needs(BASE + 100e6 + 2 * state, CHECKPOINTS * (state + 50e6) + LOGS)
 
 
-def evaluation_needs(data: list[Path]) -> Needs:
-    """``evaluate``: the held-out and unlabelled states of one data file at a time, twice."""
+def evaluation_needs(data: list[Path], workers: int = 1) -> Needs:
+    """``evaluate``: the held-out and unlabelled states of one data file at a time, twice, in each of its processes."""
     largest = 0
     for path in data:
         dataset = open_dataset(path)
         counts = dataset.counts()
         heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
         largest = max(largest, (heldout + counts["unlabelled"]) * prod(dataset.observation_shape))
-    return Needs(BASE + 300e6 + 2.0 * largest, 2 * LOGS)
+    processes = workers + (workers > 1)  # the one that asks holds the states too
+    return Needs(300e6 + processes * (BASE + 2.0 * largest), 2 * LOGS)

@@ -40,7 +40,8 @@ def machine_factor() -> float:
 def wall_seconds(cells: Sequence[Cell], workers: int, factor: float) -> float:
     """How long the cells take with so many at once, at least; those whose cost is not known count nothing."""
     seconds = [factor * cell.cost.seconds for cell in cells]
-    return max(sum(seconds) / workers, max(seconds, default=0.0))
+    alone = [own / min(workers, cell.cost.cores) for own, cell in zip(seconds, cells, strict=True)]
+    return max(sum(seconds) / workers, max(alone, default=0.0))
 
 
 def cost_lines(cells: Sequence[Cell], workers: int, factor: float) -> list[str]:

@@ -27,6 +27,7 @@ PER_MEMBER_STEP = {"montezuma": 0.11, "montezuma-crop": 0.01}
 PER_LOCALISER = 90.0
 PER_STEP = {"light": 2.5e-3, "paper": 4.0}
 PER_EVALUATED_MEMBER = 4.0
+EVALUATING = 6  # ensembles that an evaluation judges at once, at the most
 
 METHODS: dict[str, tuple[str, ...]] = {
     "dbat": ("--diversity", "dbat"),
@@ -107,7 +108,7 @@ def cells(
     variants: dict[str, Any] = {variant: _changed(ensemble, variant) for variant in ("", *config.variants)}
     members = {method: 1 if method == "cnn" else ensemble.members for method in METHODS}
     option = play.steps * PER_STEP[play.network]
-    evaluated = 0
+    evaluated = judged = 0
 
     domain = load_domain(DOMAIN)
     states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
@@ -139,6 +140,7 @@ def cells(
             settings = (part for change in variant.split() for part in ("--set", change))
             arguments = ("train-ensemble", str(data), *METHODS[method], *settings, "--seed", str(seed))
             evaluated += members[method]
+            judged += 1
             axes = {"method": method, "variant": variant, "groups": groups, "seed": seed}
             made.append(add(place, arguments, axes, training(method, variant), (data,)))
     for ladder in config.ladders:
@@ -159,5 +161,5 @@ def cells(
                 arguments = ("train-options", str(source), *changes, "--seed", str(seed))
                 axes = {"method": "oracle", "ladder": ladder, "seed": seed}
                 made.append(add(place, arguments, axes, learning("cnn", option), (source,)))
-    evaluating = Cost(PER_EVALUATED_MEMBER * evaluated, BASE + 300e6 + 2 * states, 2 * LOGS)
+    evaluating = Cost(PER_EVALUATED_MEMBER * evaluated, BASE + 300e6 + 2 * states, 2 * LOGS, min(EVALUATING, judged))
     return planned + closing_cells(out, made, evaluating)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.preflight import preflight
+from hypogoal.core.preflight import free_memory, preflight
 from hypogoal.core.progress import Progress
+from hypogoal.core.workers import cores
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import installed_domain
 from hypogoal.evaluation.agents import (
@@ -31,17 +30,16 @@ from hypogoal.evaluation.distance import INSIDE, LAST, NEAR, ORACLE, distance_ta
 from hypogoal.evaluation.ensembles import ensemble_name, ensemble_names, hypotheses_table, sub_goal_metrics
 from hypogoal.evaluation.examples import overlay
 from hypogoal.evaluation.found import Found, find, most_used, takes, within
+from hypogoal.evaluation.judging import Case, cases_of, judge_all, processes_for, states_of
 from hypogoal.evaluation.ladders import ladder_names, missing_ladders
 from hypogoal.evaluation.quantities import QUANTITIES, plain
 from hypogoal.evaluation.reading import read_episodes, read_executions, read_layout, read_terminations
 from hypogoal.evaluation.rooms import groups_of, method_names, room_metrics, rooms_table
 from hypogoal.evaluation.saliency import BASELINE
 from hypogoal.evaluation.selecting import evaluate_selection
-from hypogoal.evaluation.shown import Unlabelled, show_states, show_stops
+from hypogoal.evaluation.shown import show_states, show_stops
 from hypogoal.evaluation.summary import hypotheses_summary, summary_table
-from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
-from hypogoal.hypotheses.storage import read_ensemble
-from hypogoal.hypotheses.views import positions_of
+from hypogoal.hypotheses.ensemble import THRESHOLD
 from hypogoal.needs import evaluation_needs
 
 __all__ = ["evaluate", "hypotheses_summary", "summary_table"]
@@ -69,7 +67,12 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
     found = find(run)
     inputs = [artefact.whole().path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})
-    preflight("evaluate", out, evaluation_needs(data), quiet=quiet)
+    cases = cases_of(found.ensembles)
+    workers = processes_for([case for _, case in cases], cores())
+    needs = evaluation_needs(data, workers)
+    if workers > 1 and needs.memory > (free_memory() or math.inf):
+        workers, needs = 1, evaluation_needs(data, 1)
+    preflight("evaluate", out, needs, quiet=quiet)
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force
     ) as folder:
@@ -83,7 +86,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
             if runs:
                 write_curves(arrays, groups)
             selection = evaluate_selection(found, groups, arrays, progress)
-            ensembles, saliency, explorer = evaluate_ensembles(found, arrays, progress)
+            ensembles, saliency, explorer = evaluate_ensembles(found, cases, workers, arrays, progress)
             distance = evaluate_distance(found, ensembles, arrays, progress)
         rooms = rooms_table(ensembles)
         metrics = {
@@ -115,56 +118,48 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
 
 
 def evaluate_ensembles(
-    found: Found, arrays: Any, progress: Progress
+    found: Found, cases: Sequence[tuple[int, Case]], workers: int, arrays: Any, progress: Progress
 ) -> tuple[list[dict[str, Any]], dict[str, Any] | None, dict[str, Any] | None]:
     """Spec F1, F2: every ensemble of the run on its data's held-out and unlabelled states.
 
     Of one ensemble, the first of those with the most members, example states and attributions are kept too; of one,
     the one with the most members whose options were learned most often, states to browse.
     """
-    artefacts = found.ensembles
-    configs = [artefact.config for artefact in artefacts]
-    rows: list[list[dict[str, Any]]] = [[] for _ in artefacts]
+    configs = [artefact.config for artefact in found.ensembles]
+    rows: list[list[dict[str, Any]]] = [[] for _ in configs]
+    left = [len(config["sub_goals"]) for config in configs]
     shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
     browsed = most_used(found)
     explained, browsable = [], []
-    sources = [artefact.input("data") for artefact in artefacts]
-    for path in sorted(set(sources)):
-        dataset = open_dataset(path)
-        unlabelled = Unlabelled(dataset.unlabelled(), positions_of(dataset.unlabelled_origins()))
-        kinds = getattr(installed_domain(dataset.domain), "kinds", ())
-        for sub_goal in dataset.sub_goals:
-            split = dataset.heldout(sub_goal)  # read once for all ensembles: it is the largest thing here
-            for index, artefact in enumerate(artefacts):
-                if sources[index] != path or sub_goal not in configs[index]["sub_goals"]:
-                    continue
-                ensemble = read_ensemble(artefact.path, configs[index], sub_goal)
-                judged = judge(ensemble, split.observations, positions_of(split.origins))
-                _, told = judge(ensemble, unlabelled.observations, unlabelled.positions)
-                row = sub_goal_metrics(sub_goal, judged[1], split.labels, split.origins.get("layout_seed"), told)
-                if "seen" in split.origins:
-                    row["rooms"] = room_metrics(judged[1], split.labels, split.origins, kinds)
-                rows[index].append(row)
-                if index == shown:
-                    explained.append(show_states(ensemble, sub_goal, split, judged, unlabelled, arrays))
-                if index == browsed:
-                    count = len(configs[index]["sub_goals"])
-                    browsable.append(browse_states(ensemble, sub_goal, split, judged, unlabelled, kinds, count, arrays))
-                progress.advance(len(rows[index]) == len(configs[index]["sub_goals"]))
+
+    def done(number: int) -> None:
+        index = cases[number][0]
+        left[index] -= 1
+        progress.advance(left[index] == 0)
+
+    judgements = judge_all([case for _, case in cases], workers, done)
+    for (index, case), judged in zip(cases, judgements, strict=True):
+        split, unlabelled = states_of(case.data, case.sub_goal)
+        kinds = getattr(installed_domain(open_dataset(case.data).domain), "kinds", ())
+        layouts = split.origins.get("layout_seed")
+        row = sub_goal_metrics(case.sub_goal, judged.verdicts, split.labels, layouts, judged.told)
+        if "seen" in split.origins:
+            row["rooms"] = room_metrics(judged.verdicts, split.labels, split.origins, kinds)
+        rows[index].append(row)
+        both = (judged.probabilities, judged.verdicts)
+        if index == shown:
+            explained.append(show_states(case.read(), case.sub_goal, split, both, unlabelled, arrays))
+        if index == browsed:
+            count = len(configs[index]["sub_goals"])
+            states = browse_states(case.read(), case.sub_goal, split, both, unlabelled, kinds, count, arrays)
+            browsable.append(states)
+    states_of.cache_clear()
     metrics = _named(found, rows)
     if shown is None or browsed is None:
         return metrics, None, None
     about = {"ensemble": metrics[shown]["path"], "seed": metrics[shown]["seed"], "baseline": BASELINE}
     other = {"ensemble": metrics[browsed]["path"], "seed": metrics[browsed]["seed"], "baseline": BASELINE}
     return metrics, {**about, "sub_goals": explained}, {**other, "sub_goals": browsable}
-
-
-def judge(
-    ensemble: Ensemble, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Every member's probability of each state, and its verdict at its own threshold, (N, K) each."""
-    probabilities = ensemble.predict(observations, positions)
-    return probabilities, probabilities > ensemble.thresholds.numpy()
 
 
 def _named(found: Found, rows: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:

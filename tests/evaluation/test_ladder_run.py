@@ -11,9 +11,10 @@ import pytest
 from ladder_run import ROOMS, STATES_PER_ROOM, SUB_GOAL, executions, write_data, write_members, write_options, write_run
 from rich.console import Console
 
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
+from hypogoal.evaluation import judging
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.stages.evaluate import evaluate, summary_table
@@ -72,6 +73,22 @@ def test_members_are_judged_room_by_room(run, metrics):
         len(ROOMS) * STATES_PER_ROOM - sum(ROOMS.values())
     )
     assert {row["kind"] for row in rooms["false_positives"]} == {"near-base", "on-ladder", "elsewhere"}
+
+
+def test_any_number_of_processes_gives_the_same_evaluation(run, metrics, tmp_path, monkeypatch):
+    """Spec G1, G5: judged in two processes: the same numbers and arrays; this run is too small for more than one."""
+    cases = [case for _, case in judging.cases_of(find_artefacts(run, "ensemble"))]
+    assert judging.processes_for(cases, 2) == 1
+    monkeypatch.setattr(judging, "SPREAD_FROM", 0)
+    monkeypatch.setenv("HYPOGOAL_CORES", "2")
+    assert judging.processes_for(cases, 2) == 2
+    assert evaluate(run, tmp_path / "again", **QUIET) == metrics
+    with h5py.File(tmp_path / "again/arrays.h5") as spread, h5py.File(run / "evaluation/arrays.h5") as alone:
+        found = []
+        alone.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
+        assert found
+        for name in found:
+            assert np.array_equal(spread[name][()], alone[name][()]), name
 
 
 def test_figure_3_has_a_row_per_method_and_n(metrics):
