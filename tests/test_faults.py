@@ -21,8 +21,10 @@ from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
+from hypogoal.options.initiation import Initiation
 from hypogoal.options.light import LightLearner
 from hypogoal.options.recording import Recorder
+from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
 
 TESTS = Path(__file__).parent
@@ -77,6 +79,49 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
         learner.online.heads.bias.view(2, -1)[1] = torch.nan
     with pytest.raises(NumericalError, match=r"the option loss is nan, from option \[1\], in the batch of update \d+"):
         learner._update()
+
+
+def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None:
+    """Spec G3: the same for the independent networks of ``paper``."""
+    engine = Corridor(1)
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    config = OptionConfig(network="paper", experience="own", environments=1, warm_up=4, option_batch=4)
+    learner = RecurrentLearner(engine, verdicts, config, 0)
+    loop = OptionLoop(
+        engine, verdicts, learner, RandomChooser(np.random.default_rng(0)), Recorder(2), config, gamma=0.9
+    )
+    while not learner.members[1].updates:
+        loop.step()
+    member = learner.members[1]
+    before = [weight.clone() for weight in member.online.parameters()]
+    hook = next(member.online.parameters()).register_hook(lambda gradient: gradient * torch.inf)
+    with pytest.raises(
+        NumericalError, match=r"a gradient of option 1 is (nan|inf) in the batch of its update \d+, its"
+    ):
+        learner._update(1, member)
+    hook.remove()
+    assert all(map(torch.equal, before, member.online.parameters()))
+    with torch.no_grad():
+        list(member.online.parameters())[-1].fill_(torch.nan)
+    with pytest.raises(NumericalError, match=r"the loss of option 1 is nan in the batch of its update \d+, its step"):
+        learner._update(1, member)
+
+
+def test_a_loss_or_gradient_that_is_no_number_stops_the_initiation_sets() -> None:
+    """Spec G3."""
+    initiation = Initiation(Corridor(4), 2, OptionConfig(), seed=0)
+    weight = next(initiation.network.parameters())
+    reached = np.array([True, False])
+    initiation.record(np.array([1, 2]), np.array([0, 1]), reached)
+    hook = weight.register_hook(lambda gradient: gradient * torch.inf)
+    with pytest.raises(NumericalError, match=r"^a gradient of the initiation sets is (nan|inf) after 2 executions$"):
+        initiation._update(np.array([0, 1]))
+    hook.remove()
+    assert torch.isfinite(weight).all()
+    with torch.no_grad():
+        weight.fill_(torch.nan)
+    with pytest.raises(NumericalError, match=r"^the loss of the initiation sets is nan after 2 executions$"):
+        initiation._update(np.array([0, 1]))
 
 
 def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 
 
 def double_q_targets(
@@ -56,6 +57,11 @@ def follow_tensors(ours: Sequence[Tensor], theirs: Sequence[Tensor], tau: float)
     for a, b in zip(ours, theirs, strict=True):
         if tau >= 1 or not a.is_floating_point():
             a.copy_(b)
+
+
+def gradient_norm(network: nn.Module) -> float:
+    """The norm of all of a network's gradients together: NaN or Inf where one of them is (Spec G3)."""
+    return float(get_total_norm([weight.grad for weight in network.parameters() if weight.grad is not None]))
 
 
 def linear_epsilon(steps: NDArray[np.int64], over: int, final: float) -> NDArray[np.float64]:

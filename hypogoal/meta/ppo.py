@@ -14,6 +14,7 @@ from torch import Tensor
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
+from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
@@ -171,7 +172,12 @@ class MetaPolicy:
         }
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Weights of an artefact."""
+        """Weights of an artefact.
+
+        Raises:
+            UserError: they are not of such a policy.
+        """
+        check_fit(self.state(), state, "meta.safetensors", AGAIN)
         for part, module in (("network", self.network), ("head", self.head)):
             module.load_state_dict(
                 {name[len(part) + 1 :]: value for name, value in state.items() if name.startswith(f"{part}.")}

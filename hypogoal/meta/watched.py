@@ -18,6 +18,7 @@ from hypogoal.meta.playing import PlayConfig, build
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.execution import Chooser, Learner, OptionLoop
+from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 
 REPLAY = 1_000  # nothing is learned: a small one
@@ -54,6 +55,7 @@ class Agent:
         ensemble: the ensemble's folder.
         options: tensors of ``options.safetensors``.
         meta: tensors of ``meta.safetensors``; None where options are chosen at random.
+        initiation: tensors of ``initiation.safetensors``; None where no option is held back.
     """
 
     config: Mapping[str, Any]
@@ -61,6 +63,7 @@ class Agent:
     ensemble: Path
     options: dict[str, Tensor]
     meta: dict[str, Tensor] | None
+    initiation: dict[str, Tensor] | None = None
 
 
 @dataclass
@@ -135,9 +138,15 @@ def play_episode(agent: Agent, domain: Domain, seed: int) -> list[Frame]:
     if agent.meta is not None:
         chooser = MetaPolicy(engine, verdicts.options, meta, seed)
         chooser.load(agent.meta)
+    initiation = None
+    if agent.initiation is not None:
+        initiation = Initiation(engine, verdicts.options, config, seed)
+        initiation.load(agent.initiation)
     recorder = Recorder(verdicts.options)
     onlooker = _Onlooker(learner)
-    loop = onlooker.loop = OptionLoop(engine, verdicts, onlooker, chooser, recorder, config, gamma=meta.gamma)
+    loop = onlooker.loop = OptionLoop(
+        engine, verdicts, onlooker, chooser, recorder, config, gamma=meta.gamma, initiation=initiation
+    )
     while not recorder.episodes:
         loop.step(explore=False, learn=False)
     return onlooker.frames

@@ -7,17 +7,21 @@ all together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
+from hypogoal.learners.double_dqn import gradient_norm
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, apply_to_states
@@ -95,14 +99,31 @@ class Initiation:
         own = logits.gather(1, torch.from_numpy(self.option[drawn])[:, None])[:, 0]
         reached = torch.from_numpy(self.reached[drawn]).float()
         loss = torch.nn.functional.binary_cross_entropy_with_logits(own, reached)
+        where = f"of the initiation sets is {{}} after {self.count} executions"
         if not torch.isfinite(loss):
-            raise NumericalError(
-                f"the loss of the initiation sets is {float(loss.detach())} after {self.count} executions"
-            )
+            raise NumericalError("the loss " + where.format(float(loss.detach())))
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        norm = gradient_norm(self.network)
+        if not math.isfinite(norm):
+            raise NumericalError("a gradient " + where.format(norm))
         self.optimiser.step()
         return {"initiation_loss": float(loss.detach())}
+
+    def state(self) -> dict[str, Tensor]:
+        """Weights and how often each option was executed, for an artefact."""
+        state = {f"network.{name}": value.contiguous() for name, value in self.network.state_dict().items()}
+        return state | {"executions": torch.from_numpy(self.executions.copy())}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from what an artefact holds; no execution is remembered.
+
+        Raises:
+            UserError: it is not of so many options on such observations.
+        """
+        check_fit(self.state(), state, "initiation.safetensors", AGAIN)
+        self.network.load_state_dict({name: state[f"network.{name}"] for name in self.network.state_dict()})
+        self.executions[:] = state["executions"].numpy()
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly."""

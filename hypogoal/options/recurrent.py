@@ -7,6 +7,7 @@ learning samples a step and replays the option's execution up to it. Every membe
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,7 +21,7 @@ from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
+from hypogoal.learners.double_dqn import double_q_targets, follow, gradient_norm, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
@@ -228,11 +229,14 @@ class RecurrentLearner:
         error = taken - goal
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber * torch.from_numpy(weights)).mean()
+        where = f"in the batch of its update {member.updates}, its step {member.steps}"
         if not torch.isfinite(loss):
-            where = f"in the batch of its update {member.updates}, its step {member.steps}"
             raise NumericalError(f"the loss of option {option} is {float(loss.detach())} {where}")
         member.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        norm = gradient_norm(member.online)
+        if not math.isfinite(norm):
+            raise NumericalError(f"a gradient of option {option} is {norm} {where}")
         member.optimiser.step()
         member.updates += 1
         if member.updates % config.target_interval == 0:

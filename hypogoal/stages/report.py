@@ -79,10 +79,11 @@ def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int)
     for index in range(count):
         artefact, episode = agents[index % len(agents)], index // len(agents)
         config, source = artefact.config, open_artefact(artefact.input("ensemble"), "ensemble")
-        weights = (load_tensors(artefact.path / f"{name}.safetensors") for name in ("options", "meta"))
-        frames = play_episode(
-            Agent(config, source.config, source.path, *weights), load_domain(config["domain"]), seed=episode
-        )
+        options, meta = (load_tensors(artefact.path / f"{name}.safetensors") for name in ("options", "meta"))
+        sets = artefact.path / "initiation.safetensors"
+        initiation = load_tensors(sets) if sets.name in artefact.manifest["files"] else None
+        agent = Agent(config, source.config, source.path, options, meta, initiation)
+        frames = play_episode(agent, load_domain(config["domain"]), seed=episode)
         name = artefact.path.relative_to(run).as_posix().replace("/", "-")
         gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
         (folder / f"{name}-episode-{episode}.gif").write_bytes(gif)

@@ -101,6 +101,8 @@ def train_meta(
         policy = MetaPolicy(engine, verdicts.options, config, seed) if config.chooser == "ppo" else None
         chooser: Chooser = policy or RandomChooser(rng_for(seed, "random-choice"))
         initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        if trained and initiation and "initiation.safetensors" in trained.manifest["files"]:
+            initiation.load(load_tensors(trained.path / "initiation.safetensors"))
         visited = visited_by(engine, config, seed)
         loop = OptionLoop(
             engine,
@@ -121,6 +123,8 @@ def train_meta(
         if visited:
             visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
+        if initiation:
+            save_tensors(folder / "initiation.safetensors", initiation.state())
         if policy:
             save_tensors(folder / "meta.safetensors", policy.state())
         (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")

@@ -100,6 +100,8 @@ def train_options(
         if visited:
             visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
+        if initiation:
+            save_tensors(folder / "initiation.safetensors", initiation.state())
         (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
     counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
     if config.restart_options:

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from hypogoal.core.artefacts import create_artefact, open_artefact
@@ -15,6 +16,7 @@ from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation.videos import BAR, draw_frame, episode_gif, frame_lines
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.meta.watched import Agent, Frame, play_episode
+from hypogoal.options.initiation import Initiation
 from hypogoal.stages.collect import collect
 from hypogoal.stages.report import agents_of, draw_videos
 from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
@@ -91,6 +93,43 @@ def test_videos_are_files_of_the_agents_that_choose(run, tmp_path):
         assert video.format == "GIF"
         assert 2 < video.n_frames <= 2 * CAP + 1
         assert video.size[0] == 320
+
+
+def test_options_are_held_back_as_in_training(run, tmp_path, monkeypatch):
+    """Spec D7: the artefact keeps the initiation sets, further training and videos go by them."""
+    held = TrainMetaConfig(
+        steps=320,
+        max_episode_steps=CAP,
+        option_timeout=TIMEOUT,
+        random_episodes=1,
+        layout_seed=100,
+        initiation="learned",
+    )
+    train_meta(run / "ensemble", held, tmp_path / "meta", **QUIET)
+    artefact = open_artefact(tmp_path / "meta").whole()
+    kept = load_tensors(artefact.path / "initiation.safetensors")
+    assert kept["executions"].sum() > 0
+    asked = []
+    narrow = Initiation.narrow
+
+    def watched(self, ids, offered):
+        assert self.state().keys() == kept.keys()
+        assert all(torch.equal(tensor, kept[name]) for name, tensor in self.state().items() if "network" in name)
+        asked.append(len(ids))
+        return narrow(self, ids, offered)
+
+    monkeypatch.setattr(Initiation, "narrow", watched)
+    draw_videos([artefact], tmp_path, tmp_path / "videos", 1)
+    assert asked and [path.suffix for path in (tmp_path / "videos").iterdir()] == [".gif"]
+
+
+def test_weights_of_another_policy_are_one_line(run):
+    """Spec G2: a meta-policy or initiation sets that do not fit."""
+    artefact, source = open_artefact(run / "meta"), open_artefact(run / "ensemble")
+    options, meta = (load_tensors(artefact.path / f"{name}.safetensors") for name in ("options", "meta"))
+    for wrong in ((dict(list(meta.items())[1:]), None), (meta, {"executions": torch.zeros(2)})):
+        with pytest.raises(UserError, match="do not fit"):
+            play_episode(Agent(artefact.config, source.config, source.path, options, *wrong), DOMAIN, seed=0)
 
 
 def test_a_run_without_such_an_agent_is_one_line(tmp_path):
