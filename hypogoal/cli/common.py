@@ -44,7 +44,7 @@ Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with what was begun; keep a complete --out as it is; else begin.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+Device = Annotated[str, typer.Option("--device", help="auto (the CPU), cpu, or cuda for training.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hypogoal.cli.common import AsJson, Force, Out, Preset, Quiet, Set, app, echo, print_table
+from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, print_table
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")]
 SLURM = "Slurm (with --engine slurm)"
@@ -20,6 +20,7 @@ def run(
     out: Out,
     preset: Preset = None,
     set_: Set = None,
+    device: Device = "auto",
     force: Force = False,
     resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
     quiet: Quiet = False,
@@ -28,15 +29,17 @@ def run(
     """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
     import json
 
+    from hypogoal.core.compute import prepare
     from hypogoal.stages.evaluate import summary_table
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
     out = _folder(out)
-    planned = plan(experiment, out, preset=preset, assignments=set_ or ())
+    planned = plan(experiment, out, preset=preset, assignments=set_ or (), device=device)
     if dry_run:
         _list(planned)
         return
+    prepare(device)
     stage(planned, out, force=force, resume=resume, quiet=quiet)
     metrics = out / "evaluation" / "metrics.json"
     if not metrics.is_file():
@@ -56,6 +59,7 @@ def sweep(
     preset: Preset = None,
     set_: Set = None,
     seeds: Annotated[str | None, typer.Option(help="The run seeds: 0-9, or 0,3,7.")] = None,
+    device: Device = "auto",
     engine: Annotated[str, typer.Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
@@ -105,6 +109,7 @@ def sweep(
         typer.echo(f"{end(out)} jobs ended; the same command as before goes on", err=True)
         return
 
+    from hypogoal.core.compute import prepare
     from hypogoal.core.errors import UserError
     from hypogoal.experiments.engines.slurm import Options
     from hypogoal.stages import sweep as stage
@@ -116,12 +121,13 @@ def sweep(
         raise UserError("which experiment?", "hypogoal sweep", "See 'hypogoal sweep --help'.")
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
-    planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds)
+    planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)
     if dry_run:
         _list(planned)
         return
     ask = None if yes or not sys.stdin.isatty() else _confirm
-    if engine == "local":
+    if engine == "local":  # with Slurm another machine's device is meant
+        prepare(device)
         typer.echo(stage.sweep(planned, out, quiet=quiet, confirm=ask))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))

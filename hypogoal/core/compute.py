@@ -2,19 +2,57 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
 from hypogoal.core.errors import UserError
 
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
-def prepare(device: str = "auto") -> None:
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def prepare(device: str = "auto") -> str:
     """Use one torch thread, and refuse a device that cannot be used.
 
     One thread per process is as fast on small networks, does not suffer from busy neighbours, and makes results
     the same bytes again on the same machine.
+
+    Args:
+        device: of ``DEVICES``; ``auto`` is the CPU (decision 26).
+
+    Returns:
+        ``cpu`` or ``cuda``.
+
+    Raises:
+        UserError: no such device, or torch finds none.
     """
     import torch
 
     torch.set_num_threads(1)
-    if device not in ("auto", "cpu", "cuda"):
-        raise UserError("unknown device", device, "Choose one of auto, cpu, cuda.")
-    if device == "cuda":
-        raise UserError("training runs on the CPU only in this version", "--device cuda", "Use --device cpu.")
+    check_name(device)
+    if device == "cuda" and not torch.cuda.is_available():
+        found = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
+        raise UserError("torch finds no GPU", found, "Use --device cpu, or see docs/gpu.md.")
+    return "cuda" if device == "cuda" else "cpu"
+
+
+def check_name(device: str) -> None:
+    """Refuse what is no device's name; whether this machine has it is not looked at.
+
+    Raises:
+        UserError: it is not of ``DEVICES``.
+    """
+    if device not in DEVICES:
+        raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
+
+
+def tensor(values: NDArray[Any], device: torch.device) -> Tensor:
+    """An array as a tensor on a device; on the CPU it shares the array's memory."""
+    import torch
+
+    return torch.from_numpy(values).to(device)

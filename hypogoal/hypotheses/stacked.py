@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hypogoal.core.compute import tensor
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.views import FullView
@@ -24,7 +25,8 @@ class StackedMembers:
     Up to rounding the same as each ensemble's ``predict`` (a test asserts it).
 
     Args:
-        ensembles: G ensembles of K members each, all with one network and observation shape, and views of one shape.
+        ensembles: G ensembles of K members each, all with one network and observation shape, views of one shape, and on
+            one device.
 
     Attributes:
         needs_positions: whether any of them does, see :attr:`Ensemble.needs_positions`.
@@ -32,6 +34,7 @@ class StackedMembers:
 
     def __init__(self, ensembles: Sequence[Ensemble]):
         self.ensembles = tuple(ensembles)
+        self.device = ensembles[0].thresholds.device
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
         self._one_view = all(isinstance(ensemble.view, FullView) for ensemble in ensembles)
         self._thresholds = np.concatenate([ensemble.thresholds.cpu().numpy() for ensemble in ensembles])
@@ -49,8 +52,8 @@ class StackedMembers:
         rows = []
         with torch.inference_mode():
             for start in range(0, len(seen), CHUNK):
-                images = as_input(torch.from_numpy(seen[start : start + CHUNK]))
-                rows.append(self._logits(images).softmax(-1)[..., 1].T.numpy())
+                images = as_input(tensor(seen[start : start + CHUNK], self.device))
+                rows.append(self._logits(images).softmax(-1)[..., 1].T.cpu().numpy())
         return np.concatenate(rows) if rows else np.empty((0, self.count), dtype=np.float32)
 
     def verdicts(

@@ -315,7 +315,8 @@ class _Watch:
         self.done += 1
         if self.done % REPORT_EVERY and self.done != self._config.steps:
             return
-        losses = torch.stack(self._rows).cpu()
+        device = self._rows[-1].device  # those of a checkpoint are on the CPU
+        losses = torch.stack([row.to(device) for row in self._rows]).cpu()
         self._rows.clear()
         faults = (~losses.isfinite()).nonzero().tolist()
         if faults:

@@ -101,7 +101,8 @@ class GaussianHead(nn.Module):
 
     def draw(self, scores: Tensor, offered: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Options int64 (N,) and the drawn scores, float32 (N, O)."""
-        drawn = scores + self.log_std.exp() * torch.randn(scores.shape, generator=generator)
+        spread = self.log_std.to(scores.device).exp()
+        drawn = scores + spread * torch.randn(scores.shape, generator=generator).to(scores.device)
         return drawn.masked_fill(~offered, -torch.inf).argmax(1), drawn
 
     def best(self, scores: Tensor, offered: Tensor) -> Tensor:
@@ -110,7 +111,7 @@ class GaussianHead(nn.Module):
 
     def log_prob(self, scores: Tensor, offered: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
         """Log density of the drawn scores and the entropy, float32 (N,) each."""
-        normal = torch.distributions.Normal(scores, self.log_std.exp().expand_as(scores))
+        normal = torch.distributions.Normal(scores, self.log_std.to(scores.device).exp().expand_as(scores))
         return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
 
 

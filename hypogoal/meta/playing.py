@@ -53,7 +53,7 @@ class PlayConfig(OptionConfig):
 
 
 def build(
-    domain: Domain, ensemble_folder: Path, about: Mapping[str, Any], config: PlayConfig, seed: int
+    domain: Domain, ensemble_folder: Path, about: Mapping[str, Any], config: PlayConfig, seed: int, device: str = "cpu"
 ) -> tuple[Engine, Verdicts, LightLearner | RecurrentLearner]:
     """The engine of one layout, the options' terminations on it and the learner of their policies.
 
@@ -63,6 +63,7 @@ def build(
         about: its manifest's configuration.
         config: see :class:`PlayConfig`.
         seed: of weights, exploration and, where there are several, start states.
+        device: where the networks are.
 
     Raises:
         UserError: the domain has no such start.
@@ -75,14 +76,16 @@ def build(
     if oracle:
         verdicts = Verdicts(oracle_terminations(engine), options)
     else:
-        ensembles = [read_ensemble(ensemble_folder, dict(about), sub_goal) for sub_goal in about["sub_goals"]]
+        ensembles = [
+            read_ensemble(ensemble_folder, dict(about), sub_goal).to(device) for sub_goal in about["sub_goals"]
+        ]
         if config.experience == "own" and not config.mask_reached:
             verdicts = MemberVerdicts(engine, ensembles)
         else:
             verdicts = Verdicts(learned_terminations(engine, ensembles), options)
         if hasattr(engine, "reachable"):
             verdicts.of(engine.reachable())  # most of what will be visited, judged at once
-    return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed)
+    return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed, device)
 
 
 def visited_by(engine: Engine, config: PlayConfig, seed: int) -> Visited | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
+from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -48,14 +49,16 @@ class MetaPolicy:
         options: the number of options, O.
         config: see :class:`MetaConfig`.
         seed: of weights, draws and minibatches.
+        device: where the networks are; options are drawn on the CPU.
     """
 
-    def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int):
+    def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int, device: torch.device | str = "cpu"):
         self.engine, self.options, self.config = engine, options, config
+        self.device = torch.device(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "meta-weights"))
-            self.network = NETWORKS[config.meta_network](engine.observation_shape, options)
-            self.head = HEADS[config.head](options)
+            self.network = NETWORKS[config.meta_network](engine.observation_shape, options).to(self.device)
+            self.head = HEADS[config.head](options).to(self.device)
         parameters = [*self.network.parameters(), *self.head.parameters()]
         self.parameters = parameters
         self.optimiser = torch.optim.Adam(parameters, lr=config.meta_learning_rate, eps=1e-5, fused=True)
@@ -70,7 +73,7 @@ class MetaPolicy:
     ) -> NDArray[np.int64]:
         """Draw an option for each of n environments in states ``ids`` among those offered, bool (n, O)."""
         with torch.no_grad():
-            scores = self._outputs(ids)[:, :-1]
+            scores = self._outputs(ids)[:, :-1].cpu()
             mask = torch.from_numpy(offered)
             options, drawn = self.head.draw(scores, mask, self.generator)
             log_prob = self.head.log_prob(scores, mask, drawn)[0]
@@ -83,7 +86,7 @@ class MetaPolicy:
     def best(self, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.int64]:
         """The preferred option in each state, without chance, int64 (n,)."""
         with torch.no_grad():
-            return self.head.best(self._outputs(ids)[:, :-1], torch.from_numpy(offered)).numpy()
+            return self.head.best(self._outputs(ids)[:, :-1].cpu(), torch.from_numpy(offered)).numpy()
 
     def record(self, outcome: Outcome) -> None:
         """The chosen options ended as ``outcome`` says."""
@@ -115,8 +118,8 @@ class MetaPolicy:
         states = np.array([decision.state for decision in flat])
         following = np.array([decision.next_state for decision in flat])
         with torch.no_grad():
-            values = self._outputs(states)[:, -1].double().numpy()
-            next_values = self._outputs(following)[:, -1].double().numpy()
+            values = self._outputs(states)[:, -1].double().cpu().numpy()
+            next_values = self._outputs(following)[:, -1].double().cpu().numpy()
         advantages = np.zeros(len(flat))
         start = 0
         for sequence in sequences:
@@ -131,17 +134,17 @@ class MetaPolicy:
                 config.gae_lambda,
             )
             start += len(sequence)
-        offered = torch.from_numpy(np.stack([decision.offered for decision in flat]))
-        drawn = torch.from_numpy(np.stack([decision.drawn for decision in flat]))
-        old = torch.tensor([decision.log_prob for decision in flat])
-        goal = torch.from_numpy(advantages + values).float()
-        scaled = torch.from_numpy(scaled_advantages(advantages, config.advantage_floor)).float()
+        offered = tensor(np.stack([decision.offered for decision in flat]), self.device)
+        drawn = tensor(np.stack([decision.drawn for decision in flat]), self.device)
+        old = tensor(np.array([decision.log_prob for decision in flat], dtype=np.float32), self.device)
+        goal = tensor(advantages + values, self.device).float()
+        scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
         entropy_seen = 0.0
         for epoch in range(config.epochs):
             order = self.rng.permutation(len(flat))
             for begin in range(0, len(flat), config.meta_batch):
                 rows = order[begin : begin + config.meta_batch]
-                pick = torch.from_numpy(rows)
+                pick = tensor(rows, self.device)
                 out = self._outputs(states[rows])
                 log_prob, entropy = self.head.log_prob(out[:, :-1], offered[pick], drawn[pick])
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
+from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -40,14 +41,18 @@ class Initiation:
         options: O.
         config: ``initiation_threshold`` and ``initiation_ignored``.
         seed: of weights and draws.
+        device: where the network is.
     """
 
-    def __init__(self, engine: Engine, options: int, config: OptionConfig, seed: int):
+    def __init__(
+        self, engine: Engine, options: int, config: OptionConfig, seed: int, device: torch.device | str = "cpu"
+    ):
         self.engine, self.options, self.config = engine, options, config
+        self.device = torch.device(device)
         self.rng = rng_for(seed, "initiation")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "initiation-weights"))
-            self.network = LightQNetwork(engine.observation_shape, options, actions=1)
+            self.network = LightQNetwork(engine.observation_shape, options, actions=1).to(self.device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=LEARNING_RATE, fused=True)
         self.states, self.option = np.zeros((2, KEPT), dtype=np.int64)
         self.reached = np.zeros(KEPT, dtype=np.bool_)
@@ -57,7 +62,8 @@ class Initiation:
     def chances(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
         """P(sub-goal reached before the timeout | state, option), float32 (n, O)."""
         with torch.no_grad():
-            found: NDArray[np.float32] = apply_to_states(self.network, self.engine, ids)[:, :, 0].sigmoid().numpy()
+            logits = apply_to_states(self.network, self.engine, ids)[:, :, 0].cpu()
+        found: NDArray[np.float32] = logits.sigmoid().numpy()
         return found
 
     def narrow(self, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -96,8 +102,8 @@ class Initiation:
 
     def _update(self, drawn: NDArray[np.int64]) -> dict[str, float]:
         logits = apply_to_states(self.network, self.engine, self.states[drawn])[:, :, 0]
-        own = logits.gather(1, torch.from_numpy(self.option[drawn])[:, None])[:, 0]
-        reached = torch.from_numpy(self.reached[drawn]).float()
+        own = logits.gather(1, tensor(self.option[drawn], self.device)[:, None])[:, 0]
+        reached = tensor(self.reached[drawn], self.device).float()
         loss = torch.nn.functional.binary_cross_entropy_with_logits(own, reached)
         where = f"of the initiation sets is {{}} after {self.count} executions"
         if not torch.isfinite(loss):

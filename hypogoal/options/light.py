@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
+from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -45,13 +46,17 @@ class LightLearner:
         verdicts: each option's termination classifier on states.
         config: see :class:`OptionConfig`.
         seed: of weights, exploration and sampling.
+        device: where the networks are.
 
     Raises:
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    def __init__(self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int):
+    def __init__(
+        self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int, device: torch.device | str = "cpu"
+    ):
         self.engine, self.verdicts, self.config = engine, verdicts, config
+        self.device = torch.device(device)
         self.own = config.experience == "own"
         if config.n_step > 1 and not self.own:
             raise UserError(
@@ -69,10 +74,10 @@ class LightLearner:
         self.ahead = StepsAhead(engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
-            self.online = LightQNetwork(engine.observation_shape, self.options, len(self.actions))
+            self.online = LightQNetwork(engine.observation_shape, self.options, len(self.actions)).to(self.device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
-        self.pixels = Pixels(engine, 2 * config.option_batch) if pictures else None
+        self.pixels = Pixels(engine, 2 * config.option_batch, self.device) if pictures else None
         self._copied = list(self.target.state_dict().values()), list(self.online.state_dict().values())
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         fields = {
@@ -115,7 +120,7 @@ class LightLearner:
     ) -> NDArray[np.int64]:
         """Actions int64 (E,) of the running options (E,) in states (E,)."""
         with torch.no_grad():
-            values = apply_to_states(self.online, self.engine, ids).numpy()
+            values = apply_to_states(self.online, self.engine, ids).cpu().numpy()
         chosen = values[np.arange(len(ids)), options].argmax(1)
         if explore:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
@@ -204,25 +209,25 @@ class LightLearner:
         if not self.config.bootstrap_timeout:
             terminal = terminal | (owner & batch["timeout"][:, None])
         learns = ~here & owner if self.own else ~here
-        ahead = torch.from_numpy(batch["steps"]).float()[:, None]
+        ahead = self._tensor(batch["steps"]).float()[:, None]
 
         values, next_online, next_target = self._values(s, following)
         with torch.no_grad():
             goal = double_q_targets(
-                torch.from_numpy(reached) * self.config.option_gamma ** (ahead - 1),
-                torch.from_numpy(terminal),
+                self._tensor(reached) * self.config.option_gamma ** (ahead - 1),
+                self._tensor(terminal),
                 next_online,
                 next_target,
                 self.config.option_gamma**ahead,
                 bounded=self.config.bounded_values,
             )
-        actions = torch.from_numpy(batch["a"].astype(np.int64))[:, None, None].expand(-1, self.options, 1)
+        actions = self._tensor(batch["a"].astype(np.int64))[:, None, None].expand(-1, self.options, 1)
         error = values.gather(2, actions).squeeze(2) - goal
-        error = error * torch.from_numpy(learns)
+        error = error * self._tensor(learns)
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
-        loss = (huber.sum(1) * torch.from_numpy(weights)).mean()
+        loss = (huber.sum(1) * self._tensor(weights)).mean()
         self._step(loss, huber.detach())
-        largest = error.detach().abs().amax(1).numpy()
+        largest = error.detach().abs().amax(1).cpu().numpy()
         self.replay.set_priorities(indices, largest[: len(indices)])
         return {"option_loss": float(loss.detach())}
 
@@ -239,6 +244,9 @@ class LightLearner:
             next_online = apply_to_states(self.online, self.engine, following)
             next_target = apply_to_states(self.target, self.engine, following)
         return values, next_online, next_target
+
+    def _tensor(self, values: NDArray[Any]) -> Tensor:
+        return tensor(values, self.device)
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
         """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.core.compute import tensor
 from hypogoal.domains.base import Engine
 
 CELL = 8  # pixels
@@ -40,7 +41,8 @@ class CellEmbedding(nn.Module):
         """The same from tile codes uint8 (N, cells) and the tiles uint8 (T, 8, 8, C) that they stand for."""
         if self._tiles is not tiles:
             self._tiles = tiles
-            self._pixels = torch.from_numpy(tiles.copy()).permute(0, 3, 1, 2).flatten(1).float() / 255.0
+            pixels = tensor(tiles.copy(), self.conv.weight.device)
+            self._pixels = pixels.permute(0, 3, 1, 2).flatten(1).float() / 255.0
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
         return nn.functional.embedding(codes.long(), table).flatten(1)
 
@@ -145,11 +147,12 @@ class PaperQNetwork(nn.Module):
 
 def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
     """A cell network's output on states of an engine: by tile codes where the engine has them, else by images."""
+    device = next(network.parameters()).device
     tiles = getattr(engine, "tiles", None)
     if tiles is not None:
-        codes = torch.from_numpy(engine.codes(ids))  # type: ignore[attr-defined]
+        codes = tensor(engine.codes(ids), device)  # type: ignore[attr-defined]
         return network.from_codes(codes, tiles)  # type: ignore[operator]
-    return network(torch.from_numpy(engine.images(ids)))
+    return network(tensor(engine.images(ids), device))
 
 
 class Pixels:
@@ -160,15 +163,19 @@ class Pixels:
     Args:
         engine: gives observations of state ids.
         most: pictures at once, at most.
+        device: where they are to be used; only on the CPU is the memory the same.
     """
 
-    def __init__(self, engine: Engine, most: int):
-        self.engine = engine
+    def __init__(self, engine: Engine, most: int, device: torch.device):
+        self.engine, self.device = engine, device
         self._images = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
-        self._pixels = torch.zeros(self._images.shape)
+        self._pixels = torch.zeros(self._images.shape) if device.type == "cpu" else None
 
     def of(self, ids: NDArray[np.int64]) -> Tensor:
         """float32 (n, H, W, C), 0 to 255, valid until the next call."""
         count = len(ids)
         self.engine.images(ids, self._images[:count])
-        return self._pixels[:count].copy_(torch.from_numpy(self._images[:count]))
+        images = torch.from_numpy(self._images[:count])
+        if self._pixels is None:
+            return images.to(self.device).float()
+        return self._pixels[:count].copy_(images)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
+from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -41,10 +42,12 @@ COUNTS = ("steps", "updates", "due", "positives", "steps_since_positive", "execu
 class Member:
     """One member's policy: networks, optimiser, replay of whole executions, counters."""
 
-    def __init__(self, engine: Engine, config: OptionConfig, seed: int, option: int, actions: int):
+    def __init__(
+        self, engine: Engine, config: OptionConfig, seed: int, option: int, actions: int, device: torch.device
+    ):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights", option))
-            self.online = PaperQNetwork(engine.observation_shape, actions)
+            self.online = PaperQNetwork(engine.observation_shape, actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
@@ -74,10 +77,13 @@ class RecurrentLearner:
     """The intra-option policies of all O options, each on its own.
 
     Args:
-        engine, verdicts, config, seed: as of :class:`hypogoal.options.light.LightLearner`.
+        engine, verdicts, config, seed, device: as of :class:`hypogoal.options.light.LightLearner`.
     """
 
-    def __init__(self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int):
+    def __init__(
+        self, engine: Engine, verdicts: Verdicts, config: OptionConfig, seed: int, device: torch.device | str = "cpu"
+    ):
+        self.device = torch.device(device)
         if config.experience != "own":
             raise UserError(
                 "the paper's network learns from its member's own executions only",
@@ -96,8 +102,9 @@ class RecurrentLearner:
         self._index[self.actions] = np.arange(len(self.actions))
         self.rng = rng_for(seed, "options")
         self.exploration = Exploration(config, engine.count, len(self.actions), self.rng)
-        self.members = [Member(engine, config, seed, option, len(self.actions)) for option in range(self.options)]
-        self.hidden = torch.zeros(engine.count, PaperQNetwork.HIDDEN)
+        count = len(self.actions)
+        self.members = [Member(engine, config, seed, option, count, self.device) for option in range(self.options)]
+        self.hidden = torch.zeros(engine.count, PaperQNetwork.HIDDEN, device=self.device)
         self.running: list[list[tuple[int, int, int, bool, bool]]] = [[] for _ in range(engine.count)]
 
     @staticmethod
@@ -126,14 +133,15 @@ class RecurrentLearner:
     ) -> NDArray[np.int64]:
         """Actions int64 (E,); moves each environment's hidden state one step on (BatchNorm in eval mode)."""
         chosen = np.empty(len(ids), dtype=np.int64)
-        self.hidden[torch.from_numpy(age == 0)] = 0.0
-        images = torch.from_numpy(self.engine.images(ids))
+        self.hidden[self._tensor(age == 0)] = 0.0
+        images = self._tensor(self.engine.images(ids))
         for option in np.unique(options):
-            rows = torch.from_numpy(np.flatnonzero(options == option))
+            places = np.flatnonzero(options == option)
+            rows = self._tensor(places)
             network = self.members[option].online.eval()
             values, hidden = network(network.embed(images[rows])[:, None], self.hidden[rows][None])
             self.hidden[rows] = hidden[0]
-            chosen[rows.numpy()] = values[:, 0].argmax(1).numpy()
+            chosen[places] = values[:, 0].argmax(1).cpu().numpy()
         if explore:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return self.actions[chosen]
@@ -204,31 +212,31 @@ class RecurrentLearner:
         states[rows, place + 1] = data["next"][indices]
 
         unique, inverse = np.unique(states, return_inverse=True)
-        images = torch.from_numpy(self.engine.images(unique))
-        places = torch.from_numpy(inverse.reshape(states.shape))
+        images = self._tensor(self.engine.images(unique))
+        places = self._tensor(inverse.reshape(states.shape))
         member.online.train()
         values = member.online(member.online.embed(images)[places])[0]
         with torch.no_grad():
             next_target = member.target(member.target.embed(images)[places])[0]
-        here, after = torch.from_numpy(place), torch.from_numpy(place + 1)
-        pick = torch.arange(len(indices))
+        here, after = self._tensor(place), self._tensor(place + 1)
+        pick = torch.arange(len(indices), device=self.device)
         terminal = data["terminal"][indices]
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]
         following = data["next"][indices].astype(np.int64)
         reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
         goal = double_q_targets(
-            torch.from_numpy(reached).float(),
-            torch.from_numpy(terminal),
+            self._tensor(reached).float(),
+            self._tensor(terminal),
             values[pick, after].detach(),
             next_target[pick, after],
             config.option_gamma,
             bounded=config.bounded_values,
         )
-        taken = values[pick, here, torch.from_numpy(data["a"][indices].astype(np.int64))]
+        taken = values[pick, here, self._tensor(data["a"][indices].astype(np.int64))]
         error = taken - goal
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
-        loss = (huber * torch.from_numpy(weights)).mean()
+        loss = (huber * self._tensor(weights)).mean()
         where = f"in the batch of its update {member.updates}, its step {member.steps}"
         if not torch.isfinite(loss):
             raise NumericalError(f"the loss of option {option} is {float(loss.detach())} {where}")
@@ -241,8 +249,11 @@ class RecurrentLearner:
         member.updates += 1
         if member.updates % config.target_interval == 0:
             follow(member.target, member.online, config.target_tau)
-        member.replay.set_priorities(indices, error.detach().abs().numpy())
+        member.replay.set_priorities(indices, error.detach().abs().cpu().numpy())
         return float(loss.detach())
+
+    def _tensor(self, values: NDArray[Any]) -> Tensor:
+        return tensor(values, self.device)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.core.compute import tensor
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.options.verdicts import Verdicts, learned_terminations
@@ -51,8 +52,9 @@ class MemberVerdicts(Verdicts):
         positions = self.engine.positions(ids) if ensemble.needs_positions else None  # type: ignore[attr-defined]
         seen = ensemble.see(self.engine.images(ids), positions)
         with torch.inference_mode():
-            chance = self._networks[option](as_input(torch.from_numpy(seen))).softmax(-1)[:, 1]
-            says_yes: NDArray[np.bool_] = (chance > ensemble.thresholds[member]).numpy()
+            images = as_input(tensor(seen, ensemble.thresholds.device))
+            chance = self._networks[option](images).softmax(-1)[:, 1]
+            says_yes: NDArray[np.bool_] = (chance > ensemble.thresholds[member]).cpu().numpy()
         return says_yes
 
     def snapshot(self) -> dict[str, Any]:

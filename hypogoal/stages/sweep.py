@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.compute import check_name
 from hypogoal.core.config import parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
@@ -67,7 +68,13 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
 
 
 def plan(
-    experiment: str, out: Path, *, preset: str | None = None, assignments: Iterable[str] = (), seeds: str | None = None
+    experiment: str,
+    out: Path,
+    *,
+    preset: str | None = None,
+    assignments: Iterable[str] = (),
+    seeds: str | None = None,
+    device: str = "auto",
 ) -> Plan:
     """The cells of an experiment.
 
@@ -77,24 +84,28 @@ def plan(
         preset: of a named experiment; a figure has its own.
         assignments: ``KEY=VALUE`` or ``STAGE.KEY=VALUE``; of an own experiment ``AXIS=VALUES``.
         seeds: the run seeds, ``0-9``.
+        device: of the training stages.
 
     Raises:
-        UserError: unknown experiment or preset, or a setting that no stage has.
+        UserError: unknown experiment or preset, a setting that no stage has, or no such device.
     """
+    check_name(device)
     assignments = [*assignments]
     if experiment.endswith(".toml"):
         if preset is not None:
             raise UserError("an own experiment takes no preset", preset, "Write --preset into its commands.")
+        if device != "auto":
+            raise UserError("an own experiment takes no device", device, "Write --device into its commands.")
         return own_plan(Path(experiment), out, assignments + ([f"seed={seeds}"] if seeds else []))
     name, own_preset = FIGURES.get(experiment, (experiment, None))
     if name not in EXPERIMENTS:
         known = ", ".join([*EXPERIMENTS, *FIGURES])
         raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
     chosen = assignments + ([f"seeds={seeds}"] if seeds else [])
-    return _named_plan(name, out, preset or own_preset, chosen)
+    return _named_plan(name, out, preset or own_preset, chosen, device)
 
 
-def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Sequence[str]) -> Plan:
+def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Sequence[str], device: str) -> Plan:
     found = EXPERIMENTS[experiment]
     own, by_stage = _split(assignments)
     config = resolve(found.RunConfig, stage="run", preset=preset, assignments=own, domain=found.DOMAIN)
@@ -116,6 +127,7 @@ def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Seq
         stage: (
             *(("--preset", preset) if preset else ()),
             *(x for pair in by_stage.get(stage, ()) for x in ("--set", pair)),
+            *(("--device", device) if device != "auto" and stage in CONFIGS else ()),
         )
         for stage in found.STAGES
     }

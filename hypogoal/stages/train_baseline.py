@@ -73,7 +73,7 @@ def train_baseline(
     from hypogoal.learners.baselines.engine_env import EngineEnv
     from hypogoal.learners.baselines.settings import hyperparameters
 
-    prepare(device)
+    device = prepare(device)
     claim(out, force=force, resume=resume)
     played = load_domain(domain, given=True)
     chosen = hyperparameters(config.agent, config.setting)
@@ -94,7 +94,7 @@ def train_baseline(
             report = _Report(MetricsLog(folder / "metrics.jsonl"), progress)
             if not checkpoints.saved:
                 report.log.restore(0)
-            agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL, checkpoints)
+            agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL, checkpoints, device)
             progress.update(config.steps)
         report.log.close()
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:

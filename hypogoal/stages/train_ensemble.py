@@ -67,7 +67,7 @@ def train_ensemble(
         UserError: unknown sub-goal, unusable data, or ``out`` exists.
         NumericalError: a loss became NaN or Inf.
     """
-    prepare(device)
+    device = prepare(device)
     with given(config.diversity, config.network):
         load_objective(config.diversity)
         load_network(config.network)
@@ -91,7 +91,7 @@ def train_ensemble(
     with create_artefact(
         out, kind="ensemble", config=about, seed=seed, inputs=[data, *others], force=force, resume=resume
     ) as folder:
-        jobs = [partial(_train_one, data, others, sub_goal, config, seed, folder) for sub_goal in sub_goals]
+        jobs = [partial(_train_one, data, others, sub_goal, config, seed, folder, device) for sub_goal in sub_goals]
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
         (folder.parent / FOLDER).mkdir(exist_ok=True)
         with Progress("train-ensemble", total=len(jobs), quiet=quiet) as progress:
@@ -159,7 +159,13 @@ class _Report:
 
 
 def _train_one(
-    data: Path, others: Sequence[Path], sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path
+    data: Path,
+    others: Sequence[Path],
+    sub_goal: str,
+    config: TrainEnsembleConfig,
+    seed: int,
+    folder: Path,
+    device: str,
 ) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
@@ -180,6 +186,7 @@ def _train_one(
             report,
             origins=split.origins,
             unlabelled_origins=origins,
+            device=device,
             checkpoints=checkpoints,
         )
     write_ensemble(folder, sub_goal, ensemble)

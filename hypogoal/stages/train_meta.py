@@ -71,7 +71,7 @@ def train_meta(
     Returns:
         Steps, episodes, and success and length over the last 100 episodes.
     """
-    prepare(device)
+    device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
     trained = open_artefact(options, "options").whole() if options else None
     if trained:
@@ -80,7 +80,7 @@ def train_meta(
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
-    engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
+    engine, verdicts, learner = build(domain, source.path, source.config, config, seed, device)
     about = as_dict(config) | {
         "sub_goals": source.config["sub_goals"],
         "members": verdicts.options // len(source.config["sub_goals"]),
@@ -98,9 +98,11 @@ def train_meta(
             learner.load(load_tensors(trained.path / "options.safetensors"))
             recorder.episodes = read_episodes(trained.path / "episodes.csv")
             recorder.start_at(trained.config["steps"])
-        policy = MetaPolicy(engine, verdicts.options, config, seed) if config.chooser == "ppo" else None
+        policy = MetaPolicy(engine, verdicts.options, config, seed, device) if config.chooser == "ppo" else None
         chooser: Chooser = policy or RandomChooser(rng_for(seed, "random-choice"))
-        initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        initiation = (
+            Initiation(engine, verdicts.options, config, seed, device) if config.initiation == "learned" else None
+        )
         if trained and initiation and "initiation.safetensors" in trained.manifest["files"]:
             initiation.load(load_tensors(trained.path / "initiation.safetensors"))
         visited = visited_by(engine, config, seed)

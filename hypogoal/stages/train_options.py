@@ -62,13 +62,13 @@ def train_options(
         Steps, episodes, and success and length over the last 100 episodes of random choice; where each option begins
         an episode, instead of these two the shares of ``recorder.recent``.
     """
-    prepare(device)
+    device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
     claim(out, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-options", out, play_needs(domain, source.config, config), quiet=quiet)
-    engine, verdicts, learner = build(domain, source.path, source.config, config, seed)
+    engine, verdicts, learner = build(domain, source.path, source.config, config, seed, device)
     members = verdicts.options // len(source.config["sub_goals"])
     steps = config.steps * (verdicts.options if config.steps_for == "each" else 1)
     about = as_dict(config) | {
@@ -85,7 +85,9 @@ def train_options(
         recorder = Recorder(verdicts.options)
         rng = rng_for(seed, "random-choice")
         chooser = RandomChooser(rng) if config.chooser == "random" else EvenChooser(verdicts.options, rng)
-        initiation = Initiation(engine, verdicts.options, config, seed) if config.initiation == "learned" else None
+        initiation = (
+            Initiation(engine, verdicts.options, config, seed, device) if config.initiation == "learned" else None
+        )
         visited = visited_by(engine, config, seed)
         loop = OptionLoop(
             engine, verdicts, learner, chooser, recorder, config, gamma=1.0, initiation=initiation, visited=visited

@@ -4,49 +4,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import corridor_env
 import pytest
 import torch
-from corridor import Corridor, LongCorridor
+from corridor import Corridor
+from loops import CASES, loop_of
 
 from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.core.seeding import rng_for
 from hypogoal.meta import playing
-from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.choosers import EvenChooser, RandomChooser
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
-from hypogoal.options.initiation import Initiation
-from hypogoal.options.recording import Recorder
-from hypogoal.options.verdicts import Verdicts, oracle_terminations
 
-QUICK = {
-    "environments": 3,
-    "warm_up": 40,
-    "update_interval": 4,
-    "option_batch": 16,
-    "epsilon_steps": 200,
-    "replay": 150,
-}
-OWN = {"experience": "own", "mask_reached": False}
-FAR = {**OWN, "n_step": 3, "exploration": "persistent", "restart_options": True, "option_timeout": 6}
-
-
-def gymnasium_corridor(count: int) -> Any:
-    """Environments that nobody can save: their episodes are played again."""
-    return corridor_env.DOMAIN.make_engine(0, count, 30)
-
-
-CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
-    "light, shared, ppo": (Corridor, "light", {"initiation": "learned"}, "ppo"),
-    "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
-    "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
-    "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
-    "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
-}
 STEPS, BREAKS = 300, (23, 51, 80)  # environment steps, and the steps of the loop after which it breaks
 
 
@@ -67,22 +35,6 @@ class Breaking(Checkpoints):
             self.save(state())
         if self.steps == self.last + 5:
             raise Broken
-
-
-def loop_of(case: str) -> OptionLoop:
-    engine_class, network, changes, chooser_name = CASES[case]
-    config = OptionConfig(**{"option_timeout": 10, **QUICK, **changes})  # type: ignore[arg-type]
-    engine = engine_class(3)
-    verdicts = Verdicts(oracle_terminations(engine), 2)
-    learner = playing.LEARNERS[network](engine, verdicts, config, seed=1)
-    chooser = RandomChooser(rng_for(0, "choice"))
-    if chooser_name == "even":
-        chooser = EvenChooser(2, rng_for(0, "choice"))
-    elif chooser_name != "random":
-        head = "gaussian" if chooser_name == "gaussian" else "categorical"
-        chooser = MetaPolicy(engine, 2, MetaConfig(head=head, decisions=16, meta_batch=8), 2)  # type: ignore[assignment]
-    initiation = Initiation(engine, 2, config, seed=3) if config.initiation == "learned" else None
-    return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, 100), config, gamma=0.9, initiation=initiation)
 
 
 def run(case: str, folder: Path, checkpoints: Checkpoints) -> OptionLoop:

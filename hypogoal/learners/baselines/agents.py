@@ -114,7 +114,7 @@ def check_finite(model: BaseAlgorithm, step: int) -> None:
             raise NumericalError(f"NaN or Inf in {type(model).__name__}'s {name} at step {step}")
 
 
-def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int) -> BaseAlgorithm:
+def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int, device: str = "cpu") -> BaseAlgorithm:
     """A fresh agent with the hyperparameters ``chosen``."""
     policy: dict[str, Any] = {
         "features_extractor_class": NETWORKS[chosen.network],
@@ -127,6 +127,8 @@ def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int) -> 
         with warnings.catch_warnings():
             # Table 5's 100 decisions do not divide into batches of 64: the second one has 36.
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
+            # Advice to use the CPU, which is for who chose the device.
+            warnings.filterwarnings("ignore", message="You are trying to run PPO on the GPU")
             agent = PPO(
                 "MlpPolicy",
                 env,
@@ -140,7 +142,7 @@ def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int) -> 
                 ent_coef=chosen.entropy,
                 policy_kwargs=policy,
                 seed=seed_for(seed, "agent") % 2**32,
-                device="cpu",
+                device=device,
             )
     else:
         agent = ExploringDQN(
@@ -156,7 +158,7 @@ def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int) -> 
             target_update_interval=chosen.target_interval * env.num_envs,  # it counts environment steps
             policy_kwargs=policy,
             seed=seed_for(seed, "agent") % 2**32,
-            device="cpu",
+            device=device,
         )
         agent.explore_rng = rng_for(seed, "explore")
         agent.chosen = chosen
@@ -172,6 +174,7 @@ def train(
     report: Report | None = None,
     interval: int = 5_000,
     checkpoints: Checkpoints | None = None,
+    device: str = "cpu",
 ) -> BaseAlgorithm:
     """Spec E7: train a fresh agent for ``steps`` environment steps (rounded up to whole rollouts).
 
@@ -184,6 +187,7 @@ def train(
         interval: steps.
         checkpoints: spec G1; ``report`` is part of them where it has ``snapshot`` and ``restore``. Of no use where the
             engine has no ``snapshot``.
+        device: where the agent's networks are.
 
     Returns:
         The trained agent.
@@ -194,7 +198,7 @@ def train(
     if checkpoints is None or not hasattr(env.engine, "snapshot"):
         checkpoints = Checkpoints(None)
     with own_randomness():
-        agent = make_agent(env, chosen, seed)
+        agent = make_agent(env, chosen, seed, device)
         watch = _Watch(env, report, interval, checkpoints)
         if isinstance(agent, ExploringDQN):
             agent.exploration_schedule = lambda _: epsilon(agent.chosen, env.steps, watch.first_goal)

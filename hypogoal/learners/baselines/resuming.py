@@ -79,6 +79,7 @@ def _generators(agent: BaseAlgorithm) -> dict[str, Any]:
         "python": random.getstate(),
         "actions": agent.action_space.np_random.bit_generator.state,
         "own": own.bit_generator.state if own is not None else None,
+        "cuda": torch.cuda.get_rng_state() if agent.device.type == "cuda" else None,
     }
 
 
@@ -88,5 +89,7 @@ def _restore_generators(agent: BaseAlgorithm, snapshot: Mapping[str, Any]) -> No
     version, numbers, gauss = snapshot["python"]
     random.setstate((version, tuple(numbers), gauss))
     agent.action_space.np_random.bit_generator.state = snapshot["actions"]
+    if snapshot.get("cuda") is not None:
+        torch.cuda.set_rng_state(snapshot["cuda"])
     if snapshot["own"] is not None:
         agent.explore_rng.bit_generator.state = snapshot["own"]  # type: ignore[attr-defined]

@@ -1,0 +1,71 @@
+"""Spec G5: ensembles are trained and asked on another device than the CPU."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from corridor import Corridor
+from far_device import FAR, FarTensor, far_device
+
+from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.training import fit
+from hypogoal.options.running import MemberVerdicts
+
+SHAPE = (41, 41, 3)
+CASES = {
+    "dbat, members together": {"diversity": "dbat", "unlabelled_bn": True},
+    "divdis, one after another, threshold": {
+        "diversity": "divdis",
+        "schedule": "sequential",
+        "threshold": "unlabelled-q95",
+    },
+    "changed shades": {"diversity": "none", "augment": "grey"},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    """Spec C, G1: images without repeated patches, which only the CPU looks for: the same bytes."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(256, size=(90, *SHAPE), dtype=np.uint8)
+    labels = np.arange(60) < 20
+    config = EnsembleConfig(members=2, steps=6, batch_size=8, **CASES[case])  # type: ignore[arg-type]
+    train = partial(fit, images[:60], labels, images[60:], config, 1)
+    near = train()
+    with far_device(monkeypatch):
+        far = train(device=FAR, checkpoints=Checkpoints(tmp_path / "far"))
+        assert all(isinstance(weight, FarTensor) for weight in far.parameters())
+        state = far.state()
+        np.testing.assert_array_equal(far.predict(images), near.predict(images))
+        again = train(device=FAR, checkpoints=Checkpoints(tmp_path / "far"))  # finished: nothing is left to do
+    for name, value in near.state().items():
+        assert torch.equal(value, state[name]), name
+        assert torch.equal(value, again.state()[name]), name
+
+
+def test_another_device_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec D1: few states, many states, all members at once and the running one's alone."""
+
+    class Wide(Corridor):
+        observation_shape = (48, 64, 3)
+
+    engine = Wide(2)
+    ids = np.arange(engine.n_states)
+    options = np.array([0, 1, 2, 3, 0, 1])
+    ensembles = [
+        Ensemble("doorkey", engine.observation_shape, 2, torch.Generator().manual_seed(g)).eval() for g in (0, 1)
+    ]
+    images = np.random.default_rng(0).integers(256, size=(300, *engine.observation_shape), dtype=np.uint8)
+    wanted = StackedMembers(ensembles).predict(engine.images(ids))
+    running = MemberVerdicts(engine, ensembles).running(ids, options)
+    many = ensembles[0].predict(images)
+    with far_device(monkeypatch):
+        for ensemble in ensembles:
+            ensemble.to(FAR)
+        np.testing.assert_array_equal(StackedMembers(ensembles).predict(engine.images(ids)), wanted)
+        np.testing.assert_array_equal(MemberVerdicts(engine, ensembles).running(ids, options), running)
+        np.testing.assert_allclose(ensembles[0].predict(images), many, rtol=1e-5)

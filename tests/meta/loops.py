@@ -1,0 +1,61 @@
+"""Ways to play and learn options, each of them small: light and paper's, shared and own experience, every chooser."""
+
+from collections.abc import Callable
+from typing import Any
+
+import corridor_env
+from corridor import Corridor, LongCorridor
+
+from hypogoal.core.seeding import rng_for
+from hypogoal.meta import playing
+from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.choosers import EvenChooser, RandomChooser
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import OptionLoop
+from hypogoal.options.initiation import Initiation
+from hypogoal.options.recording import Recorder
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+QUICK = {
+    "environments": 3,
+    "warm_up": 40,
+    "update_interval": 4,
+    "option_batch": 16,
+    "epsilon_steps": 200,
+    "replay": 150,
+}
+OWN = {"experience": "own", "mask_reached": False}
+FAR = {**OWN, "n_step": 3, "exploration": "persistent", "restart_options": True, "option_timeout": 6}
+
+
+def gymnasium_corridor(count: int) -> Any:
+    """Environments that nobody can save: their episodes are played again."""
+    return corridor_env.DOMAIN.make_engine(0, count, 30)
+
+
+CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
+    "light, shared, ppo": (Corridor, "light", {"initiation": "learned"}, "ppo"),
+    "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
+    "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
+    "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
+    "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
+}
+
+
+def loop_of(case: str, device: str = "cpu") -> OptionLoop:
+    """Options that are played and learned, of the case, from the same seeds each time."""
+    engine_class, network, changes, chooser_name = CASES[case]
+    config = OptionConfig(**{"option_timeout": 10, **QUICK, **changes})  # type: ignore[arg-type]
+    engine = engine_class(3)
+    verdicts = Verdicts(oracle_terminations(engine), 2)
+    learner = playing.LEARNERS[network](engine, verdicts, config, seed=1, device=device)
+    chooser = RandomChooser(rng_for(0, "choice"))
+    if chooser_name == "even":
+        chooser = EvenChooser(2, rng_for(0, "choice"))
+    elif chooser_name != "random":
+        head = "gaussian" if chooser_name == "gaussian" else "categorical"
+        meta = MetaConfig(head=head, decisions=16, meta_batch=8)
+        chooser = MetaPolicy(engine, 2, meta, 2, device)  # type: ignore[assignment]
+    initiation = Initiation(engine, 2, config, seed=3, device=device) if config.initiation == "learned" else None
+    return OptionLoop(engine, verdicts, learner, chooser, Recorder(2, 100), config, gamma=0.9, initiation=initiation)

@@ -1,0 +1,102 @@
+"""Spec G5: every training stage on another device than the CPU leaves the same files."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from far_device import FAR, far_device
+
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_tensors
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.stages import train_baseline, train_ensemble, train_meta, train_options
+from hypogoal.stages.collect import collect
+
+QUIET = {"quiet": True, "seed": 3}
+SHORT: dict[str, Any] = {
+    "steps": 192, "max_episode_steps": 30, "option_timeout": 7, "random_episodes": 1, "warm_up": 32, "replay": 200,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Data, and an ensemble that was made on the CPU."""
+    made = tmp_path_factory.mktemp("made")
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,)), made / "data.h5", **QUIET)
+    ensemble(made / "data.h5", made / "ensemble")
+    return made
+
+
+def ensemble(data: Path, out: Path) -> None:
+    config = train_ensemble.TrainEnsembleConfig(steps=3, members=2, workers=1, sub_goals=("open-red-door",))
+    train_ensemble.train_ensemble(data, config, out, device="cuda" if out.name == "far" else "cpu", **QUIET)
+
+
+def options(made: Path, out: Path) -> None:
+    config = train_options.TrainOptionsConfig(**SHORT)
+    train_options.train_options(made / "ensemble", config, out, device=out.name, **QUIET)
+
+
+def meta(made: Path, out: Path) -> None:
+    config = train_meta.TrainMetaConfig(**SHORT, decisions=32, meta_batch=16, initiation="learned")
+    train_meta.train_meta(made / "ensemble", config, out, device=out.name, **QUIET)
+
+
+def baseline(agent: str, made: Path, out: Path) -> None:
+    config = train_baseline.BaselineConfig(
+        agent=agent, setting="tuned", steps=1_200, max_episode_steps=30, random_episodes=1
+    )
+    train_baseline.train_baseline("doorkey", config, out, device=out.name, **QUIET)
+
+
+CASES: dict[str, tuple[Any, Callable[[Path, Path], None]]] = {
+    "train-ensemble": (train_ensemble, lambda made, out: ensemble(made / "data.h5", out)),
+    "train-options": (train_options, options),
+    "train-meta": (train_meta, meta),
+    "train-baseline, ppo": (train_baseline, partial(baseline, "ppo")),
+    "train-baseline, dqn": (train_baseline, partial(baseline, "dqn")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_same_files(case: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G5: whole artefacts with the same tensors; learners' bytes are compared elsewhere."""
+    module, train = CASES[case]
+    train(made, tmp_path / "cpu")
+    with far_device(monkeypatch):
+        monkeypatch.setattr(module, "prepare", lambda device="auto": FAR)
+        train(made, tmp_path / "far")
+    near, far = (open_artefact(tmp_path / name).whole() for name in ("cpu", "far"))
+    assert near.manifest["files"].keys() == far.manifest["files"].keys()
+    for name in near.manifest["files"]:
+        if name.endswith(".safetensors"):
+            one, other = load_tensors(near.path / name), load_tensors(far.path / name)
+            assert {key: (value.shape, value.dtype) for key, value in one.items()} == {
+                key: (value.shape, value.dtype) for key, value in other.items()
+            }
+            if case in ("train-options", "train-meta"):
+                assert all(torch.allclose(value.double(), other[key].double(), atol=1e-4) for key, value in one.items())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_no_gpu_is_one_line(made: Path, tmp_path: Path) -> None:
+    """Spec G2, G5: and nothing is written."""
+    with pytest.raises(UserError, match="torch finds no GPU"):
+        options(made, tmp_path / "cuda")
+    assert not (tmp_path / "cuda").exists()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("case", CASES)
+def test_on_a_gpu(case: str, made: Path, tmp_path: Path) -> None:
+    """Spec G5, G8: the real thing, where there is one."""
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    CASES[case][1](made, tmp_path / ("far" if case == "train-ensemble" else "cuda"))
+    CASES[case][1](made, tmp_path / "cpu")
+    near, far = (open_artefact(path).whole() for path in sorted(tmp_path.iterdir()))
+    assert near.manifest["files"].keys() == far.manifest["files"].keys()
