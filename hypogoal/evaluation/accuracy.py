@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 Scores = dict[str, NDArray[np.float64]]
 METRICS = ("balanced_accuracy", "precision", "recall", "accuracy", "f1")
@@ -39,6 +40,25 @@ def member_scores(verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]) -> Sco
         "accuracy": _ratio(hits + rejections, np.full_like(hits, len(labels))),
         "f1": _ratio(2 * hits, 2 * hits + false_alarms + misses),
     }
+
+
+def ranking(probabilities: NDArray[np.float32], labels: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """How well members tell positives from negatives whatever their thresholds: the area under the ROC curve.
+
+    Args:
+        probabilities: float (N, K), that the sub-goal is reached.
+        labels: bool (N,), it is.
+
+    Returns:
+        float64 (K,): the share of pairs of a positive and a negative in which the positive has the higher probability,
+        ties counted half; NaN where there are no such pairs.
+    """
+    positives = int(labels.sum())
+    pairs = positives * (len(labels) - positives)
+    if not pairs:
+        return np.full(probabilities.shape[1], np.nan)
+    ranks: NDArray[np.float64] = rankdata(probabilities, axis=0)[labels].sum(axis=0)
+    return (ranks - positives * (positives + 1) / 2) / pairs
 
 
 def _ratio(numerator: NDArray[np.int64], denominator: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -17,6 +17,11 @@ QUANTITIES: dict[str, dict[str, str]] = {
     "recall": {"unit": "fraction", "meaning": "share of positives that a member calls positive"},
     "accuracy": {"unit": "fraction", "meaning": "share of states that a member calls right"},
     "f1": {"unit": "fraction", "meaning": "harmonic mean of precision and recall; misleads where positives abound"},
+    "ranking": {
+        "unit": "fraction",
+        "meaning": "share of pairs of a positive and a negative in which a member gives the positive the higher "
+        "probability: the area under the ROC curve, whatever the threshold",
+    },
     "says_yes_unlabelled": {"unit": "fraction", "meaning": "share of unlabelled states that a member calls positive"},
     "disagreement": {"unit": "fraction", "meaning": "share of states on which two members' verdicts differ"},
     "success": {"unit": "fraction", "meaning": "share of the last 100 training episodes that reached the goal"},

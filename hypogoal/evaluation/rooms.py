@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
-from hypogoal.evaluation.accuracy import METRICS, best_mean_worst, member_scores
+from hypogoal.evaluation.accuracy import best_mean_worst, member_scores, ranking
 from hypogoal.evaluation.ensembles import ensemble_names
 from hypogoal.evaluation.statistics import aggregate_with_deviation
 
@@ -25,6 +25,7 @@ SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
 TABLED = ("unseen", "all")  # scopes of the table and of Figure 3
 FIGURE = ("balanced_accuracy", "accuracy")  # scores of the table
+SCORED = (*FIGURE, "ranking")  # of which best, mean, ... are told
 WHICH = ("best", "validated", "mean", "worst")
 
 
@@ -33,6 +34,7 @@ def room_metrics(
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
     kinds: Sequence[str] = (),
+    probabilities: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
     """Spec F1: one ensemble's members by whether training saw the room.
 
@@ -41,11 +43,12 @@ def room_metrics(
         labels: bool (N,), theirs.
         origins: int (N,) each: ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``.
         kinds: names of the values of ``kind``.
+        probabilities: float (N, K), what the verdicts were made of; without them there is no ``ranking``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
-        of accuracy and balanced accuracy; ``validated``: which member the rooms of labelled groups pick; ``by_room``;
-        ``false_positives``. NaN where not defined.
+        of accuracy, balanced accuracy and ``ranking`` (see ``accuracy.ranking``); ``validated``: which member the rooms
+        of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
     """
     seen, rooms = origins["seen"], origins.get("room")
     validated = choose(verdicts, labels, seen)
@@ -53,15 +56,19 @@ def room_metrics(
     for name, values in SCOPES.items():
         inside = np.isin(seen, values)
         scores = member_scores(verdicts[inside], labels[inside])
+        if probabilities is not None:
+            scores["ranking"] = ranking(probabilities[inside], labels[inside])
         scopes[name] = {
             "states": int(inside.sum()),
             "positives": int(labels[inside].sum()),
             "rooms": [] if rooms is None else np.unique(rooms[inside]).tolist(),
             "members": [
-                {"member": member, **{score: float(scores[score][member]) for score in METRICS}}
+                {"member": member, **{score: float(scores[score][member]) for score in scores}}
                 for member in range(verdicts.shape[1])
             ],
-            "scores": {score: with_validated(scores[score], validated["member"]) for score in FIGURE},
+            "scores": {
+                score: with_validated(scores[score], validated["member"]) for score in SCORED if score in scores
+            },
         }
     return {
         "scopes": scopes,
@@ -182,7 +189,8 @@ def rooms_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                             which: over([own[scope]["scores"][score][which] for own in scopes], score, scope, which)
                             for which in WHICH
                         }
-                        for score in FIGURE
+                        for score in SCORED
+                        if all(score in own[scope]["scores"] for own in scopes)
                     }
                     for scope in TABLED
                 },

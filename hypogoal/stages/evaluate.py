@@ -144,7 +144,7 @@ def evaluate_ensembles(
         layouts = split.origins.get("layout_seed")
         row = sub_goal_metrics(case.sub_goal, judged.verdicts, split.labels, layouts, judged.told)
         if "seen" in split.origins:
-            row["rooms"] = room_metrics(judged.verdicts, split.labels, split.origins, kinds)
+            row["rooms"] = room_metrics(judged.verdicts, split.labels, split.origins, kinds, judged.probabilities)
         rows[index].append(row)
         both = (judged.probabilities, judged.verdicts)
         if index == shown:

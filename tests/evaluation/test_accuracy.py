@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.accuracy import METRICS, best_mean_worst, member_scores, scores_by_layout
+from hypogoal.evaluation.accuracy import METRICS, best_mean_worst, member_scores, ranking, scores_by_layout
 from hypogoal.evaluation.disagreement import mean_disagreement, pairwise_disagreement
 from hypogoal.evaluation.examples import overlay, pick_examples
 from hypogoal.evaluation.selection import most_and_least, preference, rank_correlation, rank_correlations, shares
@@ -127,3 +127,13 @@ def test_overlay_keeps_what_is_shared():
     states[:, 0, 0] = 200
     states[0, 0, 1] = 200
     assert overlay(states)[0, :, 0].tolist() == [200, 113]
+
+
+def test_ranking_is_the_share_of_pairs_in_order():
+    """Spec F1: worked by hand: 2 positives, 3 negatives; ties count half; no threshold matters."""
+    labels = np.array([True, True, False, False, False])
+    probabilities = np.array([[0.9, 0.1, 0.5], [0.8, 0.4, 0.5], [0.7, 0.2, 0.5], [0.1, 0.3, 0.5], [0.2, 0.9, 0.5]])
+    assert ranking(probabilities, labels).tolist() == pytest.approx([1, 2 / 6, 1 / 2])
+    assert ranking(probabilities / 100, labels).tolist() == pytest.approx([1, 2 / 6, 1 / 2])
+    assert np.isnan(ranking(probabilities[:2], labels[:2])).all()
+    assert np.isnan(ranking(probabilities[:0], labels[:0])).all()

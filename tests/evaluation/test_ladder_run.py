@@ -15,7 +15,7 @@ from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation import judging
-from hypogoal.evaluation.accuracy import member_scores
+from hypogoal.evaluation.accuracy import member_scores, ranking
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.stages.evaluate import evaluate, summary_table
 from hypogoal.stages.report import draw_figures, report
@@ -55,7 +55,8 @@ def test_members_are_judged_room_by_room(run, metrics):
     assert (ensemble["method"], ensemble["groups"], ensemble["name"]) == ("dbat, K=2", 2, "dbat, K=2, groups=2")
     source = open_artefact(run / ensemble["path"])
     split = open_dataset(run / "data/groups-2.h5").heldout(SUB_GOAL)
-    yes = read_ensemble(source.path, source.config, SUB_GOAL).predict(split.observations) > 0.5
+    probabilities = read_ensemble(source.path, source.config, SUB_GOAL).predict(split.observations)
+    yes = probabilities > 0.5
     rooms = ensemble["sub_goals"][0]["rooms"]
     for name, inside in (
         ("unseen", np.isin(split.origins["room"], (9, 20))),
@@ -63,7 +64,8 @@ def test_members_are_judged_room_by_room(run, metrics):
         ("labelled", np.isin(split.origins["room"], (1, 2, 6))),
     ):
         scores = member_scores(yes[inside], split.labels[inside])
-        for score in ("accuracy", "balanced_accuracy", "recall"):
+        scores["ranking"] = ranking(probabilities[inside], split.labels[inside])
+        for score in ("accuracy", "balanced_accuracy", "recall", "ranking"):
             found = [member[score] for member in rooms["scopes"][name]["members"]]
             assert found == pytest.approx(scores[score].tolist())
         if name == "labelled":

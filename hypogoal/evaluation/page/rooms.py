@@ -216,6 +216,7 @@ def _intervals(rows: Sequence[Mapping[str, Any]]) -> Block:
 def _differences(rows: Sequence[Mapping[str, Any]]) -> Block:
     lines, last = [], ""
     for entry in rows:
+        ranked = entry["scores"]["unseen"].get("ranking")  # which an evaluation of before does not have
         lines.append(
             row(
                 entry["method"] if entry["method"] != last else "",
@@ -223,17 +224,29 @@ def _differences(rows: Sequence[Mapping[str, Any]]) -> Block:
                 deviation(entry["disagreement_unlabelled"], 3),
                 deviation(entry["disagreement_heldout"], 3),
                 fixed(entry["tied"], 1),
+                *(deviation(ranked[which], 3) if ranked else "–" for which in ("best", "mean", "worst")),
                 mark="first" if entry["method"] != last else "",
             )
         )
         last = entry["method"]
     return table(
-        ("method", "N", "disagree, unlabelled", "disagree, held-out", "tied on validation"),
+        (
+            "method",
+            "N",
+            "disagree, unlabelled",
+            "disagree, held-out",
+            "tied on validation",
+            "ranking, best",
+            "ranking, mean",
+            "ranking, worst",
+        ),
         lines,
         texts=2,
         tight=True,
-        heading="How different the members are",
+        heading="How different the members are, and what they know",
         caption="Share of states on which two members' verdicts differ, mean over pairs; mean over seeds ± standard "
         "deviation. Tied: members with the same, highest balanced accuracy in the rooms of labelled groups, of which "
-        "the first counts as validated; where all are tied, validation chooses nothing.",
+        "the first counts as validated; where all are tied, validation chooses nothing. Ranking: share of pairs of a "
+        "positive and a negative of unseen rooms in which a member gives the positive the higher probability (area "
+        "under the ROC curve); what lies between that and balanced accuracy is where its threshold is.",
     )
