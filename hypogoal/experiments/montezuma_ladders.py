@@ -23,10 +23,10 @@ STAGES = ("collect", "train-ensemble", "train-options")
 # member, per localiser learned, per environment step of an option, per member that is evaluated.
 PER_COLLECTION = 30.0
 PLAYING = 6  # rooms that a collection plays in at once, at the most
-PER_MEMBER_STEP = {"montezuma": 0.11, "montezuma-crop": 0.01}
+PER_MEMBER_STEP = {"montezuma": 0.08, "montezuma-crop": 0.01}
 PER_LOCALISER = 90.0
 PER_STEP = {"light": 2.5e-3, "paper": 4.0}
-PER_EVALUATED_MEMBER = 4.0
+PER_EVALUATED_MEMBER = 3.0
 EVALUATING = 6  # ensembles that an evaluation judges at once, at the most
 
 METHODS: dict[str, tuple[str, ...]] = {
