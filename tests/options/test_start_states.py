@@ -292,7 +292,7 @@ def test_pixels_are_the_images() -> None:
         engine.step(np.array([LEFT, RIGHT, STAY]))
     ids = np.arange(1, engine.n_states)
     torch.manual_seed(0)
-    network, pixels = LightQNetwork(engine.observation_shape, 2, 4), Pixels(engine, 50)
+    network, pixels = LightQNetwork(engine.observation_shape, 2, 4), Pixels(engine, 50, torch.device("cpu"))
     expected = network(torch.from_numpy(engine.images(ids)))
     torch.testing.assert_close(network(pixels.of(ids)), expected)
     # Scaled weights are the same function as scaled pixels.
