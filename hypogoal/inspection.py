@@ -14,6 +14,12 @@ from hypogoal.domains.base import installed_domain
 
 def describe_path(path: Path) -> dict[str, Any]:
     """Kind, configuration, inputs and numbers of a data file, an artefact, or every artefact of a run."""
+    if path.is_file() or (path / MANIFEST).is_file():
+        return _describe_part(path)
+    return {"kind": "run", "path": str(path), "artefacts": [_describe_part(part) for part in parts_of(path)]}
+
+
+def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
@@ -25,11 +31,9 @@ def describe_path(path: Path) -> dict[str, Any]:
             "counts": dataset.counts(),
             "lost": list(dataset.lost) or None,
         }
-    if (path / MANIFEST).is_file():
-        artefact = open_artefact(path)
-        keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
-        return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
-    return {"kind": "run", "path": str(path), "artefacts": [describe_path(part) for part in parts_of(path)]}
+    artefact = open_artefact(path)
+    keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
+    return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
 
 
 def lines(about: dict[str, Any]) -> list[str]:
@@ -47,7 +51,7 @@ def _lines(about: dict[str, Any]) -> list[str]:
         if isinstance(value, dict):
             text.append(f"{key}:")
             text.extend(f"  {name}: {item}" for name, item in value.items())
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
+        elif key == "inputs" and value:
             text.append(f"{key}:")
             text.extend(f"  {item['kind']} {item['path']}" for item in value)
         else:

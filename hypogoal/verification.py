@@ -23,8 +23,15 @@ AGAIN = "Make the artefact again."
 def faults_of(path: Path) -> list[str]:
     """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
     try:
-        if path.is_dir() and not (path / MANIFEST).is_file():
-            return [fault for part in parts_of(path) for fault in faults_of(part)]
+        run = path.is_dir() and not (path / MANIFEST).is_file()
+        return [fault for part in (parts_of(path) if run else [path]) for fault in _faults_of_part(part)]
+    except UserError as error:
+        return [str(error)]
+
+
+def _faults_of_part(path: Path) -> list[str]:
+    """Those of one data file or artefact; a manifest that is a folder or a device is a fault of its own."""
+    try:
         faults = _artefact_faults(open_artefact(path)) if path.is_dir() else _data_faults(path)
         return [f"{path}: {fault}" for fault in faults]
     except UserError as error:

@@ -23,7 +23,7 @@ from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import stage_cell
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.inspection import lines
+from hypogoal.inspection import describe_path, lines
 from hypogoal.verification import faults_of
 
 OBSERVATIONS = "labelled/one/observations"
@@ -178,6 +178,27 @@ def test_links_and_paths_that_lead_out(tmp_path: Path) -> None:
     for name in ("../secret", "/etc/hosts", "a/../../secret", "loop", "", ".", "a\0b", "x" * 300, 3):
         assert inside(out, name) is None, name
     assert inside(out, "figures/a.svg") == out / "figures/a.svg"
+
+
+def test_a_manifest_that_is_no_file_is_told_once(tmp_path: Path) -> None:
+    """Spec G2: a link to a folder or a device in a manifest's place; an endless search once."""
+    run = tmp_path / "run"
+    for name, target in (("a", ".."), ("b", "/dev/zero")):
+        artefact(run / name)
+        (run / name / "manifest.json").unlink()
+        (run / name / "manifest.json").symlink_to(target)
+    assert [fault.count("no manifest.json") for fault in faults_of(run)] == [1, 1]
+    for path in (run, run / "a"):
+        with pytest.raises(UserError, match="no manifest"):
+            describe_path(path)
+
+
+def test_odd_lists_of_a_manifest_are_shown(tmp_path: Path) -> None:
+    """Spec G2: only what has been checked is taken apart."""
+    path = artefact(tmp_path / "one") / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps(manifest | {"versions": [{"x": 1}], "command": [{}]}))
+    assert any("{'x': 1}" in line for line in lines(describe_path(path.parent)))
 
 
 def test_pipes_and_devices_are_no_files(tmp_path: Path) -> None:
