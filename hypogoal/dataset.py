@@ -199,8 +199,8 @@ class Dataset:
                 rows[split] = {}
                 for goal in self.sub_goals:
                     gone = {split, f"{split}/{goal}"} & {*self.lost}
-                    labels = np.zeros(0, np.bool_) if gone else read_array(file, f"{split}/{goal}/labels", "bui")
-                    rows[split][goal] = {"states": len(labels), "positives": int(labels.astype(np.bool_).sum())}
+                    labels = np.zeros(0, np.bool_) if gone else self._labels(file, f"{split}/{goal}")
+                    rows[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
         return rows
 
     def _split(self, split: str, sub_goal: str) -> Split:
@@ -209,10 +209,17 @@ class Dataset:
         base = f"{split}/{sub_goal}"
         with self._file() as file:
             observations = self._observations(file, base)
-            labels = read_array(file, f"{base}/labels", "bui")
+            labels = self._labels(file, base)
             if labels.shape != (len(observations),):
                 raise Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
-            return Split(observations, labels.astype(np.bool_), self._origins(file, base, len(observations)))
+            return Split(observations, labels, self._origins(file, base, len(observations)))
+
+    @staticmethod
+    def _labels(file: Any, base: str) -> NDArray[np.bool_]:
+        labels = read_array(file, f"{base}/labels", "bui")
+        if labels.ndim != 1:
+            raise Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
+        return labels.astype(np.bool_)
 
     def _observations(self, file: Any, base: str) -> NDArray[np.uint8]:
         name = f"{base}/observations"

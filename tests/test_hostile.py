@@ -120,6 +120,14 @@ def test_names_of_sub_goals_become_files(tmp_path: Path, names: Any) -> None:
         open_dataset(path)
 
 
+def test_labels_that_are_a_single_number(tmp_path: Path) -> None:
+    """Spec G2: the counts of a data file are asked for before its states are read."""
+    path = write(tmp_path / "a.h5")
+    replaced(path, "labelled/one/labels", lambda file: file.create_dataset("labelled/one/labels", data=True))
+    with pytest.raises(UserError, match="not one for each state"):
+        open_dataset(path).counts()
+
+
 def test_texts_of_variable_length(tmp_path: Path) -> None:
     """Spec G2: these lie in a heap that the HDF5 library, where it is damaged, may read for ever."""
     path = write(tmp_path / "data.h5")
