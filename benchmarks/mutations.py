@@ -82,20 +82,25 @@ def tree_changed(tree: Any, rng: Rng, odd: list[Any]) -> Any:
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         places = list(_places(tree))
         if not places:
-            return rng.choice(odd)
+            return _one_of(odd, rng)
         holder, key = rng.choice(places)
         what = rng.randrange(8)
         if what <= 4:
-            holder[key] = rng.choice(odd)
+            holder[key] = _one_of(odd, rng)
         elif what == 5:
             del holder[key]
         elif what == 6 and isinstance(holder, dict):
             holder[str(rng.choice(odd))[:6000]] = holder.pop(key)
         elif isinstance(holder, dict):
-            holder[str(rng.choice(odd))[:6000]] = rng.choice(odd)
+            holder[str(rng.choice(odd))[:6000]] = _one_of(odd, rng)
         else:
-            holder.append(rng.choice(odd))
-    return rng.choice(odd) if rng.random() < 0.02 else tree
+            holder.append(_one_of(odd, rng))
+    return _one_of(odd, rng) if rng.random() < 0.02 else tree
+
+
+def _one_of(odd: list[Any], rng: Rng) -> Any:
+    """A copy: what is put into a tree may be changed there, and must not be found changed in the next case."""
+    return json.loads(json.dumps(rng.choice(odd)))
 
 
 def _places(tree: Any) -> Any:
