@@ -223,7 +223,7 @@ def replay_figures(repeats: int) -> dict[str, float]:
     for replay in replays:
         for _ in range(100):
             replay.add(**{name: rng.integers(0, 2, 1_000).astype(kind) for name, kind in fields.items()})
-    held = sum(values.nbytes for replay in replays for values in (*replay.data.values(), replay.tree.nodes))
+    held = sum(replay.tree.nbytes + sum(values.nbytes for values in replay.data.values()) for replay in replays)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
 
     def sampled() -> None:

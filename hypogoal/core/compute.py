@@ -17,10 +17,11 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def prepare(device: str = "auto") -> str:
-    """Use one torch thread, and refuse a device that cannot be used.
+    """Use one torch thread without denormal numbers, and refuse a device that cannot be used.
 
     One thread per process is as fast on small networks, does not suffer from busy neighbours, and makes results
-    the same bytes again on the same machine.
+    the same bytes again on the same machine. Denormal numbers (below 1e-38, where Adam's moments of weights that are
+    not used end) count as 0: arithmetic with them takes many times as long.
 
     Args:
         device: of ``DEVICES``; ``auto`` is the CPU (decision 26).
@@ -34,6 +35,7 @@ def prepare(device: str = "auto") -> str:
     import torch
 
     torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
     check_name(device)
     if device == "cuda" and not torch.cuda.is_available():
         found = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"

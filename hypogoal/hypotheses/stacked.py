@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from hypogoal.core.compute import tensor
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.views import FullView
+from hypogoal.hypotheses.windows import KnownWindows, split_of
 
 CHUNK = 64  # images at once: what fits a CPU's cache
 
@@ -27,12 +29,14 @@ class StackedMembers:
     Args:
         ensembles: G ensembles of K members each, all with one network and observation shape, views of one shape, and on
             one device.
+        repeats: states are of a grid world: what convolutions make of windows is kept, see :mod:`.windows`. Where
+            members do not see all of a state, or on a GPU, it makes no difference.
 
     Attributes:
         needs_positions: whether any of them does, see :attr:`Ensemble.needs_positions`.
     """
 
-    def __init__(self, ensembles: Sequence[Ensemble]):
+    def __init__(self, ensembles: Sequence[Ensemble], *, repeats: bool = False):
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
@@ -43,6 +47,9 @@ class StackedMembers:
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
         for layers in zip(*networks, strict=True):
             self._steps.append((layers[0], _stack(list(layers))))
+        split = split_of(networks[0]) if repeats and self._one_view and self.device.type == "cpu" else None
+        self._known = KnownWindows(partial(self._apply, 0, split[0]), *split[1:]) if split else None
+        self._first = split[0] if split else 0  # of the layers behind the windows
 
     def predict(
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
@@ -52,8 +59,7 @@ class StackedMembers:
         rows = []
         with torch.inference_mode():
             for start in range(0, len(seen), CHUNK):
-                images = as_input(tensor(seen[start : start + CHUNK], self.device))
-                rows.append(self._logits(images).softmax(-1)[..., 1].T.cpu().numpy())
+                rows.append(self._logits(seen[start : start + CHUNK]).softmax(-1)[..., 1].T.cpu().numpy())
         return np.concatenate(rows) if rows else np.empty((0, self.count), dtype=np.float32)
 
     def verdicts(
@@ -69,10 +75,15 @@ class StackedMembers:
             return self.ensembles[0].see(observations)
         return np.concatenate([ensemble.see(observations, positions) for ensemble in self.ensembles], axis=-1)
 
-    def _logits(self, x: Tensor) -> Tensor:
-        """float32 (N, C, H, W) -> (members, N, 2)."""
-        groups = 1 if self._one_view else len(self.ensembles)
-        for layer, weights in self._steps:
+    def _logits(self, seen: NDArray[np.uint8]) -> Tensor:
+        """uint8 (N, h, w, C) -> (members, N, 2)."""
+        x = self._known.of(seen) if self._known is not None else as_input(tensor(seen, self.device))
+        return self._apply(self._first, len(self._steps), x)
+
+    def _apply(self, first: int, end: int, x: Tensor) -> Tensor:
+        """Some of the layers: ``first`` and those behind it, before ``end``."""
+        groups = self.count if first else 1 if self._one_view else len(self.ensembles)
+        for layer, weights in self._steps[first:end]:
             if isinstance(layer, nn.Conv2d):
                 bias = weights[1] if len(weights) > 1 else None
                 x = functional.conv2d(x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups)

@@ -17,6 +17,7 @@ from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
+from hypogoal.learners.flat import FlatParameters
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
 from hypogoal.meta.smdp import smdp_advantages
@@ -59,9 +60,8 @@ class MetaPolicy:
             torch.manual_seed(seed_for(seed, "meta-weights"))
             self.network = NETWORKS[config.meta_network](engine.observation_shape, options).to(self.device)
             self.head = HEADS[config.head](options).to(self.device)
-        parameters = [*self.network.parameters(), *self.head.parameters()]
-        self.parameters = parameters
-        self.optimiser = torch.optim.Adam(parameters, lr=config.meta_learning_rate, eps=1e-5, fused=True)
+        self._flat = FlatParameters(self.network, self.head)
+        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.meta_learning_rate, eps=1e-5, fused=True)
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         self._open: dict[int, _Decision] = {}
@@ -158,9 +158,9 @@ class MetaPolicy:
     def _step(self, loss: Tensor, where: str) -> None:
         if not torch.isfinite(loss):
             raise NumericalError(f"the meta-policy's loss is {float(loss.detach())} in {where}")
-        self.optimiser.zero_grad(set_to_none=True)
+        self._flat.gradient.zero_()
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, GRADIENT_NORM, foreach=True)
+        norm = torch.nn.utils.clip_grad_norm_(self._flat.vector, GRADIENT_NORM)
         if not torch.isfinite(norm):
             raise NumericalError(f"a gradient of the meta-policy is {float(norm)} in {where}")
         self.optimiser.step()

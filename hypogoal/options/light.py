@@ -24,12 +24,13 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow_tensors, linear_epsilon
+from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.n_step import StepsAhead
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
 from hypogoal.options.memory import STACK, remembered, require_memory
-from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_to_states
+from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
 from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
@@ -78,8 +79,8 @@ class LightLearner:
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
         self.pixels = Pixels(engine, 2 * config.option_batch, self.device) if pictures else None
-        self._copied = list(self.target.state_dict().values()), list(self.online.state_dict().values())
-        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
+        self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
+        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
         fields = {
             "s": np.int32,
             "a": np.int8,
@@ -186,16 +187,21 @@ class LightLearner:
         return numbers
 
     def _batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64], NDArray[np.float32]]:
-        kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
-        kept &= remembered(self.engine, self.positive["s"]) & remembered(self.engine, self.positive["next"])
-        have = np.flatnonzero(kept.any(1))
+        counts = np.minimum(self.positives, POSITIVES_KEPT)
+        kept: NDArray[np.bool_] | None = None  # where the engine forgets: the slots of states that it remembers
+        if hasattr(self.engine, "oldest"):
+            kept = np.arange(POSITIVES_KEPT) < counts[:, None]
+            kept &= remembered(self.engine, self.positive["s"]) & remembered(self.engine, self.positive["next"])
+            counts = kept.sum(1)
+        have = np.flatnonzero(counts)
         extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
         indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
         batch = {name: values[indices] for name, values in self.replay.data.items()}
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
-            nth = (self.rng.random(extra) * kept.sum(1)[options]).astype(np.int64)
-            slots = (np.cumsum(kept, axis=1)[options] <= nth[:, None]).sum(1)
+            slots = (self.rng.random(extra) * counts[options]).astype(np.int64)
+            if kept is not None:
+                slots = (np.cumsum(kept, axis=1)[options] <= slots[:, None]).sum(1)
             batch = {name: np.concatenate([batch[name], self.positive[name][options, slots]]) for name in batch}
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
         return batch, indices, weights
@@ -241,8 +247,7 @@ class LightLearner:
             return self.online(here), *ahead
         values = apply_to_states(self.online, self.engine, s)
         with torch.no_grad():
-            next_online = apply_to_states(self.online, self.engine, following)
-            next_target = apply_to_states(self.target, self.engine, following)
+            next_online, next_target = apply_all_to_states((self.online, self.target), self.engine, following)
         return values, next_online, next_target
 
     def _tensor(self, values: NDArray[Any]) -> Tensor:
@@ -254,16 +259,16 @@ class LightLearner:
             options = (~errors.isfinite()).any(0).nonzero().flatten().tolist()
             what = f"the option loss is {float(loss.detach())}, from option {options},"
             raise NumericalError(f"{what} in the batch of update {self.updates}, step {self.steps}")
-        self.optimiser.zero_grad(set_to_none=True)
+        self._flat.gradient.zero_()
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), GRADIENT_NORM, foreach=True)
+        norm = torch.nn.utils.clip_grad_norm_(self._flat.vector, GRADIENT_NORM)
         if not torch.isfinite(norm):
             where = f"in the batch of update {self.updates}, step {self.steps}"
             raise NumericalError(f"a gradient of the options is {float(norm)} {where}")
         self.optimiser.step()
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
-            follow_tensors(*self._copied, self.config.target_tau)
+            follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)
 
     def state(self) -> dict[str, Tensor]:
         """Weights and exploration counters, for an artefact."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -38,13 +40,14 @@ class CellEmbedding(nn.Module):
         return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 
     def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
-        """The same from tile codes uint8 (N, cells) and the tiles uint8 (T, 8, 8, C) that they stand for."""
+        """The same from tile codes, integers (N, cells), and the tiles uint8 (T, 8, 8, C) that they stand for."""
         if self._tiles is not tiles:
             self._tiles = tiles
             pixels = tensor(tiles.copy(), self.conv.weight.device)
             self._pixels = pixels.permute(0, 3, 1, 2).flatten(1).float() / 255.0
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
-        return nn.functional.embedding(codes.long(), table).flatten(1)
+        # index_select, not embedding: the same, and its gradient takes a sixth of the time.
+        return table.index_select(0, codes.flatten().long()).view(len(codes), -1)
 
 
 class PictureEmbedding(nn.Module):
@@ -147,12 +150,18 @@ class PaperQNetwork(nn.Module):
 
 def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
     """A cell network's output on states of an engine: by tile codes where the engine has them, else by images."""
-    device = next(network.parameters()).device
+    return apply_all_to_states((network,), engine, ids)[0]
+
+
+def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDArray[np.int64]) -> list[Tensor]:
+    """As :func:`apply_to_states`, several networks' outputs on the same states."""
+    device = next(networks[0].parameters()).device
     tiles = getattr(engine, "tiles", None)
     if tiles is not None:
-        codes = tensor(engine.codes(ids), device)  # type: ignore[attr-defined]
-        return network.from_codes(codes, tiles)  # type: ignore[operator]
-    return network(tensor(engine.images(ids), device))
+        codes = tensor(engine.codes(ids).astype(np.int64), device)  # type: ignore[attr-defined]
+        return [network.from_codes(codes, tiles) for network in networks]  # type: ignore[operator]
+    images = tensor(engine.images(ids), device)
+    return [network(images) for network in networks]
 
 
 class Pixels:

@@ -27,7 +27,7 @@ def learned_terminations(engine: Engine, ensembles: Sequence[Ensemble]) -> Class
         A function from state ids (n,) to verdicts bool (n, G*K).
     """
 
-    stacked = StackedMembers(ensembles)
+    stacked = StackedMembers(ensembles, repeats=hasattr(engine, "tiles"))
 
     def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         images = engine.images(ids)

@@ -25,3 +25,54 @@ def test_stacked_members_equal_each_ensemble(network: str, shape: tuple[int, ...
     np.testing.assert_allclose(stacked, plain, atol=1e-5)
     assert np.ptp(plain) > 1e-3
     assert StackedMembers(ensembles).predict(states[:0]).shape == (0, 4)
+
+
+def grid_worlds(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Images of 8 x 8 tiles of which there are three."""
+    tiles = rng.integers(0, 256, size=(3, 8, 8, 3), dtype=np.uint8)
+    cells = rng.integers(0, 3, size=(count, 8, 8)) * (rng.random((count, 8, 8)) < 0.2)
+    return tiles[cells].transpose(0, 1, 3, 2, 4, 5).reshape(count, 64, 64, 3)
+
+
+def test_known_windows_equal_whole_images() -> None:
+    """What was kept of other states' windows gives what each state gives by itself, also when too many are known."""
+    rng = np.random.default_rng(0)
+    generator = torch.Generator().manual_seed(0)
+    ensembles = [Ensemble("doorkey", (64, 64, 3), 2, generator).eval() for _ in range(2)]
+    states = grid_worlds(60, rng)
+    plain = StackedMembers(ensembles).predict(states)
+    windows = StackedMembers(ensembles, repeats=True)
+    assert windows._known is not None
+    for most in (16_384, 500):
+        windows._known.most = most
+        for start in range(0, 60, 7):
+            found = windows.predict(states[start : start + 7])
+            np.testing.assert_allclose(found, plain[start : start + 7], atol=1e-6)
+            assert 0 < len(windows._known) <= most
+    assert np.ptp(plain) > 1e-3
+
+
+def test_a_window_s_numbers_do_not_depend_on_its_company() -> None:
+    """Spec G1: a resumed run, which knows no windows yet, judges as one that knows many: to the bit."""
+    rng = np.random.default_rng(1)
+    ensembles = [Ensemble("doorkey", (64, 64, 3), 3, torch.Generator().manual_seed(0)).eval() for _ in range(5)]
+    states = grid_worlds(40, rng)
+    learned = StackedMembers(ensembles, repeats=True)
+    learned.predict(states[rng.permutation(40)])
+    for start in range(0, 40, 3):
+        some = states[start : start + 3]
+        fresh = StackedMembers(ensembles, repeats=True)
+        np.testing.assert_array_equal(fresh.predict(some), learned.predict(some))
+
+
+def test_networks_without_windows_are_judged_whole() -> None:
+    """Spec C5: an own network with padding, pictures that are no grid world."""
+    from hypogoal.hypotheses.windows import split_of
+
+    padded = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3, padding=1), torch.nn.ReLU())
+    assert split_of(padded) is None
+    assert split_of(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3, 2))) is None
+    generator = torch.Generator().manual_seed(0)
+    network = Ensemble("doorkey", (64, 64, 3), 1, generator).networks()[0]
+    assert split_of(network) is not None
+    assert split_of(network)[1:] == (17, 8)

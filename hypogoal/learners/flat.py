@@ -1,0 +1,54 @@
+"""The parameters of small networks as one vector: what is done to each of them is done once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class FlatParameters:
+    """All parameters of some modules, and their gradients, as two vectors that they are views of.
+
+    An optimiser's step, the norm of the gradients and a target's average then cost one call instead of one for each
+    parameter. Matrices lie transposed in the vectors, (in, out) row by row: so a dense layer's product needs nothing
+    rearranged, and for the 16 states of an acting step it takes a fifth of the time. Same values, up to rounding.
+
+    Args:
+        modules: on one device, float32; they get new parameters, which are to be changed in place only.
+        learning: whether there are gradients.
+
+    Attributes:
+        vector: float32 (P,); where ``learning``, with its ``grad``, to be given to an optimiser.
+    """
+
+    def __init__(self, *modules: nn.Module, learning: bool = True):
+        places = [
+            (part, name, parameter)
+            for module in modules
+            for part in module.modules()
+            for name, parameter in part.named_parameters(recurse=False)
+        ]
+        sizes = [parameter.numel() for _, _, parameter in places]
+        values = torch.zeros(sum(sizes), device=places[0][2].device)
+        self.vector = nn.Parameter(values, requires_grad=learning)
+        gradients = torch.zeros_like(values)
+        if learning:
+            self.vector.grad = gradients
+        for (part, name, parameter), held, slope in zip(
+            places, values.split(sizes), gradients.split(sizes), strict=True
+        ):
+            view = nn.Parameter(_shaped(held, parameter).copy_(parameter.data), requires_grad=learning)
+            setattr(part, name, view)
+            if learning:
+                view.grad = _shaped(slope, parameter)
+
+    @property
+    def gradient(self) -> Tensor:
+        """float32 (P,): the gradients of all parameters."""
+        assert self.vector.grad is not None
+        return self.vector.grad
+
+
+def _shaped(part: Tensor, like: Tensor) -> Tensor:
+    """A part of a vector in the shape of a parameter."""
+    return part.view(like.shape[::-1]).t() if like.ndim == 2 else part.view(like.shape)
