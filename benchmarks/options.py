@@ -1,4 +1,4 @@
-"""Option learning: updates against a plain one, all members at once, verdicts, replay; in one run, one thread.
+"""Option learning: updates against a plain one, all members at once, replay; in one run, one thread.
 
     python -m benchmarks options [--short] [--json PATH]
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 import copy
 import resource
 import statistics
-import time
 from typing import Any
 
 from benchmarks import timing
@@ -25,6 +24,7 @@ import torch  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
+from hypogoal.core.compute import prepare  # noqa: E402
 from hypogoal.core.config import resolve  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey import DoorKeyEngine  # noqa: E402
@@ -170,49 +170,6 @@ def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[s
     return rows, timing.rows_of(by_members, f"light, {MEMBERS[-1]} members", {})
 
 
-def verdict_share(steps: int) -> dict[str, float]:
-    """The share of CPU time of a light training step, 15 members, that is spent on terminations and masks.
-
-    ``learned`` networks judge each state once, when it is new; so the share falls as states repeat.
-    """
-    import tempfile
-    from pathlib import Path
-
-    from benchmarks.training import states
-    from hypogoal.hypotheses.config import EnsembleConfig
-    from hypogoal.hypotheses.training import fit
-    from hypogoal.options.verdicts import learned_terminations
-
-    config = config_of()
-    engine = DoorKeyEngine(LAYOUT, config.environments)
-    with tempfile.TemporaryDirectory() as folder:
-        split, unlabelled = states("doorkey", Path(folder))
-    settings = resolve(EnsembleConfig, stage="train-ensemble", assignments=["steps=2"])
-    ensemble = fit(split.observations, split.labels, unlabelled, settings, 0)
-    verdicts = Verdicts(learned_terminations(engine, [ensemble] * 5), 15)
-    spent = 0.0
-    plain = verdicts.of
-
-    def timed(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        nonlocal spent
-        begin = time.process_time()
-        answer = plain(ids)
-        spent += time.process_time() - begin
-        return answer
-
-    verdicts.of = timed  # type: ignore[method-assign]
-    learner = LightLearner(engine, verdicts, config, 0)
-    loop = OptionLoop(engine, verdicts, learner, RandomChooser(rng_for(0, "c")), Recorder(15), config, gamma=1.0)
-    begin = time.process_time()
-    verdicts.of(engine.reachable())
-    before = time.process_time() - begin
-    spent, begin = 0.0, time.process_time()
-    while loop.recorder.steps < steps:
-        loop.step()
-    whole = time.process_time() - begin
-    return {"share": spent / whole, "of reachable states, before, seconds": before, "steps": steps}
-
-
 def replay_figures(repeats: int) -> dict[str, float]:
     """Memory of 15 full replays of 1e5 transitions, and a sample of 32 with its new priorities."""
     fields = {"s": np.int32, "a": np.int8, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
@@ -240,18 +197,16 @@ def main() -> None:
     """Measure, print, write."""
     given = timing.arguments(__doc__, "options")
     repeats, count = (1, 2) if given.short else (5, 10)
+    prepare()
     about = timing.machine("torch", "numpy")
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     replay = replay_figures(3 if given.short else 20)
     rows, members = updates(repeats, count)
-    share = verdict_share(4_000 if given.short else 40_000)
     timing.show("\na Double-DQN update", rows)
     timing.show("\nthe light update by number of members, all learning from every transition", members)
-    print(f"\nterminations and masks: {share['share']:.1%} of a training step's time (wanted: under 10 %);")
-    print(f"before, all states that can be reached, once: {share['of reachable states, before, seconds']:.1f} s")
-    print(f"15 replays of 1e5 DoorKey transitions: {replay['MB held']:.0f} MB (wanted: under 300);")
+    print(f"\n15 replays of 1e5 DoorKey transitions: {replay['MB held']:.0f} MB (wanted: under 300);")
     print(f"a sample of 32 and its priorities: {replay['ms to sample 32 and update']:.3f} ms (wanted: under 0.3)")
-    results = {"updates": rows, "members": members, "verdicts": share, "replay": replay, "repeats": repeats}
+    results = {"updates": rows, "members": members, "replay": replay, "repeats": repeats}
     timing.write(given.json, about, results)
 
 

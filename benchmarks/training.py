@@ -28,6 +28,7 @@ import torch  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
 from hypogoal.core.checkpoints import Checkpoints  # noqa: E402
+from hypogoal.core.compute import prepare  # noqa: E402
 from hypogoal.core.config import resolve  # noqa: E402
 from hypogoal.dataset import Split, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
@@ -137,6 +138,7 @@ def main() -> None:
     """Measure, print, write."""
     given = timing.arguments(__doc__, "training")
     repeats, steps = (1, 4) if given.short else (5, 12)
+    prepare()
     about = timing.machine("torch", "numpy")
     print(", ".join(f"{name} {value}" for name, value in about.items()))
     results: dict[str, Any] = {"repeats": repeats, "steps": steps}
