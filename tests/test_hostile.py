@@ -22,6 +22,8 @@ from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import stage_cell
+from hypogoal.experiments.own import own_plan
+from hypogoal.experiments.records import PLAN, read_plan, write_plan
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.inspection import describe_path, lines
 from hypogoal.verification import faults_of
@@ -261,6 +263,23 @@ def test_hostile_presets(tmp_path: Path, text: str) -> None:
     with pytest.raises(UserError) as caught:
         resolve(EnsembleConfig, stage="train-ensemble", preset=str(path))
     assert len(str(caught.value)) < 1000 and str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"arguments": []}, {"arguments": ["rm"]}, {"name": "../x"}, {"out": "/x"}, {"needs": ["@/x"]}, {"axes": 3}],
+)
+def test_hostile_plans(tmp_path: Path, change: dict[str, Any]) -> None:
+    """Spec G2, G4: what a sweep's folder says is to be run is one of our commands, inside it."""
+    own = tmp_path / "own.toml"
+    own.write_text('format = 1\ncells = [{ name = "data", command = "collect doorkey" }]')
+    write_plan(tmp_path, own_plan(own, tmp_path), 1.0)
+    assert read_plan(tmp_path)[0].cells[0].name == "data"
+    plan = json.loads((tmp_path / PLAN).read_text())
+    plan["cells"][0] |= change
+    (tmp_path / PLAN).write_text(json.dumps(plan))
+    with pytest.raises(UserError, match="plan is damaged"):
+        read_plan(tmp_path)
 
 
 def test_a_file_cannot_name_code_to_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

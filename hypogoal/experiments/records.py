@@ -196,7 +196,7 @@ def read_plan(run: Path) -> tuple[Plan, float]:
 def _cell(row: dict[str, Any], run: Path) -> Cell:
     arguments = tuple(map(str, row["arguments"]))
     places = [Path(place).relative_to(RUN) for place in (row["out"], *row["needs"])]
-    fits = arguments[0] in COMMANDS and plain_name(row["name"])
+    fits = arguments[:1] and arguments[0] in COMMANDS and plain_name(row["name"])
     if not fits or not all(plain_name(part) for place in places for part in place.parts):
         raise ValueError
     cost = Cost(float(row["seconds"]), float(row["memory"]), float(row["disk"]), int(row["cores"]))
