@@ -19,6 +19,7 @@ from hypogoal.options.recording import STOPS_KEPT
 
 BASE = 450e6
 MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal (the paper's for Montezuma)
+WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
 PER_TRANSITION = 50  # bytes in a replay, its sum tree included
@@ -75,7 +76,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
         kept = domain.played_bytes(getattr(config, "steps", 0))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
-    members = len(about["sub_goals"]) * about["members"] * MEMBER
+    members = len(about["sub_goals"]) * about["members"] * (MEMBER + WINDOWS)
     # A checkpoint is a copy of the state, in memory while it is written.
     return Needs(BASE + 2 * state + members, weights + stops + CHECKPOINTS * state + LOGS)
 
