@@ -57,14 +57,27 @@ def import_(
 
 @app.command()
 def export(
-    data: Annotated[Path, typer.Argument(help="A data file.")],
-    out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")],
+    source: Annotated[Path, typer.Argument(help="A data file, or the folder of a meta artefact.")],
+    out: Annotated[Path, typer.Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Of the agent, where it is one.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of the agent's draws of options.")] = 0,
     force: Force = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Write a data file's states as NumPy arrays, for other software; 'import' takes them again."""
-    from hypogoal.stages.import_data import export_data as stage
+    """Write states as NumPy arrays, or an agent's episodes as a Minari dataset, for other software.
 
-    stage(data, out, force=force)
+    'import' takes both again.
+    """
+    if source.is_dir():
+        from hypogoal.stages.export_episodes import export_episodes
+
+        steps = export_episodes(source, out, episodes=episodes, seed=seed, quiet=quiet)
+        if not quiet:
+            typer.echo(f"{episodes} episodes, {steps} steps")
+    else:
+        from hypogoal.stages.import_data import export_data as stage
+
+        stage(source, out, force=force)
     typer.echo(out)
 
 

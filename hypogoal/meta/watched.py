@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Domain
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.playing import PlayConfig, build
@@ -119,16 +122,33 @@ class _Onlooker:
         self.frames.append(Frame(self.loop.engine.images(ids)[0].copy(), step, option, says_yes, left, ended))
 
 
-def play_episode(agent: Agent, domain: Domain, seed: int) -> list[Frame]:
-    """One episode with greedy options; options are drawn as in training.
+def read_agent(artefact: Artefact) -> Agent:
+    """The agent of a meta artefact.
+
+    Raises:
+        UserError: a file of it, or its ensemble, is missing or damaged.
+    """
+    about = open_artefact(artefact.input("ensemble"), "ensemble")
+    there = artefact.manifest["files"]
+    options, meta, initiation = (
+        load_tensors(artefact.path / name) if name in there else None
+        for name in ("options.safetensors", "meta.safetensors", "initiation.safetensors")
+    )
+    if options is None:
+        raise UserError("the agent has no options", artefact.path, "Make the artefact again.")
+    return Agent(artefact.config, about.config, about.path, options, meta, initiation)
+
+
+def loop_of(
+    agent: Agent, domain: Domain, seed: int, onlooker: Callable[[Learner], Learner] | None = None
+) -> OptionLoop:
+    """One environment in which the agent plays.
 
     Args:
         agent: see :class:`Agent`.
         domain: where it lives.
         seed: of the draws.
-
-    Returns:
-        A frame per step, and one for the state in which each execution ended.
+        onlooker: what is to stand between the loop and the options' learner.
     """
     config = replace(_settings(PlayConfig, agent.config), environments=1, replay=REPLAY)
     engine, verdicts, learner = build(domain, agent.ensemble, agent.about, config, seed)
@@ -142,12 +162,27 @@ def play_episode(agent: Agent, domain: Domain, seed: int) -> list[Frame]:
     if agent.initiation is not None:
         initiation = Initiation(engine, verdicts.options, config, seed)
         initiation.load(agent.initiation)
+    played: Learner = onlooker(learner) if onlooker else learner
     recorder = Recorder(verdicts.options)
-    onlooker = _Onlooker(learner)
-    loop = onlooker.loop = OptionLoop(
-        engine, verdicts, onlooker, chooser, recorder, config, gamma=meta.gamma, initiation=initiation
-    )
-    while not recorder.episodes:
+    return OptionLoop(engine, verdicts, played, chooser, recorder, config, gamma=meta.gamma, initiation=initiation)
+
+
+def play_episode(agent: Agent, domain: Domain, seed: int) -> list[Frame]:
+    """One episode with greedy options; options are drawn as in training.
+
+    Args:
+        agent: see :class:`Agent`.
+        domain: where it lives.
+        seed: of the draws.
+
+    Returns:
+        A frame per step, and one for the state in which each execution ended.
+    """
+    loop = loop_of(agent, domain, seed, _Onlooker)
+    onlooker = loop.learner
+    assert isinstance(onlooker, _Onlooker)
+    onlooker.loop = loop
+    while not loop.recorder.episodes:
         loop.step(explore=False, learn=False)
     return onlooker.frames
 

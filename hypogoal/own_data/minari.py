@@ -1,8 +1,9 @@
-"""Minari datasets: episodes, whose states a function labels. Read as files; the ``minari`` package is not needed."""
+"""Minari datasets: episodes whose states a function labels, and episodes of agents. The package is not needed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,16 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import Foreign, find, members, open_hdf5, read_array
+from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, read_array
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import write_observations
+from hypogoal.meta.recorded import Episode
 from hypogoal.own_data.parts import Parts
 
 MAIN_FILE = Path("data") / "main_data.hdf5"
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
+MINARI_VERSION = "0.5.4"  # whose layout is written
 SHARES = (0.4, 0.4, 0.2)
 
 Label = Callable[[NDArray[Any]], bool]
@@ -46,6 +50,8 @@ def read_minari(
     stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
+    if _is_picture(about.get("observation_space"), key) and about.get("jpeg_encoding", "minari_version" in about):
+        raise UserError("its images are JPEG, not as they were seen", folder, "Make it with jpeg_encoding=False.")
     episodes = _episodes(folder / MAIN_FILE, key)
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
@@ -69,6 +75,16 @@ def _episodes(path: Path, key: str) -> list[NDArray[Any]]:
             raise UserError(f"the dataset cannot be used: {error}", path, DO) from None
 
 
+def _is_picture(space: object, key: str) -> bool:
+    """Whether Minari may have made JPEG of a space, which is told as JSON."""
+    try:
+        about = json.loads(space) if isinstance(space, str) else {}
+        about = about["subspaces"][key] if key else about
+        return about["type"] == "Box" and about["dtype"] == "uint8" and len(about["shape"]) in (2, 3)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return False
+
+
 def _number(name: str) -> int:
     tail = name.removeprefix("episode_")
     return int(tail) if tail.isdecimal() else -1
@@ -77,3 +93,50 @@ def _number(name: str) -> int:
 def _told(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.bool_]:
     """What the functions say of each observation, bool (N, G)."""
     return np.array([[bool(label(observation)) for label in labels] for observation in observations], np.bool_)
+
+
+def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, actions: int, description: str) -> int:
+    """Episodes as a Minari dataset of format ``hdf5``, pictures as they were seen.
+
+    Args:
+        folder: to be filled; ``data/`` is made in it.
+        episodes: at least one; ``infos/option`` says which option led to a state, -1 at the start.
+        name: its id, for example ``doorkey/options-v0``.
+        actions: how many primitive ones there are.
+        description: what one should know of it.
+
+    Returns:
+        Steps, all episodes together.
+    """
+    shape: tuple[int, ...] = ()
+    total = count = 0
+    (folder / MAIN_FILE).parent.mkdir(parents=True)
+    with create_hdf5(folder / MAIN_FILE) as file:
+        for episode in episodes:
+            group, steps = file.create_group(f"episode_{count}"), len(episode.actions)
+            shape = episode.observations.shape[1:]
+            group.attrs["id"], group.attrs["total_steps"] = count, steps
+            write_observations(group, episode.observations)
+            last = np.arange(steps) == steps - 1
+            group["actions"], group["rewards"] = episode.actions, episode.rewards
+            group["terminations"], group["truncations"] = last & episode.terminated, last & (not episode.terminated)
+            group["infos/option"] = np.concatenate([[-1], episode.options])
+            total, count = total + steps, count + 1
+    spaces = {
+        "observation_space": {"type": "Box", "dtype": "uint8", "shape": list(shape)}
+        | {bound: np.full(shape, value).tolist() for bound, value in (("low", 0), ("high", 255))},
+        "action_space": {"type": "Discrete", "dtype": "int64", "start": 0, "n": actions},
+    }
+    about = {
+        "total_episodes": count,
+        "total_steps": total,
+        "data_format": "hdf5",
+        "jpeg_encoding": False,
+        "dataset_id": name,
+        "minari_version": MINARI_VERSION,
+        "algorithm_name": "hypogoal",
+        "description": description,
+        **{space: json.dumps(about) for space, about in spaces.items()},
+    }
+    (folder / METADATA).write_text(json.dumps(about) + "\n", encoding="utf-8")
+    return total

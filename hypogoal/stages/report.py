@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, open_artefact, versions
+from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.evaluated import AGAIN, read_evaluation
 
@@ -70,19 +70,14 @@ def agents_of(run: Path) -> list[Artefact]:
 
 def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int) -> None:
     """Spec E1: episodes of the agents in turn, played from their saved weights, one GIF each."""
-    from hypogoal.core.tensors import load_tensors
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation.videos import episode_gif
-    from hypogoal.meta.watched import Agent, play_episode
+    from hypogoal.meta.watched import play_episode, read_agent
 
     folder.mkdir()
     for index in range(count):
         artefact, episode = agents[index % len(agents)], index // len(agents)
-        config, source = artefact.config, open_artefact(artefact.input("ensemble"), "ensemble")
-        options, meta = (load_tensors(artefact.path / f"{name}.safetensors") for name in ("options", "meta"))
-        sets = artefact.path / "initiation.safetensors"
-        initiation = load_tensors(sets) if sets.name in artefact.manifest["files"] else None
-        agent = Agent(config, source.config, source.path, options, meta, initiation)
+        config, agent = artefact.config, read_agent(artefact)
         frames = play_episode(agent, load_domain(config["domain"]), seed=episode)
         name = artefact.path.relative_to(run).as_posix().replace("/", "-")
         gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])

@@ -1,0 +1,66 @@
+"""Spec B6: episodes of a trained agent as a Minari dataset, for offline learning with other software."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from hypogoal.core.artefacts import claim, open_artefact
+from hypogoal.core.compute import prepare
+from hypogoal.core.drafts import put_in_place
+from hypogoal.core.errors import UserError
+from hypogoal.core.progress import Progress
+from hypogoal.domains.base import load_domain
+from hypogoal.meta.recorded import Episode, play_episodes
+from hypogoal.meta.watched import loop_of, read_agent
+from hypogoal.own_data import write_minari
+
+NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")
+
+
+def export_episodes(meta: Path, out: Path, *, episodes: int = 20, seed: int = 0, quiet: bool = False) -> int:
+    """Let the agent of a meta artefact play, and write what happened as a Minari dataset.
+
+    Args:
+        meta: the artefact that ``train-meta`` wrote.
+        out: the dataset's folder; its name, such as ``solved-v0``, is the dataset's id.
+        episodes: how many.
+        seed: of the draws of options.
+        quiet: no progress.
+
+    Returns:
+        Steps, all episodes together.
+
+    Raises:
+        UserError: no such agent, no such name, or there is something at ``out``.
+    """
+    prepare()
+    if not NAME.fullmatch(out.name):
+        raise UserError("a Minari dataset has a version in its name", out.name, "Give --out DIR/NAME-v0.")
+    source = open_artefact(meta, "meta").whole()
+    claim(out)
+    agent, domain = read_agent(source), load_domain(source.config["domain"])
+    made = out.with_name(f".{out.name}.new")
+    shutil.rmtree(made, ignore_errors=True)
+    described = (
+        f"Episodes of an agent that chooses among {len(source.config['sub_goals']) * source.config['members']} options "
+        f"({source.config['domain']}, layout seed {source.config['layout_seed']}, seed {seed})."
+    )
+    loop = loop_of(agent, domain, seed)
+
+    def told(progress: Progress) -> Iterator[Episode]:
+        for number, episode in enumerate(play_episodes(loop, episodes), 1):
+            yield episode
+            progress.update(number)
+
+    try:
+        with Progress("export", total=episodes, quiet=quiet) as progress:
+            steps = write_minari(
+                made, told(progress), name=out.name, actions=loop.engine.n_actions, description=described
+            )
+        put_in_place(made, out)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+    return steps

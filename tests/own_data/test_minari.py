@@ -1,0 +1,126 @@
+"""Episodes to and from the real minari package (Spec B6)."""
+
+import re
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import pytest
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+
+import hypogoal  # noqa: F401 - registers the environments
+from benchmarks.kills import STAGES, needed
+from hypogoal.cli import main
+from hypogoal.core.errors import UserError
+from hypogoal.own_data import read_minari
+
+LAYOUT = 100
+EPISODES = 3
+
+
+@pytest.fixture(scope="module")
+def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A toy run's agent, whose episodes are cut after 60 steps."""
+    run = tmp_path_factory.mktemp("toy")
+    for part in needed(["meta"]):
+        stage = STAGES[part]
+        assert main([*stage.arguments(run), "--out", str(run / f"{part}{stage.suffix}"), "-q"]) == 0
+    return run / "meta"
+
+
+@pytest.fixture
+def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where minari looks for datasets."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
+
+
+def even(observation: np.ndarray) -> bool:
+    return int(observation.astype(int).sum()) % 2 == 0
+
+
+def test_an_agents_episodes_are_a_minari_dataset(agent: Path, there: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: minari reads them; played again, their actions lead to the same observations and rewards."""
+    out = there / "toy-v0"
+    assert main(["export", str(agent), "--out", str(out), "--episodes", str(EPISODES)]) == 0
+    said = capsys.readouterr().out
+    dataset = minari.load_dataset("toy-v0")
+    assert dataset.total_episodes == EPISODES
+    assert re.search(rf"{EPISODES} episodes, {dataset.total_steps} steps", said)
+    env = gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=LAYOUT)
+    assert dataset.observation_space == env.observation_space
+    assert dataset.action_space == env.action_space
+    for episode in dataset.iterate_episodes():
+        observation, _ = env.reset()
+        np.testing.assert_array_equal(episode.observations[0], observation)
+        for step, action in enumerate(episode.actions):
+            observation, reward, terminated, _, _ = env.step(action)
+            np.testing.assert_array_equal(episode.observations[step + 1], observation)
+            assert (episode.rewards[step], episode.terminations[step]) == (reward, terminated)
+        assert episode.terminations[-1] != episode.truncations[-1]
+        assert not (episode.terminations[:-1] | episode.truncations[:-1]).any()
+        assert episode.terminations[-1] or len(episode.actions) == 60
+        options = episode.infos["option"]
+        assert options[0] == -1
+        assert (options[1:] >= 0).all() and (options[1:] < 4).all()
+    again = there / "again-v0"
+    assert main(["export", str(agent), "--out", str(again), "--episodes", str(EPISODES), "-q"]) == 0
+    for one, other in zip(dataset.iterate_episodes(), minari.load_dataset("again-v0").iterate_episodes(), strict=True):
+        np.testing.assert_array_equal(one.actions, other.actions)
+
+
+def states_in(folder: Path) -> list[bytes]:
+    """All states that an import would take, in some order."""
+    parts = read_minari(folder, [even])
+    assert parts.heldout_observations is not None
+    found = np.concatenate([parts.observations, parts.unlabelled, parts.heldout_observations])
+    return sorted(state.tobytes() for state in found)
+
+
+def test_exported_episodes_are_imported(agent: Path, there: Path) -> None:
+    """Spec B6: what goes out comes in."""
+    assert main(["export", str(agent), "--out", str(there / "toy-v1"), "--episodes", str(EPISODES), "-q"]) == 0
+    episodes = minari.load_dataset("toy-v1").iterate_episodes()
+    assert states_in(there / "toy-v1") == sorted(seen.tobytes() for one in episodes for seen in one.observations)
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "words"),
+    [("toy", [], "Give --out DIR/NAME-v0"), ("toy-v2", ["--seed", "-1"], "seed"), ("there-v0", [], "exists already")],
+)
+def test_what_cannot_be_exported_is_one_line(
+    agent: Path, there: Path, capsys: pytest.CaptureFixture[str], name: str, more: list[str], words: str
+) -> None:
+    """Spec G2: nothing half-written, nothing replaced."""
+    (there / "there-v0").mkdir(parents=True)
+    (there / "there-v0" / "mine").write_text("mine")
+    assert main(["export", str(agent), "--out", str(there / name), *more]) == 2
+    assert words in capsys.readouterr().err
+    assert [path.name for path in there.iterdir()] == ["there-v0"]
+    assert main(["export", str(agent.parent / "ensemble"), "--out", str(there / "x-v0")]) == 2
+
+
+@pytest.mark.parametrize("jpeg", [True, False])
+def test_pictures_as_jpeg_are_refused(there: Path, jpeg: bool) -> None:
+    """Spec B6, G2: minari makes JPEG of pictures unless told not to; those are not the states that were seen."""
+    rng = np.random.default_rng(0)
+    pictures = gymnasium.spaces.Box(0, 255, (24, 24, 3), np.uint8)
+    states = rng.integers(0, 256, size=(4, 5, *pictures.shape), dtype=np.uint8)
+    episodes = [
+        EpisodeBuffer(
+            observations=list(seen), actions=[0] * 4, rewards=[0.0] * 4, terminations=[False] * 4,
+            truncations=[False, False, False, True],
+        )
+        for seen in states
+    ]  # fmt: skip
+    folder = there / "own-v0" / "data"
+    folder.mkdir(parents=True)
+    storage = MinariStorage.new(folder, pictures, gymnasium.spaces.Discrete(2), jpeg_encoding=jpeg)
+    storage.update_episodes(episodes)
+    if jpeg:
+        with pytest.raises(UserError, match=r"JPEG.*jpeg_encoding=False"):
+            read_minari(there / "own-v0", [even])
+        return
+    assert states_in(there / "own-v0") == sorted(state.tobytes() for state in states.reshape(-1, *pictures.shape))
