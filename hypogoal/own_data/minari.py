@@ -50,9 +50,7 @@ def read_minari(
     stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
-    if _is_picture(about.get("observation_space"), key) and about.get("jpeg_encoding", "minari_version" in about):
-        raise UserError("its images are JPEG, not as they were seen", folder, "Make it with jpeg_encoding=False.")
-    episodes = _episodes(folder / MAIN_FILE, key)
+    episodes = _episodes(folder / MAIN_FILE, key, _picture_shape(about.get("observation_space"), key))
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
     order = rng_for(seed, "minari").permutation(len(episodes))
@@ -62,7 +60,7 @@ def read_minari(
     return Parts(labelled, _told(labels, labelled), unlabelled, heldout, _told(labels, heldout))
 
 
-def _episodes(path: Path, key: str) -> list[NDArray[Any]]:
+def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
     with open_hdf5(path, "the dataset", DO) as file:
         try:
             names = [name for name in members(file) if name.startswith("episode_")]
@@ -70,19 +68,24 @@ def _episodes(path: Path, key: str) -> list[NDArray[Any]]:
             if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
                 keys = ", ".join(members(find(file, f"{names[0]}/observations")))
                 raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
+            stored = find(file, f"{names[0]}/{place}") if names and shape else None
+            if hasattr(stored, "dtype") and stored.shape[1:] != shape:
+                what = "its images are not stored as they were seen, but as JPEG"
+                raise UserError(what, path, "Make it with jpeg_encoding=False.")
             return [read_array(file, f"{name}/{place}", "uif") for name in sorted(names, key=_number)]
         except Foreign as error:
             raise UserError(f"the dataset cannot be used: {error}", path, DO) from None
 
 
-def _is_picture(space: object, key: str) -> bool:
-    """Whether Minari may have made JPEG of a space, which is told as JSON."""
+def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:
+    """The shape of a space of pictures, told as JSON, which Minari may have made JPEG; None where it is no such one."""
     try:
         about = json.loads(space) if isinstance(space, str) else {}
         about = about["subspaces"][key] if key else about
-        return about["type"] == "Box" and about["dtype"] == "uint8" and len(about["shape"]) in (2, 3)
+        shape = tuple(about["shape"])
+        return shape if (about["type"], about["dtype"]) == ("Box", "uint8") and len(shape) in (2, 3) else None
     except (ValueError, KeyError, TypeError, RecursionError):
-        return False
+        return None
 
 
 def _number(name: str) -> int:
