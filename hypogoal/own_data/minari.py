@@ -68,8 +68,8 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArr
             if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
                 keys = ", ".join(members(find(file, f"{names[0]}/observations")))
                 raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
-            stored = find(file, f"{names[0]}/{place}") if names and shape else None
-            if hasattr(stored, "dtype") and stored.shape[1:] != shape:
+            stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
+            if stored is not None and stored[1:] != shape:
                 what = "its images are not stored as they were seen, but as JPEG"
                 raise UserError(what, path, "Make it with jpeg_encoding=False.")
             return [read_array(file, f"{name}/{place}", "uif") for name in sorted(names, key=_number)]
