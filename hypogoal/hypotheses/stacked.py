@@ -18,13 +18,15 @@ from hypogoal.hypotheses.views import FullView
 from hypogoal.hypotheses.windows import KnownWindows, split_of
 
 CHUNK = 64  # images at once: what fits a CPU's cache
+WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # the same for all members at once
 
 
 class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
     The first convolution's filters stand side by side, later ones are grouped, dense layers are batched products.
-    Up to rounding the same as each ensemble's ``predict`` (a test asserts it).
+    Up to rounding the same as each ensemble's ``predict`` (a test asserts it). Own networks with layers of other kinds
+    are not joined: each ensemble predicts by itself.
 
     Args:
         ensembles: G ensembles of K members each, all with one network and observation shape, views of one shape, and on
@@ -34,6 +36,7 @@ class StackedMembers:
 
     Attributes:
         needs_positions: whether any of them does, see :attr:`Ensemble.needs_positions`.
+        joined: whether the network's layers are of kinds that can be.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble], *, repeats: bool = False):
@@ -44,7 +47,11 @@ class StackedMembers:
         self._thresholds = np.concatenate([ensemble.thresholds.cpu().numpy() for ensemble in ensembles])
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
         self.count = len(networks)
+        self.joined = _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
+        self._known: KnownWindows | None = None
+        if not self.joined:
+            return
         for layers in zip(*networks, strict=True):
             self._steps.append((layers[0], _stack(list(layers))))
         split = split_of(networks[0]) if repeats and self._one_view and self.device.type == "cpu" else None
@@ -55,6 +62,8 @@ class StackedMembers:
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
     ) -> NDArray[np.float32]:
         """P(sub-goal reached): float32 (N, G*K), ensemble by ensemble; arguments as of :meth:`Ensemble.predict`."""
+        if not self.joined:
+            return np.concatenate([ensemble.predict(observations, positions) for ensemble in self.ensembles], axis=1)
         seen = self._see(observations, positions)
         rows = []
         with torch.inference_mode():
@@ -95,6 +104,20 @@ class StackedMembers:
             else:
                 x = layer(x)
         return x
+
+
+def _can_be_joined(network: nn.Sequential) -> bool:
+    flat = False
+    for layer in network:
+        if isinstance(layer, nn.Flatten):
+            fits, flat = (layer.start_dim, layer.end_dim) == (1, -1) and not flat, True
+        elif isinstance(layer, nn.Conv2d):
+            fits = not flat and layer.groups == 1 and layer.padding_mode == "zeros"
+        else:
+            fits = (isinstance(layer, nn.Linear) and flat) or isinstance(layer, WITHOUT_WEIGHTS)
+        if not fits:
+            return False
+    return flat
 
 
 def _stack(layers: list[nn.Module]) -> list[Tensor]:
