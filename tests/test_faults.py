@@ -127,7 +127,7 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_initiation_sets() -> Non
 def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:
     """Spec G3."""
     policy = MetaPolicy(Corridor(4), 2, MetaConfig(), seed=0)
-    weight = policy.parameters[0]
+    weight = next(policy.network.parameters())
     with pytest.raises(
         NumericalError, match=r"a gradient of the meta-policy is (nan|inf) in update 3, epoch 1, batch 2"
     ):
