@@ -71,7 +71,7 @@ def export(
     if source.is_dir():
         from hypogoal.stages.export_episodes import export_episodes
 
-        steps = export_episodes(source, out, episodes=episodes, seed=seed, quiet=quiet)
+        steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
         if not quiet:
             typer.echo(f"{episodes} episodes, {steps} steps")
     else:

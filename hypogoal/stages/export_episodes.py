@@ -20,7 +20,9 @@ from hypogoal.own_data import write_minari
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")
 
 
-def export_episodes(meta: Path, out: Path, *, episodes: int = 20, seed: int = 0, quiet: bool = False) -> int:
+def export_episodes(
+    meta: Path, out: Path, *, episodes: int = 20, seed: int = 0, force: bool = False, quiet: bool = False
+) -> int:
     """Let the agent of a meta artefact play, and write what happened as a Minari dataset.
 
     Args:
@@ -28,6 +30,7 @@ def export_episodes(meta: Path, out: Path, *, episodes: int = 20, seed: int = 0,
         out: the dataset's folder; its name, such as ``solved-v0``, is the dataset's id.
         episodes: how many.
         seed: of the draws of options.
+        force: replace an artefact at ``out``; another folder has to be moved away.
         quiet: no progress.
 
     Returns:
@@ -40,7 +43,7 @@ def export_episodes(meta: Path, out: Path, *, episodes: int = 20, seed: int = 0,
     if not NAME.fullmatch(out.name):
         raise UserError("a Minari dataset has a version in its name", out.name, "Give --out DIR/NAME-v0.")
     source = open_artefact(meta, "meta").whole()
-    claim(out)
+    claim(out, force=force)
     agent, domain = read_agent(source), load_domain(source.config["domain"])
     made = out.with_name(f".{out.name}.new")
     shutil.rmtree(made, ignore_errors=True)

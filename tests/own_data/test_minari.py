@@ -88,7 +88,12 @@ def test_exported_episodes_are_imported(agent: Path, there: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "more", "words"),
-    [("toy", [], "Give --out DIR/NAME-v0"), ("toy-v2", ["--seed", "-1"], "seed"), ("there-v0", [], "exists already")],
+    [
+        ("toy", [], "Give --out DIR/NAME-v0"),
+        ("toy-v2", ["--seed", "-1"], "seed"),
+        ("there-v0", [], "exists already"),
+        ("there-v0", ["--force"], "Move it away"),
+    ],
 )
 def test_what_cannot_be_exported_is_one_line(
     agent: Path, there: Path, capsys: pytest.CaptureFixture[str], name: str, more: list[str], words: str
