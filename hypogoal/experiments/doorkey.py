@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell
 from hypogoal.learners.baselines.settings import hyperparameters
@@ -32,6 +33,11 @@ class RunConfig:
 
     layout_seeds: tuple[int, ...] = setting((100,), "layouts, each with an agent of its own", source="Spec E4", low=0)
     seeds: tuple[int, ...] = setting((0,), "run seeds, each with an ensemble of its own", low=0)
+    paired: bool = setting(
+        False,
+        "the first layout with the first seed, the second with the second, instead of all with all",
+        source="Spec E4",
+    )
     pretrain: bool = setting(True, "train-options before train-meta; false is the paper's D5")
     controls: tuple[str, ...] = setting(
         ("random", "oracle"), "controls beside the agent", source="Spec E6", choices=("random", "oracle")
@@ -45,6 +51,20 @@ class RunConfig:
     workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
 
 
+def _cases(config: RunConfig) -> list[tuple[int, int]]:
+    """Layout seed and run seed of each agent."""
+    layouts, seeds = config.layout_seeds, config.seeds
+    if not config.paired:
+        return [(layout, seed) for layout in layouts for seed in seeds]
+    if len(layouts) != len(seeds):
+        raise UserError(
+            f"{len(layouts)} layouts cannot be paired with {len(seeds)} seeds",
+            "layout_seeds",
+            "Give as many of both, or paired=false for every layout with every seed.",
+        )
+    return list(zip(layouts, seeds, strict=True))
+
+
 def cells(
     out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
 ) -> list[Cell]:
@@ -55,9 +75,13 @@ def cells(
         config: which cells.
         resolved: by stage, its configuration.
         common: by stage, the arguments that brought that configuration about.
+
+    Raises:
+        UserError: layouts and seeds are to be paired and differ in number.
     """
+    cases = _cases(config)
     domain = load_domain(DOMAIN)
-    single = len(config.layout_seeds) * len(config.seeds) == 1
+    single = len(cases) == 1
     data = out / "data.h5"
     ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
     states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
@@ -89,7 +113,6 @@ def cells(
     ensembles = {
         seed: add("ensemble", ("train-ensemble", str(data)), seed, None, (data,), training) for seed in config.seeds
     }
-    cases = [(layout, seed) for layout in config.layout_seeds for seed in config.seeds]
     for layout, seed in cases:
         source = ensembles[seed]
         extra: tuple[str, ...] = ()

@@ -104,9 +104,20 @@ def test_the_papers_figures_are_experiments() -> None:
     assert figure == plan("doorkey", OUT, preset="figure6").cells
     assert plan("figure3", OUT).cells == plan("montezuma-ladders", OUT, preset="figure3").cells
     assert plan("figure4", OUT).cells == plan("montezuma-ladders", OUT, preset="figure4").cells
-    ten = plan("figure6", OUT, seeds="0", assignments=["layout_seeds=210-219"]).cells
+    ten = plan("figure6", OUT, seeds="0", assignments=["paired=false", "layout_seeds=210-219"]).cells
     agents = [cell for cell in ten if cell.stage == "train-meta" and dict(cell.axes)["agent"] == "meta"]
     assert [dict(cell.axes)["layout_seed"] for cell in agents] == [*range(210, 220)]
+
+
+def test_layouts_and_seeds_in_pairs() -> None:
+    """Spec E4: ten agents, each with a layout and an ensemble of its own; as many of both or one line."""
+    pairs = plan("doorkey", OUT, seeds="3,5", assignments=["paired=true", "layout_seeds=7,8", "baselines=ppo-tuned"])
+    axes = [dict(cell.axes) for cell in pairs.cells if cell.stage == "train-meta" or cell.stage == "train-baseline"]
+    assert len(axes) == 4 * 2
+    assert {(found["layout_seed"], found["seed"]) for found in axes} == {(7, 3), (8, 5)}
+    assert [dict(cell.axes)["seed"] for cell in pairs.cells if cell.stage == "train-ensemble"] == [3, 5]
+    with pytest.raises(UserError, match="10 layouts cannot be paired with 1 seeds"):
+        plan("figure6", OUT, seeds="0")
 
 
 def test_a_moved_cell_is_the_same_in_another_place() -> None:
