@@ -113,6 +113,22 @@ if __name__ == "__main__":
 """
 
 
+STOPPED_AT_ONCE = """
+import os, signal, sys
+import hypogoal.cli
+
+hypogoal.cli.app = lambda **_: os.kill(os.getpid(), signal.SIGTERM)
+sys.exit(hypogoal.cli.main())
+"""
+
+
+def test_stopped_before_a_command_is_reached() -> None:
+    """Spec G1, G2: one line and 128 + the signal, as later."""
+    done = subprocess.run([sys.executable, "-c", STOPPED_AT_ONCE], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stderr == "hypogoal: stopped; nothing was half-written\n"
+
+
 def test_a_stage_dies_with_all_its_processes(tmp_path: Path) -> None:
     """Spec G1: no orphan goes on writing beside its successor."""
     (tmp_path / "script.py").write_text(SLEEPERS)

@@ -188,3 +188,31 @@ def test_a_long_sweep_asks_first_where_somebody_can_answer(tmp_path: Path, monke
     monkeypatch.setattr("typer.confirm", lambda *_, **__: False)
     assert main(["sweep", str(toy), "--out", str(out), "-q"]) == 1
     assert not out.exists()
+
+
+WARNED_AT_ONCE = """
+import os, signal, sys
+from hypogoal.cli import main
+from hypogoal.experiments.engines import element
+
+begin = element.start
+def warned(*given, **more):
+    running = begin(*given, **more)
+    os.kill(os.getpid(), signal.SIGUSR2)  # the stage has hardly begun and does not listen yet
+    return running
+element.start = warned
+sys.exit(main(["sweep", "--out", sys.argv[1], "--cell", "data"]))
+"""
+
+
+def test_a_job_warned_before_its_stage_listens_says_that_nothing_was_saved(swept: Path, tmp_path: Path) -> None:
+    """Spec G4: it is not queued again, where it would come to the same end."""
+    (tmp_path / "sweep.json").write_bytes((swept / "whole" / "sweep.json").read_bytes())
+    command = [sys.executable, "-c", WARNED_AT_ONCE, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "data failed: nothing new could be saved before the time limit" in done.stderr
+    assert "queued again" not in done.stderr
+    data = next(cell for cell in read_plan(tmp_path)[0].cells if cell.name == "data")
+    assert read_record(tmp_path, data).code == 1
+    assert not data.out.exists()
