@@ -7,16 +7,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from toy import SMALL, write_toy
+from toy import DATA, SMALL, write_toy
 
 from hypogoal.cli import main
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
+from hypogoal.experiments.engines.local import run_cells
 from hypogoal.experiments.records import is_running, open_log, read_plan, read_record
 from hypogoal.experiments.status import read_status
+from hypogoal.stages.sweep import plan
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0
@@ -170,6 +173,17 @@ def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
         child.kill()
         child.wait()
     assert not is_running(run, cell)
+
+
+def test_cells_are_run_in_the_plans_order(tmp_path: Path) -> None:
+    """Spec G4: one that waits for nothing does not go before those of the plan that had to wait."""
+    last = f'[[cells]]\nname = "more"\ncommand = "{DATA} --seed 1"'
+    toy = write_toy(tmp_path / "toy.toml", "0", last)
+    planned = replace(plan(str(toy), tmp_path / "out"), workers=1)
+    told: list[str] = []
+    run_cells(planned, tmp_path / "out", force=False, say=told.append)
+    started = [line.split()[1] for line in told if line.endswith(" ...")]
+    assert started == ["data", "ensemble-seed-0", "more"]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The cells on this machine: as many at once as cores and memory allow (Spec G4)."""
+"""The cells on this machine, in the plan's order: as many at once as cores and memory allow (Spec G4)."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None])
         say: told what happens, a line at a time.
     """
     outcome = Outcome(waiting=list(plan.cells))
+    places = {cell.name: place for place, cell in enumerate(plan.cells)}
     running: list[Running] = []
     made: set[Path] = set()
     startable: list[Cell] = []
@@ -53,6 +54,7 @@ def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None])
                         startable.append(cell)
                 except UserError as error:
                     _fail(outcome, cell, str(error), say)
+            startable.sort(key=lambda cell: places[cell.name])  # not those first that wait for nothing
             while startable and (cores := _allotted(startable, running, plan.workers, budget)):
                 cell = startable.pop(0)
                 try:
