@@ -45,15 +45,16 @@ def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None])
     total, told = len(plan.cells), time.monotonic()
     try:
         while True:
-            for cell in [cell for cell in outcome.waiting if made.issuperset(cell.needs)]:
-                outcome.waiting.remove(cell)
-                try:
-                    if not force and is_finished(cell):
-                        _add(outcome, made, cell)
-                    else:
-                        startable.append(cell)
-                except UserError as error:
-                    _fail(outcome, cell, str(error), say)
+            while ready := [cell for cell in outcome.waiting if made.issuperset(cell.needs)]:
+                for cell in ready:  # of which those that are finished make others ready
+                    outcome.waiting.remove(cell)
+                    try:
+                        if not force and is_finished(cell):
+                            _add(outcome, made, cell)
+                        else:
+                            startable.append(cell)
+                    except UserError as error:
+                        _fail(outcome, cell, str(error), say)
             startable.sort(key=lambda cell: places[cell.name])  # not those first that wait for nothing
             while startable and (cores := _allotted(startable, running, plan.workers, budget)):
                 cell = startable.pop(0)
