@@ -69,6 +69,16 @@ def test_agents_are_grouped_and_counted_whole(run, metrics):
     assert own["length_over_shortest"] == pytest.approx(last[:, 1].mean() / own["shortest_path"])
 
 
+def test_an_agent_without_a_whole_episode_is_said_to_be_one(run, tmp_path):
+    """Spec F5: there is no success to speak of, neither 0 nor a dash."""
+    train_meta(run / "ensemble", TrainMetaConfig(steps=512, random_episodes=20), tmp_path / "meta", **QUIET)
+    metrics = evaluate(tmp_path, tmp_path / "evaluation", **QUIET)
+    assert metrics["agents"][0]["success"]["mean"] is None
+    page = report(tmp_path).read_text(encoding="utf-8")
+    assert "No episode of the option agent came to its end (1 run: layout seed 100" in page
+    assert "reached the goal in" not in page
+
+
 def test_members_are_judged_on_heldout_states(run, metrics):
     """Spec F1, F2: numbers of each ensemble, sub-goal and member, recomputed here from the file and the weights."""
     from hypogoal.dataset import open_dataset

@@ -55,6 +55,8 @@ def _answer(material: Material) -> str:
     agent, control = first_named(material.agents(), LEARNED), first_named(material.agents(), RANDOM)
     if agent is None:
         return ""
+    if agent["success"]["mean"] is None:
+        return f"No episode of the option agent came to its end ({_runs(agent)}): it needs more steps."
     ratio = fixed(agent["length_over_shortest"]["mean"], 1)
     text = (
         f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last 100 training episodes, "
