@@ -12,6 +12,8 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 from hypogoal.options.env import OptionEnv, Options, make_policies
+from hypogoal.options.initiation import NAME as INITIATION
+from hypogoal.options.initiation import narrowing
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 
@@ -64,4 +66,9 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     source = open_artefact(folder, "ensemble").whole()
     ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
     policies = make_policies(config, load_tensors(artefact.path / "options.safetensors"), source.config)
-    return Options(tuple(config["sub_goals"]), config["members"], ensembles, policies, config["option_timeout"])
+    goals, members = tuple(config["sub_goals"]), config["members"]
+    initiation = None
+    if INITIATION in artefact.manifest["files"]:
+        learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
+        initiation = narrowing(learned, shape, len(goals) * members, config["initiation_threshold"])
+    return Options(goals, members, ensembles, policies, config["option_timeout"], initiation)

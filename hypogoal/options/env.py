@@ -19,6 +19,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.execution import offered_options
 from hypogoal.options.exploration import actions_of
+from hypogoal.options.initiation import Narrowing
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
@@ -35,6 +36,7 @@ class Options:
         ensembles: the termination classifiers, one ensemble per sub-goal.
         policies: starts an option's greedy policy.
         timeout: steps after which an option ends.
+        initiation: holds options back where they rarely reach their sub-goals (D7); None, it holds none back.
     """
 
     sub_goals: tuple[str, ...]
@@ -42,6 +44,7 @@ class Options:
     ensembles: Sequence[Ensemble]
     policies: Policies
     timeout: int
+    initiation: Narrowing | None = None
 
     @property
     def count(self) -> int:
@@ -55,6 +58,11 @@ class Options:
     def verdicts(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which options' sub-goals hold in one observation (*obs): bool (G*K,)."""
         return np.concatenate([ensemble.verdicts(observation[None])[0] for ensemble in self.ensembles])
+
+    def offered(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Spec D6, D7: which options may start in an observation (*obs): bool (G*K,)."""
+        offered: NDArray[np.bool_] = offered_options(self.verdicts(observation)[None], mask_reached=True)[0]
+        return offered if self.initiation is None else self.initiation(observation, offered)
 
     def holds(self, option: int, observation: NDArray[np.uint8]) -> bool:
         """Whether one option's own sub-goal holds in an observation (*obs)."""
@@ -177,8 +185,8 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Spec D6: which options may start here, bool (G*K,)."""
-        return offered_options(self.options.verdicts(self._current())[None], mask_reached=True)[0]
+        """Spec D6, D7: which options may start here, bool (G*K,)."""
+        return self.options.offered(self._current())
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Run option ``action`` to its end."""

@@ -8,7 +8,7 @@ all together.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,17 +20,59 @@ from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
-from hypogoal.core.tensors import AGAIN, check_fit
+from hypogoal.core.tensors import AGAIN, check_fit, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import gradient_norm
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, apply_to_states
 
+NAME, PREFIX = "initiation.safetensors", "network."
 KEPT = 8_192  # last executions; options change while they learn, so older ones are forgotten
 FEWEST = 100  # executions of an option before it is ever held back
 KNOWN = ("states", "option", "reached", "executions", "count")
 BATCH, EXECUTIONS_PER_UPDATE, LEARNING_RATE = 128, 32, 1e-3
+
+# From an observation (*obs) and what is offered in it, bool (O,), to what may start there.
+Narrowing = Callable[[NDArray[np.uint8], NDArray[np.bool_]], NDArray[np.bool_]]
+
+
+def _narrowed(
+    offered: NDArray[np.bool_], chances: NDArray[np.float32], executions: NDArray[np.int64], threshold: float
+) -> NDArray[np.bool_]:
+    narrowed = offered & ((chances >= threshold) | (executions < FEWEST))
+    none_left = ~narrowed.any(1)
+    narrowed[none_left] = offered[none_left]
+    return narrowed
+
+
+def narrowing(state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float) -> Narrowing:
+    """What an artefact's initiation sets leave of the options offered in an observation; all, where that is none.
+
+    Args:
+        state: the tensors of ``initiation.safetensors``.
+        shape: of an observation.
+        options: O.
+        threshold: an option is held back where its chance is below this.
+
+    Returns:
+        From an observation (*shape) and what is offered in it, bool (O,), a part of the latter.
+
+    Raises:
+        UserError: the tensors are not of so many options on such observations.
+    """
+    own = {name[len(PREFIX) :]: value for name, value in state.items() if name.startswith(PREFIX)}
+    network = load_fitting(lambda: LightQNetwork(shape, options, actions=1), own, NAME)
+    others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
+    check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
+    executions = state["executions"].numpy()
+
+    @torch.no_grad()
+    def narrow(observation: NDArray[np.uint8], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        chances = network(torch.from_numpy(observation[None]))[:, :, 0].sigmoid().numpy()
+        return _narrowed(offered[None], chances, executions, threshold)[0]
+
+    return narrow
 
 
 class Initiation:
@@ -75,10 +117,9 @@ class Initiation:
             ids: int64 (n,).
             offered: bool (n, O).
         """
-        likely = (self.chances(ids) >= self.config.initiation_threshold) | (self.executions < FEWEST)
-        narrowed = offered & likely
+        narrowed = _narrowed(offered, self.chances(ids), self.executions, self.config.initiation_threshold)
         ignored = self.rng.random(len(ids)) < self.config.initiation_ignored
-        narrowed[ignored | ~narrowed.any(1)] = offered[ignored | ~narrowed.any(1)]
+        narrowed[ignored] = offered[ignored]
         return narrowed
 
     def record(self, ids: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
@@ -118,7 +159,7 @@ class Initiation:
 
     def state(self) -> dict[str, Tensor]:
         """Weights and how often each option was executed, for an artefact."""
-        state = {f"network.{name}": value.contiguous() for name, value in self.network.state_dict().items()}
+        state = {f"{PREFIX}{name}": value.contiguous() for name, value in self.network.state_dict().items()}
         return state | {"executions": torch.from_numpy(self.executions.copy())}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
@@ -127,8 +168,8 @@ class Initiation:
         Raises:
             UserError: it is not of so many options on such observations.
         """
-        check_fit(self.state(), state, "initiation.safetensors", AGAIN)
-        self.network.load_state_dict({name: state[f"network.{name}"] for name in self.network.state_dict()})
+        check_fit(self.state(), state, NAME, AGAIN)
+        self.network.load_state_dict({name: state[f"{PREFIX}{name}"] for name in self.network.state_dict()})
         self.executions[:] = state["executions"].numpy()
 
     def snapshot(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,27 @@ def test_options_do_what_their_members_say(options: Options) -> None:
         assert info["option"] == f"{'right' if right else 'left'}-end/{option % MEMBERS}"
         expected = [True, True, False, False] if right else [False, False, True, True]
         assert env.action_masks().tolist() == expected
+
+
+def test_options_are_held_back_by_what_was_learned_of_them(run: Path, options: Options) -> None:
+    """Spec D7, E1: initiation sets come with the artefact, and ``action_masks`` goes by them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(TESTS))
+        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+        play = settings("steps=600", "environments=4", "warm_up=100", "layout_seed=0", "max_episode_steps=30")
+        learned = settings("initiation=learned", "initiation_threshold=1", "random_episodes=0", "option_batch=32")
+        out = str(run / "narrowed")
+        assert main(["train-options", str(run / "ensemble"), "--out", out, "-q", *play, *learned]) == 0
+    narrowed = hypogoal.load_options(out)
+    assert options.initiation is None and narrowed.initiation is not None
+    env = hypogoal.OptionEnv(corridor(), narrowed)
+    observation, _ = env.reset(seed=0)
+    assert env.action_masks().any()
+    assert env.action_masks().tolist() == narrowed.offered(observation).tolist()
+    only = replace(narrowed, initiation=lambda _, offered: offered & (np.arange(narrowed.count) == 1))
+    env = hypogoal.OptionEnv(corridor(), only)
+    env.reset(seed=0)
+    assert env.action_masks().tolist() == [False, True, False, False]
 
 
 def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) -> None:

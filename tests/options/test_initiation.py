@@ -4,12 +4,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
+import torch
 
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
-from hypogoal.options.initiation import FEWEST, Initiation
+from hypogoal.options.initiation import FEWEST, Initiation, narrowing
 from hypogoal.options.recording import Recorder
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
 
@@ -83,3 +86,23 @@ def test_executions_that_the_end_of_the_episode_cut_short_say_nothing() -> None:
     for _ in range(5):
         loop.step()
     assert loop.initiation.count == 0
+
+
+def test_an_artefacts_initiation_sets_hold_back_the_same() -> None:
+    """Spec D7, E1: from an observation as in training from a state, but for the share that is left alone."""
+    loop = loop_with_initiation(mask_reached=True, initiation_threshold=0.5)
+    for _ in range(600):
+        loop.step()
+    own = loop.initiation
+    narrow = narrowing(own.state(), loop.engine.observation_shape, 2, 0.5)
+    ids = np.arange(LENGTH)
+    offered = np.ones((LENGTH, 2), dtype=np.bool_)
+    offered[0, 0] = offered[-1, 1] = False
+    expected = own.narrow(ids, offered)
+    found = [narrow(image, one) for image, one in zip(loop.engine.images(ids), offered, strict=True)]
+    np.testing.assert_array_equal(found, expected)
+    assert not np.array_equal(expected, offered) and expected.any(1).all()
+    with pytest.raises(UserError, match=r"initiation\.safetensors"):
+        narrowing(own.state(), loop.engine.observation_shape, 3, 0.5)
+    with pytest.raises(UserError, match=r"initiation\.safetensors"):
+        narrowing({**own.state(), "executions": torch.zeros(3)}, loop.engine.observation_shape, 2, 0.5)
