@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ ATTRIBUTES = (
     "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete", "lost",
 )  # fmt: skip
 AGAIN, REPAIR = "Collect it again.", "hypogoal verify --repair"
+NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
 MAX_SIDE = 1 << 16  # of an observation
 
 
@@ -78,6 +79,23 @@ class Split:
     origins: Mapping[str, NDArray[np.int64]]
 
 
+def require_names(sub_goals: Sequence[str]) -> None:
+    """Names of sub-goals become those of files and of groups in HDF5 files, on every system.
+
+    Raises:
+        UserError: there is none, one cannot be a file's name, or two differ in upper and lower case only.
+    """
+    if not sub_goals:
+        raise UserError("there are no sub-goals", None, "Give one at least, with a name.")
+    for name in sub_goals:
+        if not plain_name(name) or name.endswith(".") or set(name) & set(NO_FILE_NAME):
+            do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, a dot or space first or last."
+            raise UserError("a sub-goal's name must be able to be a file's name", repr(name), do)
+    if len({name.casefold() for name in sub_goals}) < len(sub_goals):
+        do = "Give them different names; upper and lower case are one to some file systems."
+        raise UserError("two sub-goals have the same name", ", ".join(sub_goals), do)
+
+
 def write_dataset(
     path: Path,
     collected: Collected,
@@ -87,7 +105,12 @@ def write_dataset(
     seed: int,
     force: bool = False,
 ) -> None:
-    """Write collected states; the file appears under its name only when it is whole."""
+    """Write collected states; the file appears under its name only when it is whole.
+
+    Raises:
+        UserError: see :func:`require_names`, or the file exists.
+    """
+    require_names(collected.sub_goals)
     claim(path, force=force)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")

@@ -65,7 +65,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
         config: how options are learned.
     """
     oracle = config.termination == "oracle"
-    options = len(domain.sub_goals) if oracle else len(about["sub_goals"]) * about["members"]
+    options = len(about["sub_goals"]) * (1 if oracle else about["members"])
     picture = prod(domain.observation_shape)
     paper = config.network == "paper"
     replays = options if paper else 1

@@ -79,6 +79,42 @@ class Lying(CorridorEnv):
         return super().image().astype(np.int32)
 
 
+class Grey(CorridorEnv):
+    """Its images have no colours, and no axis for them."""
+
+    observation_space = spaces.Box(0, 255, SHAPE[:2], np.uint8)
+
+    def image(self) -> np.ndarray:
+        return super().image()[..., 0]
+
+
+class Flipped(CorridorEnv):
+    """Its images are views that run backwards."""
+
+    def image(self) -> np.ndarray:
+        return super().image()[..., ::-1]
+
+
+class Stacked(CorridorEnv):
+    """Four frames, one behind the other, first."""
+
+    observation_space = spaces.Box(0, 255, (4, *SHAPE[:2]), np.uint8)
+
+
+class Turned(CorridorEnv):
+    """As many bytes as its space says, in another order."""
+
+    observation_space = spaces.Box(0, 255, (SHAPE[0] // 2, SHAPE[1] * 2, 3), np.uint8)
+
+
+def carries(env: gymnasium.Env) -> bool:
+    return env.unwrapped.carrying is not None  # type: ignore[attr-defined]
+
+
+GREY, STACKED, TURNED = (GymnasiumDomain(env, SUB_GOALS) for env in (Grey, Stacked, Turned))
+RAISING = GymnasiumDomain(CorridorEnv, {"key": carries})
+NAMELESS = GymnasiumDomain(CorridorEnv, {"rooms/low": at_left})
+TWICE = GymnasiumDomain(CorridorEnv, {"End": at_left, "end": at_right})
 FLOATS, STEERED, RESTLESS, LYING = (GymnasiumDomain(env, SUB_GOALS) for env in (Floats, Steered, Restless, Lying))
 NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: False})
 ALWAYS = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "somewhere": lambda env: True})

@@ -177,7 +177,7 @@ def create_artefact(
     with draft(out, identity, force=force, resume=resume) as work:
         yield work.files
         files = {
-            str(file.relative_to(work.files)): sha256_of(file)
+            file.relative_to(work.files).as_posix(): sha256_of(file)
             for file in sorted(work.files.rglob("*"))
             if file.is_file()
         }
@@ -190,7 +190,10 @@ def _input_entry(path: Path, out: Path) -> dict[str, str]:
     folder = path.is_dir()
     target = path / MANIFEST if folder else path
     kind = open_artefact(path).kind if folder else "data"
-    relative = os.path.relpath(path.absolute(), out.absolute())
+    try:
+        relative = os.path.relpath(path.absolute(), out.absolute())
+    except ValueError:  # Windows: on another drive
+        relative = str(path.absolute())
     return {"path": str(path), "relative": relative, "kind": kind, "sha256": sha256_of(target)}
 
 

@@ -11,9 +11,12 @@ import contextlib
 import importlib
 import os
 import sys
+import traceback
 from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from importlib import metadata
+from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from hypogoal.core.errors import UserError
@@ -75,6 +78,36 @@ def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> A
     try:
         found = importlib.import_module(module)
         return getattr(found, attribute) if attribute else found
-    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
-        do = "Check the module and the object."
-        raise UserError(f"the {what} cannot be loaded ({error})", name, do) from None
+    except UserError:
+        raise
+    except Exception as error:  # whatever a module does when it is loaded
+        do = "Check the module and the object; --debug shows where."
+        raise UserError(f"the {what} cannot be loaded ({type(error).__name__}: {error})", name, do) from error
+
+
+class UsersCode:
+    """A block in which code of the user's own runs: what it raises is told with its place, as the user's to mend.
+
+    Args:
+        what: whose code it is ("the label function of won").
+
+    Raises:
+        UserError: when leaving the block by another exception than a UserError.
+    """
+
+    __slots__ = ("what",)
+
+    def __init__(self, what: str):
+        self.what = what
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, Exception) and not isinstance(error, UserError):
+            place = traceback.extract_tb(trace)[-1]
+            where = f"{Path(place.filename).name}, line {place.lineno}"
+            do = "Mend it; --debug shows how it was called."
+            raise UserError(f"{self.what} raised {type(error).__name__}: {error}", where, do) from error

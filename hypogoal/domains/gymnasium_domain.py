@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.gymnasium_engine import (
     MEMORY,
+    RESET,
+    STEP,
     GymnasiumEngine,
     Label,
     MakeEnv,
@@ -150,19 +153,23 @@ class GymnasiumDomain:
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states, labels))
                 group.offer((image, layout, episode, step), rng)
 
-        observation, _info = env.reset(seed=layout)
+        with RESET:
+            observation, _info = env.reset(seed=layout)
         look(observation)
         for _ in range(config.steps):
             if self.policy is None or rng.random() < config.explore:
                 action = int(rng.integers(env.action_space.n))  # type: ignore[attr-defined]
             else:
-                action = int(self.policy(env, observation, rng))
-            observation, _reward, terminated, truncated, _info = env.step(action)
+                with UsersCode("the domain's policy"):
+                    action = int(self.policy(env, observation, rng))
+            with STEP:
+                observation, _reward, terminated, truncated, _info = env.step(action)
             step += 1
             look(observation)  # the last state of an episode, too: a sub-goal may lie there
             progress.advance()
             if terminated or truncated or step >= config.max_episode_steps:
-                observation, _info = env.reset(seed=layout)
+                with RESET:
+                    observation, _info = env.reset(seed=layout)
                 episode, step = episode + 1, 0
         return _shared_out(list(groups.values()), config.states, self.observation_shape, len(self.sub_goals))
 

@@ -12,10 +12,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode
 from hypogoal.domains.base import Step
 
 MakeEnv = Callable[[], gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
+STEP, RESET = UsersCode("the environment's step"), UsersCode("the environment's reset")
+MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
 
@@ -27,12 +30,18 @@ def make_checked(make: MakeEnv) -> gymnasium.Env:
     """
     try:
         env = make()
-    except (gymnasium.error.Error, ImportError, TypeError, ValueError) as error:
-        raise UserError(f"the environment cannot be made ({error})", None, "Mend the function that makes it.") from None
+    except UserError:
+        raise
+    except Exception as error:  # whatever it does
+        do = "Mend the function that makes it; --debug shows where it fails."
+        raise UserError(f"the environment cannot be made ({type(error).__name__}: {error})", None, do) from error
     space, actions = env.observation_space, env.action_space
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
         do = "Wrap it so that it gives images, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
         raise UserError("observations must be images, uint8 (H, W, C) or (H, W)", space, do)
+    if len(space.shape) == 3 and space.shape[0] in (1, 3, 4) and space.shape[2] > MOST_CHANNELS:
+        do = "Wrap it in gymnasium.wrappers.TransformObservation with x.transpose(1, 2, 0)."
+        raise UserError("observations have their channels, or stacked frames, first", space.shape, do)
     if not isinstance(actions, spaces.Discrete) or actions.start != 0:
         raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
     return env
@@ -42,7 +51,12 @@ def shape_of(env: gymnasium.Env) -> tuple[int, ...]:
     """(H, W, C) of an environment's observations."""
     shape = env.observation_space.shape
     assert shape is not None
-    return tuple(int(size) for size in (shape if len(shape) == 3 else (*shape, 1)))
+    return with_channels(tuple(map(int, shape)))
+
+
+def with_channels(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """(H, W, 1) of (H, W), any other as it is."""
+    return (*shape, 1) if len(shape) == 2 else shape
 
 
 def as_image(observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -52,16 +66,17 @@ def as_image(observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         UserError: it is not what the environment's observation space says.
     """
     image = np.array(observation, order="C")
-    if image.dtype != np.uint8 or image.size != int(np.prod(shape)):
+    if image.dtype != np.uint8 or with_channels(image.shape) != shape:
         found = f"{image.dtype} {image.shape}"
-        do = f"Make the observation space and the observations agree; the space says uint8 {shape}."
+        do = f"Make the observation space and the observations agree; the former says uint8 {shape}."
         raise UserError("the environment gave another observation than its space says", found, do)
     return image.reshape(shape)
 
 
 def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
     """Which sub-goals hold in an environment's current state, bool (G,)."""
-    return np.array([bool(label(env)) for label in labels], dtype=np.bool_)
+    with UsersCode("a sub-goal's function"):
+        return np.array([bool(label(env)) for label in labels], dtype=np.bool_)
 
 
 class GymnasiumEngine:
@@ -132,7 +147,8 @@ class GymnasiumEngine:
         terminated, truncated = np.zeros((2, self.count), dtype=np.bool_)
         ids, elapsed = np.empty_like(next_ids), self.elapsed + 1
         for number, (env, action) in enumerate(zip(self._envs, actions.tolist(), strict=True)):
-            observation, reward, over, cut, _info = env.step(action)
+            with STEP:
+                observation, reward, over, cut, _info = env.step(action)
             self._played[number].append(action)
             next_ids[number] = ids[number] = self._remember(env, observation)
             rewards[number], terminated[number] = float(reward), bool(over)
@@ -143,7 +159,8 @@ class GymnasiumEngine:
         return Step(next_ids, rewards, terminated, truncated & ~terminated)
 
     def _begin(self, number: int) -> int:
-        observation, _info = self._envs[number].reset(seed=self.layout_seed)
+        with RESET:
+            observation, _info = self._envs[number].reset(seed=self.layout_seed)
         self._played[number] = []
         return self._remember(self._envs[number], observation)
 
@@ -217,9 +234,11 @@ class GymnasiumEngine:
             self._ids[digest] = identity
         for number, actions in enumerate(snapshot["played"]):
             env = self._envs[number]
-            observation, _info = env.reset(seed=self.layout_seed)
-            for action in actions:
-                observation = env.step(action)[0]
+            with RESET:
+                observation, _info = env.reset(seed=self.layout_seed)
+            with STEP:
+                for action in actions:
+                    observation = env.step(action)[0]
             here, was = as_image(observation, self.observation_shape), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 raise UserError(

@@ -59,19 +59,25 @@ def evaluate_selection(
 
 
 def match_on_layout(source: Artefact, layout_seed: int) -> NDArray[np.float64]:
-    """Spec F6: every member's balanced accuracy on the states of a layout, float (G*K,)."""
+    """Spec F6: every member's balanced accuracy on the states of a layout, float (G*K,).
+
+    NaN where the domain does not have the sub-goal, which the user's own labels told: its truth there is not known.
+    """
     domain = load_domain(source.config["domain"])
     known = source.config["domain_config"]
     extra = {key: known[key] for key in ("keyring", "door_label") if key in known}
     engine: Any = domain.make_engine(layout_seed, 1, 500, **extra)
     ids = states_of_layout(engine)
     images, labels = engine.images(ids), engine.labels(ids)
-    columns = [domain.sub_goals.index(sub_goal) for sub_goal in source.config["sub_goals"]]
+    known_goals = list(domain.sub_goals)
     match = []
-    for sub_goal, column in zip(source.config["sub_goals"], columns, strict=True):
+    for sub_goal in source.config["sub_goals"]:
+        if sub_goal not in known_goals:
+            match.append(np.full(source.config["members"], np.nan))
+            continue
         ensemble = read_ensemble(source.path, source.config, sub_goal)
         verdicts = ensemble.verdicts(images, engine.positions(ids) if ensemble.needs_positions else None)
-        match.append(member_scores(verdicts, labels[:, column])["balanced_accuracy"])
+        match.append(member_scores(verdicts, labels[:, known_goals.index(sub_goal)])["balanced_accuracy"])
     return np.concatenate(match)
 
 

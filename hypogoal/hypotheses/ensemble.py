@@ -78,7 +78,7 @@ class Ensemble(nn.Module):
     def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
         """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`."""
         self._check(observations, positions)
-        return self.view.see(observations, positions)
+        return np.ascontiguousarray(self.view.see(observations, positions))  # flipped pictures are no tensors
 
     def verdicts(
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None

@@ -10,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.domains.gymnasium_engine import as_image, with_channels
 from hypogoal.hypotheses.ensemble import Ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -23,7 +24,7 @@ def require_observations(env: Env, shape: tuple[int, ...]) -> None:
         UserError: it is one.
     """
     space = env.observation_space
-    if space.shape != shape or space.dtype != np.uint8:
+    if space.shape is None or with_channels(space.shape) != shape or space.dtype != np.uint8:
         found = f"{space.dtype} {space.shape}, not uint8 {shape}"
         do = "Use the environment they were trained on, with its wrappers."
         raise UserError("the environment's observations are not those that these members know", found, do)
@@ -46,7 +47,8 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.ensemble, self.by = ensemble, by
 
     def holds(self, observation: NDArray[np.uint8]) -> bool:
-        """Whether the sub-goal holds in an observation (H, W, C), by the members asked."""
+        """Whether the sub-goal holds in an observation (H, W, C), or (H, W), by the members asked."""
+        observation = as_image(observation, self.ensemble.observation_shape)
         if self.by == "mean":
             return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
         verdicts = self.ensemble.verdicts(observation[None])[0]

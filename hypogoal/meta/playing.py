@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,19 +66,19 @@ def build(
         device: where the networks are.
 
     Raises:
-        UserError: the domain has no such start.
+        UserError: the domain has no such start, or options are to end at true sub-goals that it does not have.
     """
+    goals: Sequence[str] = about["sub_goals"]
     extra = {key: about["domain_config"][key] for key in ("keyring", "door_label") if key in about["domain_config"]}
     oracle = config.termination == "oracle"
-    options = len(domain.sub_goals) if oracle else len(about["sub_goals"]) * about["members"]
+    columns = _columns(domain, goals) if oracle else []
+    options = len(goals) * (1 if oracle else about["members"])
     extra |= start_arguments(domain, config, options, seed)
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **extra)
     if oracle:
-        verdicts = Verdicts(oracle_terminations(engine), options)
+        verdicts = Verdicts(oracle_terminations(engine, columns), options)
     else:
-        ensembles = [
-            read_ensemble(ensemble_folder, dict(about), sub_goal).to(device) for sub_goal in about["sub_goals"]
-        ]
+        ensembles = [read_ensemble(ensemble_folder, dict(about), sub_goal).to(device) for sub_goal in goals]
         if config.experience == "own" and not config.mask_reached:
             verdicts = MemberVerdicts(engine, ensembles)
         else:
@@ -86,6 +86,19 @@ def build(
         if hasattr(engine, "reachable"):
             verdicts.of(engine.reachable())  # most of what will be visited, judged at once
     return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed, device)
+
+
+def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
+    """Where among the domain's own these sub-goals are."""
+    own = list(domain.sub_goals)
+    for sub_goal in sub_goals:
+        if sub_goal not in own:
+            raise UserError(
+                f"{domain.name} does not know where {sub_goal!r} is true",
+                "termination=oracle",
+                f"It knows of {', '.join(own)}; leave the setting out for members' verdicts.",
+            )
+    return [own.index(sub_goal) for sub_goal in sub_goals]
 
 
 def visited_by(engine: Engine, config: PlayConfig, seed: int) -> Visited | None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_fitting
+from hypogoal.domains.gymnasium_engine import as_image
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.execution import offered_options
@@ -104,7 +105,8 @@ def _light_policies(
     def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
         @torch.no_grad()
         def act(observation: NDArray[np.uint8]) -> int:
-            return int(actions[int(network(torch.from_numpy(observation[None]))[0, option].argmax())])
+            image = torch.from_numpy(np.ascontiguousarray(observation[None]))
+            return int(actions[int(network(image)[0, option].argmax())])
 
         return act
 
@@ -131,7 +133,8 @@ def _paper_policies(
         @torch.no_grad()
         def act(observation: NDArray[np.uint8]) -> int:
             nonlocal hidden
-            values, hidden = network(network.embed(torch.from_numpy(observation[None]))[:, None], hidden)
+            image = torch.from_numpy(np.ascontiguousarray(observation[None]))
+            values, hidden = network(network.embed(image)[:, None], hidden)
             return int(actions[int(values[0, 0].argmax())])
 
         return act
@@ -173,15 +176,15 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gymnasium.Env[Any, Any], options: Options, gamma: float = 1.0):
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma)
         gymnasium.Wrapper.__init__(self, env)
-        require_observations(env, tuple(options.ensembles[0].observation_shape))
-        self.options, self.gamma = options, gamma
+        self.options, self.gamma, self._shape = options, gamma, tuple(options.ensembles[0].observation_shape)
+        require_observations(env, self._shape)
         self.action_space = gymnasium.spaces.Discrete(options.count)
-        self._observation: NDArray[np.uint8] | None = None
+        self._image: NDArray[np.uint8] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """As the environment's own."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._observation = observation
+        self._image = as_image(observation, self._shape)
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -193,20 +196,21 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         option = int(action)
         act = self.options.policies(option)
         total, duration, reached, ended = 0.0, 0, False, False
-        observation = self._current()
+        image, observation = self._current(), None
         terminated = truncated = False
         info: dict[str, Any] = {}
         while not ended:
-            observation, reward, terminated, truncated, info = self.env.step(act(observation))
+            observation, reward, terminated, truncated, info = self.env.step(act(image))
+            image = as_image(observation, self._shape)
             total += self.gamma**duration * float(reward)
             duration += 1
-            reached = self.options.holds(option, observation)
+            reached = self.options.holds(option, image)
             ended = reached or terminated or truncated or duration >= self.options.timeout
-        self._observation = observation
+        self._image = image
         info = info | {"duration": duration, "reached": reached, "option": self.options.name(option)}
         return observation, total, terminated, truncated, info
 
     def _current(self) -> NDArray[np.uint8]:
-        if self._observation is None:
+        if self._image is None:
             raise UserError("the environment was not reset", None, "Call reset() first.")
-        return self._observation
+        return self._image

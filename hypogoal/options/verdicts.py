@@ -49,9 +49,14 @@ def _positions(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def oracle_terminations(engine: Engine) -> Classifier:
-    """Spec E6: the true sub-goal predicates, one option per sub-goal; an upper bound, never the method."""
-    return engine.labels
+def oracle_terminations(engine: Engine, columns: Sequence[int] | None = None) -> Classifier:
+    """Spec E6: the true sub-goal predicates, one option per sub-goal; an upper bound, never the method.
+
+    Args:
+        engine: knows them.
+        columns: which of its sub-goals, in this order; None: all.
+    """
+    return engine.labels if columns is None else lambda ids: engine.labels(ids)[:, columns]
 
 
 class Verdicts:

@@ -37,7 +37,11 @@ def read_arrays(path: Path) -> Parts:
         raise UserError(f"no array {missing[0]!r}", path, do)
     if ("heldout_observations" in arrays) != ("heldout_labels" in arrays):
         raise UserError("held-out states need observations and labels", path, f"Give {' and '.join(OPTIONAL)}.")
-    named = tuple(map(str, arrays[NAMES].ravel())) if NAMES in arrays else ()
+    named: tuple[str, ...] = ()
+    if NAMES in arrays:
+        if arrays[NAMES].dtype.kind != "U":
+            raise UserError(f"{NAMES} are no texts but {arrays[NAMES].dtype}", path, "Give numpy.array of str.")
+        named = tuple(map(str, arrays[NAMES].ravel()))
     return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, sub_goals=named)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,13 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.own_data.parts import Parts
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
 ARRAY = ".npy"  # a state that no image file holds, such as a stack of four frames
 DO = "Remove it, or write it again."
+GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", "PA", "RGBA")  # of 8 bits a channel
 
 
 def read_images(folder: Path) -> Parts:
@@ -73,9 +78,9 @@ def read_image(file: Path) -> NDArray[np.uint8]:
         file: an image, or a ``.npy`` file with an array uint8 (H, W, C).
 
     Raises:
-        UserError: it cannot be read.
+        UserError: it cannot be read, has more than 8 bits a channel, or is transparent in places.
     """
-    from PIL import Image
+    import PIL.Image
 
     try:
         if file.suffix == ARRAY:
@@ -83,11 +88,23 @@ def read_image(file: Path) -> NDArray[np.uint8]:
             if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
             return np.array(values)
-        with Image.open(file) as image:
-            values = np.asarray(image.convert("L" if image.mode in ("1", "L") else "RGB"), dtype=np.uint8)
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError):
+        with PIL.Image.open(file) as image:
+            values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
+    except (OSError, ValueError, SyntaxError, EOFError, PIL.Image.DecompressionBombError):
         raise UserError("this is no image, or a damaged one", file, DO) from None
     return values.reshape(*values.shape[:2], -1)
+
+
+def _opaque(image: Image, file: Path) -> Image:
+    """The image itself, where its colours are all that can be seen of it, and bytes hold them."""
+    if image.mode not in (*GREY, *COLOURED, *TRANSPARENT):
+        do = "Scale it to 0..255 and write it again."
+        raise UserError(f"the image has the mode {image.mode}, not 8 bits a channel", file, do)
+    if image.mode in TRANSPARENT or "transparency" in image.info:
+        if np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+            raise UserError("the image is transparent in places", file, "Put it on a background, as the agent sees it.")
+        return image.convert("RGB")
+    return image
 
 
 def _read(files: list[Path]) -> list[NDArray[np.uint8]]:

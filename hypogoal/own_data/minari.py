@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, read_array
+from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import write_observations
 from hypogoal.meta.recorded import Episode
@@ -95,7 +96,11 @@ def _number(name: str) -> int:
 
 def _told(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.bool_]:
     """What the functions say of each observation, bool (N, G)."""
-    return np.array([[bool(label(observation)) for label in labels] for observation in observations], np.bool_)
+    told = np.empty((len(observations), len(labels)), np.bool_)
+    for column, label in enumerate(labels):
+        with UsersCode(f"the label function {getattr(label, '__name__', column)}"):
+            told[:, column] = [bool(label(observation)) for observation in observations]
+    return told
 
 
 def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, actions: int, description: str) -> int:

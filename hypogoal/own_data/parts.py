@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States
+from hypogoal.dataset import Collected, States, require_names
 
 FEW = 10  # states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
@@ -70,6 +69,9 @@ def collected_of(
             "of other contexts"
         )
     require_classes(labels, goals, warned)
+    for goal, told in zip(goals, known.T, strict=True):
+        if len(np.unique(told)) < 2:
+            warned.append(f"{goal} has one class only in the held-out states, so it cannot be judged by them")
     rows = [np.arange(len(part), dtype=np.int64) for part in (images, unlabelled, heldout)]
     sets = (
         States(images, labels, {"row": rows[0]}),
@@ -116,7 +118,7 @@ def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = N
         UserError: another number of them, or other values than 0 and 1.
     """
     found = f"{values.dtype} {values.shape}"
-    columns = values.reshape(len(values), -1) if values.ndim in (1, 2) else values
+    columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or len(columns) != count or columns.shape[1] == 0:
         raise UserError(f"{what} do not fit {count} states", found, f"Give ({count},), or ({count}, sub-goals).")
     if columns.dtype.kind not in "biuf" or not np.isin(columns, (0, 1)).all():
@@ -134,19 +136,33 @@ def named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
         UserError: not as many, the same one twice, or no plain names.
     """
     names = tuple(sub_goals) or (("sub-goal",) if count == 1 else ())
-    if len(names) != count or len(set(names)) != count or not all(map(plain_name, names)):
-        do = f"Give --sub-goal NAME {count} times, different plain names in the order of the labels' columns."
+    if len(names) != count:
+        do = f"Give --sub-goal NAME {count} times, in the order of the labels' columns."
         raise UserError(f"{count} sub-goals need as many names", ", ".join(names) or None, do)
+    require_names(names)
     return names
 
 
 def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.bool_]:
-    """Which states (N,) are held out: ``share`` of each combination of labels (N, G), at random."""
+    """Which states (N,) are held out: ``share`` of each combination of labels (N, G), at random, but never all of one.
+
+    What is too little of one combination to be a state is added to the next one's share.
+
+    Raises:
+        UserError: there are too few states to hold one out.
+    """
     rng = rng_for(seed, "held-out")
     chosen = np.zeros(len(labels), np.bool_)
+    due = 0.0
     for kind in np.unique(labels, axis=0):
         rows = np.flatnonzero((labels == kind).all(axis=1))
-        chosen[rng.permutation(rows)[: round(share * len(rows))]] = True
+        due += share * len(rows)
+        taken = min(round(due), len(rows) - 1)
+        chosen[rng.permutation(rows)[:taken]] = True
+        due -= taken
+    if not chosen.any():
+        what = f"of {len(labels)} labelled states none can be held out"
+        raise UserError(what, f"heldout={share:g}", "Give held-out states, a larger --heldout, or more labelled ones.")
     return chosen
 
 

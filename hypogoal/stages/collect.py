@@ -12,7 +12,7 @@ from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import draft, put_in_place
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import open_dataset, write_dataset
+from hypogoal.dataset import open_dataset, require_names, write_dataset
 from hypogoal.domains.base import Domain
 
 COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
@@ -44,6 +44,7 @@ def collect(
     Returns:
         Numbers of states and positives per split and sub-goal.
     """
+    require_names(domain.sub_goals)  # not after all the play, when the file is written
     claim(out, force=force, resume=resume)
     size = getattr(domain, "collected_bytes", lambda config: 0)(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)

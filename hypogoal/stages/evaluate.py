@@ -92,7 +92,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
         metrics = {
             "run": found.run.resolve().name,
             "settings": {**SETTINGS, **(LADDERS if found.ladders else {})},
-            "missing": missing(found, list(groups), rooms, distance),
+            "missing": missing(found, list(groups), rooms, distance, selection),
             "agents": agents,
             "layouts": layouts_of(runs),
             "hypotheses": hypotheses_table(ensembles),
@@ -256,19 +256,30 @@ def layouts_of(runs: Iterable[Run]) -> list[dict[str, Any]]:
 
 
 def missing(
-    found: Found, names: list[str], rooms: list[dict[str, Any]], distance: Mapping[str, list[dict[str, Any]]]
+    found: Found,
+    names: list[str],
+    rooms: list[dict[str, Any]],
+    distance: Mapping[str, list[dict[str, Any]]],
+    selection: list[dict[str, Any]],
 ) -> list[str]:
     """One line for everything of section F that this run has no artefacts for.
 
     A run with ladders is asked for what Figures 3 to 5 need, one with agents or with neither for Figure 6's.
     """
     lines = [] if found.ensembles else ["no ensemble"]
+    lines += [f"no truth of {goal} in its domain, to match members with" for goal in _unknown_goals(selection)]
     lines += [f"no executions.csv in {found.name(artefact)}: its domain tells no distance" for artefact in found.silent]
     if rooms or found.ladders:
         lines += missing_ladders(rooms, distance["options"])
     if names or not (rooms or found.ladders):
         lines += missing_agents(names)
     return lines
+
+
+def _unknown_goals(selection: list[dict[str, Any]]) -> list[str]:
+    goals = [goal for agent in selection for run in agent["runs"] for goal in run["sub_goals"]]
+    unknown = [goal for goal in goals if all(math.isnan(member["match"]) for member in goal["members"])]
+    return list(dict.fromkeys(goal["sub_goal"] for goal in unknown))
 
 
 def provenance(found: Found, data: list[Path]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import hypogoal
 from hypogoal.core import own_code
 from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name
+from hypogoal.dataset import require_names
 from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS
 from hypogoal.own_data import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
 
@@ -49,8 +49,7 @@ def label(
     Raises:
         UserError: no such source, ``out`` exists, or there is no screen.
     """
-    if not plain_name(out.resolve().name):
-        raise UserError("the folder's name must be able to be a sub-goal's", out, "Give another --out.")
+    require_names([out.resolve().name])
     if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
         raise UserError("it exists already", out, "Give --resume to go on with it, or another --out.")
     states = _source(source, layout_seed, arguments or {})
@@ -64,17 +63,31 @@ def label(
 def _source(source: str, layout_seed: int, arguments: Mapping[str, Any]) -> Source:
     if Path(source).exists():
         return Recorded(recorded_states(Path(source)))
-    return Played(partial(_environment, source, arguments), layout_seed)
+    return Played(partial(environment_of, source, arguments), layout_seed)
 
 
-def _environment(source: str, arguments: Mapping[str, Any]) -> Any:
-    """An environment by its id, of a domain, or by the function that makes it."""
+def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
+    """An environment by its id, of a domain, or by the function that makes it.
+
+    Args:
+        source: an id (``ALE/Freeway-v5``), a domain's name, or ``module:object``.
+        arguments: of the environment.
+
+    Raises:
+        UserError: there is no such thing.
+    """
     hypogoal.register()
+    import ale_py
+    import minigrid  # noqa: F401 - registers its environments when it is loaded
+
+    gymnasium.register_envs(ale_py)
     if source in gymnasium.registry:
         return gymnasium.make(source, **arguments)
     try:
         found = own_code.load_own(source, "environment", ENTRY_POINTS, BUILT_IN)
     except UserError as error:
+        if source.partition(":")[2] in gymnasium.registry:  # Gymnasium's module:id, and the module is loaded now
+            return gymnasium.make(source, **arguments)
         if ":" in source:
             raise
         do = "Give a data file, a .npz file, a folder of images, a domain, an environment's id or module:object."

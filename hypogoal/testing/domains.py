@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.config import resolve
-from hypogoal.core.files import plain_name
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import Collected, States
+from hypogoal.dataset import Collected, States, require_names
 from hypogoal.domains.base import Domain, Engine, Step
 from hypogoal.testing.verdict import Broken, Test, Verdict, run
 
@@ -49,8 +48,7 @@ class _Contract:
 
     def names(self) -> str:
         goals = tuple(self.domain.sub_goals)
-        if not goals or len(set(goals)) != len(goals) or not all(map(plain_name, goals)):
-            raise Broken(f"sub_goals is {goals!r}", "Give different names without / \\ or a dot in front.")
+        require_names(goals)
         if not dataclasses.is_dataclass(self.domain.config_class):
             do = "Make it a frozen dataclass of hypogoal.core.config.setting fields; it may have none."
             raise Broken(f"config_class is {self.domain.config_class!r}", do)

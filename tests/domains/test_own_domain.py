@@ -60,3 +60,24 @@ def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
     facts = json.loads((tmp_path / agent / "layout.json").read_text(encoding="utf-8"))
     assert facts["shortest_path"] is None and facts["random_success"] is None
     assert json.loads((tmp_path / agent / "manifest.json").read_text())["config"]["domain"] == "own_domain:ODD"
+
+
+@pytest.mark.parametrize(
+    ("domain", "message"),
+    [
+        ("NAMELESS", "a sub-goal's name must be able to be a file's name: 'rooms/low'"),
+        ("TWICE", "two sub-goals have the same name: End, end"),
+        ("STACKED", "observations have their channels, or stacked frames, first: (4, 48, 48)"),
+        ("TURNED", "the environment gave another observation than its space says: uint8 (48, 48, 3)"),
+        ("RAISING", "a sub-goal's function raised AttributeError: "),
+    ],
+)
+def test_what_is_wrong_with_an_own_domain_is_one_line(
+    domain: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec B6, G2: at once, not when all is played; of the user's own code its place."""
+    assert main(["collect", f"corridor_env:{domain}", "--out", str(tmp_path / "data.h5"), "-q"]) == 2
+    err = capsys.readouterr().err
+    assert message in err and err.count("\n") == 1
+    assert domain != "RAISING" or "corridor_env.py, line " in err
+    assert not list(tmp_path.glob("data.h5"))

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from corridor_env import LENGTH, CorridorEnv
+from corridor_env import LENGTH, CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
@@ -125,6 +125,40 @@ def test_a_registered_environment_can_be_made_again_with_its_wrapper() -> None:
 
     for kind in (hypogoal.OptionEnv, hypogoal.SubgoalReward, hypogoal.SubgoalTermination):
         assert issubclass(kind, RecordConstructorArgs)
+
+
+def test_pictures_that_are_flipped_views(options: Options, ensemble: Ensemble) -> None:
+    """Spec E1: as BGR to RGB gives them; networks see the same as of a copy."""
+    env = hypogoal.OptionEnv(TimeLimit(Flipped(), 30), options)
+    env.reset(seed=0)
+    assert 1 <= env.step(0)[4]["duration"] <= options.timeout
+    reward = hypogoal.SubgoalReward(TimeLimit(Flipped(), 30), ensemble)
+    observation, _ = reward.reset(seed=0)
+    reward.step(1)
+    flipped, copied = observation[None], observation[None].copy()
+    np.testing.assert_array_equal(ensemble.predict(flipped), ensemble.predict(copied))
+    assert options.policies(0)(flipped[0]) == options.policies(0)(copied[0])
+
+
+def test_pictures_without_an_axis_of_colours(tmp_path: Path) -> None:
+    """Spec B6, E1: of an environment with observations (H, W) the networks are (H, W, 1), its wrappers take (H, W)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(TESTS))
+        patch.setenv("HYPOGOAL_TRUST", "corridor_env:GREY")
+        few = settings("steps=60", "heldout_seeds=4,5", "unlabelled_seeds=1")
+        assert main(["collect", "corridor_env:GREY", "--out", str(tmp_path / "data.h5"), "-q", *few]) == 0
+        few = settings("steps=2", f"members={MEMBERS}", "workers=1")
+        assert main(["train-ensemble", str(tmp_path / "data.h5"), "--out", str(tmp_path / "e"), "-q", *few]) == 0
+        play = settings("steps=100", "environments=2", "layout_seed=0", "random_episodes=0", "warm_up=50")
+        assert main(["train-options", str(tmp_path / "e"), "--out", str(tmp_path / "o"), "-q", *play]) == 0
+    known = hypogoal.load_ensemble(tmp_path / "e", "left-end")
+    assert known.observation_shape == (48, 48, 1)
+    for env in (
+        hypogoal.OptionEnv(TimeLimit(Grey(), 30), hypogoal.load_options(tmp_path / "o")),
+        hypogoal.SubgoalReward(TimeLimit(Grey(), 30), known),
+    ):
+        assert env.reset(seed=0)[0].shape == (48, 48)
+        assert env.step(0)[0].shape == (48, 48)
 
 
 def test_options_in_a_vector_of_environments(options: Options) -> None:

@@ -15,6 +15,8 @@ from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data import Parts, collected_of, read_arrays, read_images
+from hypogoal.own_data.images import read_image
+from hypogoal.own_data.parts import held_out
 
 SIDE = 48
 
@@ -89,6 +91,19 @@ def test_a_share_is_held_out_where_nothing_else_is_given(tmp_path: Path, capsys:
     assert "says nothing of other contexts" in capsys.readouterr().err
 
 
+def test_a_share_is_held_out_of_many_small_groups_too() -> None:
+    """Spec B3: what is too little of one combination of labels goes on to the next; never all of one, never nothing."""
+    labels = np.array([[bit >> goal & 1 for goal in range(6)] for bit in range(64)] * 2, dtype=np.bool_)
+    chosen = held_out(labels, 0.2, seed=0)
+    assert chosen.sum() == 26
+    left = {tuple(row) for row in labels[~chosen].tolist()}
+    assert len(left) == 64
+    rare = np.arange(30) == 7
+    assert not held_out(rare[:, None], 0.9, seed=0)[7]
+    with pytest.raises(UserError, match=r"of 64 labelled states none can be held out: heldout=0\.2"):
+        held_out(labels[:64], 0.2, seed=0)
+
+
 def test_unbalanced_classes_are_warned_of() -> None:
     """Spec B6."""
     labels = np.arange(40) < 3
@@ -106,6 +121,9 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "another shape than the labelled ones"),
     ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
     ({"labels": np.arange(39) % 2}, "do not fit 40 states"),
+    ({"labels": np.zeros(0)}, "do not fit 40 states"),
+    ({"sub_goals": np.array([b"won"])}, r"sub_goals are no texts but \|S3"),
+    ({"sub_goals": np.array(["a:b"])}, "a sub-goal's name must be able to be a file's name: 'a:b'"),
     ({"labels": np.arange(40) % 3}, r"are not only 0 and 1: \[2\]"),
     ({"labels": np.full(40, np.nan)}, "are not only 0 and 1"),
     ({"labels": np.zeros(40)}, "has no positives among 40 labelled states"),
@@ -174,6 +192,15 @@ def test_what_is_wrong_with_images_is_one_line(tmp_path: Path) -> None:
     (folder / "positive" / "zz.png").write_bytes(b"no image")
     with pytest.raises(UserError, match=r"no image, or a damaged one: .*zz\.png"):
         read_images(folder)
+    Image.fromarray(np.full((SIDE, SIDE), 40_000, np.uint16)).save(folder / "positive" / "zz.png")
+    with pytest.raises(UserError, match=r"the image has the mode I;16, not 8 bits a channel: .*zz\.png"):
+        read_images(folder)
+    for mode in ("RGBA", "LA"):
+        Image.new("RGB", (SIDE, SIDE), 255).convert(mode).save(folder / "positive" / "zz.png")
+        assert read_image(folder / "positive" / "zz.png").shape == (SIDE, SIDE, 3)
+        Image.new(mode, (SIDE, SIDE)).save(folder / "positive" / "zz.png")
+        with pytest.raises(UserError, match=r"the image is transparent in places: .*zz\.png"):
+            read_images(folder)
     for file in (folder / "unlabelled").iterdir():
         file.unlink()
     with pytest.raises(UserError, match=r"no images .*unlabelled"):
@@ -199,6 +226,10 @@ def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, store
 
 def at_right(observation: np.ndarray) -> bool:
     return bool(observation[20, 35, 0] == 255)
+
+
+def fails(observation: np.ndarray) -> bool:
+    return bool(observation["nothing"])
 
 
 @pytest.mark.parametrize("nested", [False, True])
@@ -229,6 +260,11 @@ def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.Ca
         (save_minari(tmp_path / "e", 2), label, "2 episodes cannot be"),
         (save_minari(tmp_path / "f"), [*label, "--key", "x"], "no readable 'episode_0/observations/x'"),
         (save_images(tmp_path / "g"), label, "no Minari dataset"),
+        (
+            save_minari(tmp_path / "h"),
+            ["--label", "right=test_import:fails"],
+            "the label function fails raised IndexError: ",
+        ),
     ]
     for folder, more, message in cases:
         assert main(["import", str(folder), "--out", str(tmp_path / "data.h5"), *more]) == 2

@@ -15,11 +15,13 @@ from keyboard import label
 
 import hypogoal
 from hypogoal.cli import main
+from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data import Marks, read_images
 from hypogoal.own_data.marking import as_rgb
 from hypogoal.own_data.states_to_mark import action_names, action_of
+from hypogoal.stages.label import environment_of
 
 
 @pytest.fixture(autouse=True)
@@ -158,6 +160,16 @@ def test_what_cannot_be_marked_is_said_and_nothing_written(
     monkeypatch.chdir(tmp_path)
     assert main(["label", *arguments, "--out", "marked"]) == 2
     assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.atari
+@pytest.mark.parametrize("source", ["ALE/Freeway-v5", "ale_py:ALE/Freeway-v5", "MiniGrid-Empty-5x5-v0"])
+def test_environments_are_known_by_their_ids(source: str) -> None:
+    """Spec B6: MiniGrid's and Atari's, which Gymnasium knows when their packages are loaded."""
+    with own_code.given(source):
+        env = environment_of(source, {})
+    assert env.reset(seed=0) is not None
+    env.close()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="elsewhere there is always a screen")
