@@ -90,6 +90,14 @@ def stage_cell(
     return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), cost, tuple((axes or {}).items()))
 
 
+def with_common(arguments: Sequence[str], common: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """A cell's command with what is common to its stage: behind stage and input, so that the cell's own come last.
+
+    Of settings the last one counts: a method or a control is what it is called, whatever all cells were given.
+    """
+    return (*arguments[:2], *common[arguments[0]], *arguments[2:])
+
+
 def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> list[Cell]:
     """Evaluate (which takes ``cost``) and report, when everything else is there."""
     evaluation = run / "evaluation"

@@ -12,10 +12,10 @@ import socket
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from hypogoal.core.config import parse_assignments
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, replace_text
@@ -31,6 +31,7 @@ FORMAT_VERSION = 1
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
 COMMANDS = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "evaluate", "report")
+SHORT = ("--members", "--diversity", "--layout-seed", "--agent")  # options that are settings, which --set goes before
 AGAIN = "Start the sweep again."
 
 
@@ -219,7 +220,32 @@ def check_same(run: Path, cells: Sequence[Cell]) -> None:
         before, after = moved(cell, str(run), RUN), now.get(cell.name)
         if after is None:
             raise UserError(f"the sweep here has a cell that this one has not: {cell.name}", run, do)
-        if (after.arguments, after.out) != (before.arguments, before.out):
-            pairs = zip_longest(before.arguments, after.arguments, fillvalue="")
-            one, other = next((pair for pair in pairs if pair[0] != pair[1]), (before.out, after.out))
+        old, new = _meaning(before), _meaning(after)
+        if old != new:
+            one, other = (next((part for part in a if part not in b), "") for a, b in ((old, new), (new, old)))
             raise UserError(f"{cell.name} of the sweep here was begun with '{one}', not '{other}'", run, do)
+
+
+def _meaning(cell: Cell) -> list[str]:
+    """A cell's command in parts, sorted where their order changes nothing: the same for two that mean the same.
+
+    Of options and settings of one name the order stays or the last one counts; settings go before their options.
+    """
+    groups: list[list[str]] = [[]]
+    for word in cell.arguments:
+        if word.startswith("-"):
+            groups.append([])
+        groups[-1] += word.split("=", 1) if word.startswith("--") else [word]
+    first, *options = groups
+    short, given, rest = [], [], []
+    for group in options:
+        if len(group) == 2 and group[0] in SHORT:
+            short.append(f"{group[0][2:]}={group[1]}")
+        elif len(group) == 2 and group[0] == "--set" and "=" in group[1]:
+            given.append(group[1])
+        else:
+            rest.append(group)
+    settings = parse_assignments([*short, *given])
+    rest.sort(key=lambda group: group[0])
+    parts = [" ".join(group) for group in (first, *rest)]
+    return [*parts, *(f"{key}={settings[key]}" for key in sorted(settings)), str(cell.out)]

@@ -109,9 +109,13 @@ def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Seq
     found = EXPERIMENTS[experiment]
     own, by_stage = _split(assignments)
     config = resolve(found.RunConfig, stage="run", preset=preset, assignments=own, domain=found.DOMAIN)
-    for stage in by_stage:
+    for stage, pairs in by_stage.items():
         if stage not in found.STAGES:
             raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(found.STAGES)}.")
+        for key in parse_assignments(pairs):
+            if key in found.DECIDED:
+                do = f"Give --set {found.DECIDED[key]}=..."
+                raise UserError("the experiment gives each cell its own", f"{stage}.{key}", do)
     resolved: dict[str, Any] = {
         stage: resolve(
             config_class_of(stage, found.DOMAIN),
