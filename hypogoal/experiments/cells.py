@@ -66,11 +66,19 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment's cells, in an order in which they can run, and how many cores they may use at once."""
+    """An experiment.
+
+    Attributes:
+        experiment: its name.
+        cells: in an order in which they can run.
+        workers: how many cores they may use at once.
+        anew: names of those that are still to be made again, whatever is there.
+    """
 
     experiment: str
     cells: list[Cell]
     workers: int
+    anew: frozenset[str] = frozenset()
 
 
 def stage_cell(

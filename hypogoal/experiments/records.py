@@ -11,7 +11,7 @@ import json
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -90,6 +90,12 @@ def begun(before: Record) -> Record:
     return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
 
 
+def forget_records(run: Path, cells: Sequence[Cell]) -> None:
+    """Have no record of cells: as if none of them had ever been started."""
+    for cell in cells:
+        (run / LOGS / f"{cell.name}.json").unlink(missing_ok=True)
+
+
 def open_log(run: Path, cell: Cell) -> BinaryIO:
     """A cell's log to append to, locked: nobody else runs this cell while it, or a copy of it, is open.
 
@@ -155,6 +161,7 @@ def write_plan(run: Path, plan: Plan, factor: float) -> None:
     rows = [_row(moved(cell, str(run), RUN)) for cell in plan.cells]
     about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
     lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
+    about |= {"anew": sorted(plan.anew)} if plan.anew else {}
     head = json.dumps(about)[:-1]
     replace_text(run / PLAN, f'{head}, "cells": [\n{lines}\n]}}\n')
 
@@ -183,7 +190,10 @@ def read_plan(run: Path) -> tuple[Plan, float]:
     try:
         if about["format"] > FORMAT_VERSION:
             raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
-        plan = Plan(str(about["experiment"]), [_cell(row, run) for row in about["cells"]], int(about["workers"]))
+        cells, anew = [_cell(row, run) for row in about["cells"]], frozenset(about.get("anew", ()))
+        plan = Plan(str(about["experiment"]), cells, int(about["workers"]), anew)
+        if not anew <= {cell.name for cell in cells}:
+            raise ValueError
         seen: set[Path] = set()
         for cell in plan.cells:
             if not seen.issuperset(cell.needs) or cell.out in seen:
@@ -204,6 +214,12 @@ def _cell(row: dict[str, Any], run: Path) -> Cell:
     needs = tuple(Path(need) for need in row["needs"])
     axes = tuple((str(name), value) for name, value in row["axes"].items())
     return moved(Cell(row["name"], arguments, Path(row["out"]), needs, cost, axes), RUN, str(run))
+
+
+def made_anew(run: Path, cell: Cell) -> None:
+    """Write down that a cell which was to be made again has been."""
+    plan, factor = read_plan(run)
+    write_plan(run, replace(plan, anew=plan.anew - {cell.name}), factor)
 
 
 def check_same(run: Path, cells: Sequence[Cell]) -> None:

@@ -28,9 +28,19 @@ from hypogoal.experiments.engines import slurm
 from hypogoal.experiments.engines.local import run_cells
 from hypogoal.experiments.finished import left_of
 from hypogoal.experiments.own import own_plan
-from hypogoal.experiments.records import FINISHED, LOGS, RESULTS, check_same, read_plan, read_record, write_plan
+from hypogoal.experiments.records import (
+    FINISHED,
+    LOGS,
+    PLAN,
+    RESULTS,
+    check_same,
+    forget_records,
+    read_plan,
+    read_record,
+    write_plan,
+)
 from hypogoal.experiments.results import write_results
-from hypogoal.experiments.status import is_there
+from hypogoal.experiments.status import done_of
 
 EXPERIMENTS: Mapping[str, Any] = {"doorkey": doorkey, "montezuma-ladders": montezuma_ladders}
 FIGURES = {  # of the paper: the experiment and its preset
@@ -160,7 +170,17 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
     """
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
-    sweep(planned, out, force=force, quiet=quiet, go_on=GO_ON)
+    sweep(planned, out, force=force and not (resume and _begun(out, planned)), quiet=quiet, go_on=GO_ON)
+
+
+def _begun(out: Path, planned: Plan) -> bool:
+    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with."""
+    try:
+        before, _ = read_plan(out)
+        check_same(out, planned.cells)
+    except UserError:
+        return False
+    return len(done_of(replace(planned, anew=before.anew))) < len(planned.cells)
 
 
 def sweep(
@@ -193,9 +213,9 @@ def sweep(
     """
     say = (lambda text: None) if quiet else _say
     with sole_writer(out):
-        _begin(planned, out, force=force, say=say, confirm=confirm)
+        planned = _begin(planned, out, force=force, say=say, confirm=confirm)
         try:
-            outcome = run_cells(planned, out, force=force, say=say)
+            outcome = run_cells(planned, out, say=say)
         except KeyboardInterrupt as error:
             error.add_note(f"what is done is kept: {go_on}")
             raise
@@ -226,20 +246,30 @@ def submit(
     at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
     planned = replace(planned, workers=at_once)
     with sole_writer(out):
-        _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
+        planned = _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
+        if planned.anew:
+            what = f"{len(planned.anew)} cells are still to be made again, as 'hypogoal run --force' began to"
+            raise UserError(what, out, "Let 'hypogoal run --resume' do that.")
         todo = left_of(planned.cells)
         return slurm.submit(planned, out, todo, options) if todo else []
 
 
 def _begin(
     planned: Plan, out: Path, *, force: bool, say: Callable[[str], None], confirm: Callable[[str], None] | None
-) -> None:
-    """Before the first cell: is this the sweep of this folder, what will it cost, is that wanted."""
+) -> Plan:
+    """Before the first cell: is this the sweep of this folder, what will it cost, is that wanted; the plan as written.
+
+    What is to be made again is so until it is, however often the sweep is started.
+    """
     if alive := slurm.queued(out):
         raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
-    if not force:
+    anew = frozenset(cell.name for cell in planned.cells) if force else frozenset()
+    if not force and (out / PLAN).is_file():
         check_same(out, planned.cells)
-    todo = planned.cells if force else [cell for cell in planned.cells if not is_there(cell)]
+        anew = read_plan(out)[0].anew
+    planned = replace(planned, anew=anew)
+    done = done_of(planned)
+    todo = [cell for cell in planned.cells if cell.out not in done]
     factor = machine_factor() if todo else 1.0
     if len(todo) < len(planned.cells):
         say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
@@ -250,7 +280,12 @@ def _begin(
     if confirm is not None and seconds > LONG_SECONDS:
         confirm(cost_lines(todo, planned.workers, factor)[-1])
     (out / LOGS).mkdir(parents=True, exist_ok=True)
+    if force:
+        forget_records(out, planned.cells)  # before the plan: what an attempt of now began is known by its record
+    if todo:
+        (out / FINISHED).unlink(missing_ok=True)
     write_plan(out, planned, factor)
+    return planned
 
 
 def gather(out: Path) -> Path:
@@ -261,7 +296,7 @@ def gather(out: Path) -> Path:
     """
     planned, _ = read_plan(out)
     results = write_results(planned, out)
-    if all(map(is_there, planned.cells)):
+    if len(done_of(planned)) == len(planned.cells):
         seconds = sum(read_record(out, cell).seconds for cell in planned.cells)
         about = {"cells": [cell.text for cell in planned.cells], "seconds": round(seconds, 1)}
         replace_text(out / FINISHED, json.dumps(about, indent=1) + "\n")

@@ -17,9 +17,10 @@ from hypogoal.cli import main
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.engines.local import run_cells
-from hypogoal.experiments.records import is_running, open_log, read_plan, read_record
+from hypogoal.experiments.engines.slurm import Options
+from hypogoal.experiments.records import is_running, made_anew, open_log, read_plan, read_record
 from hypogoal.experiments.status import read_status
-from hypogoal.stages.sweep import plan
+from hypogoal.stages.sweep import gather, plan, run, submit
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0
@@ -183,13 +184,47 @@ def test_cells_are_run_in_the_plans_order(tmp_path: Path) -> None:
 
     def started() -> list[str]:
         told: list[str] = []
-        run_cells(planned, tmp_path / "out", force=False, say=told.append)
+        run_cells(planned, tmp_path / "out", say=told.append)
         return [line.split()[1] for line in told if line.endswith(" ...")]
 
     assert started() == ["data", "ensemble-seed-0", "more"]
     for cell in planned.cells[1:]:
         cell.out.rename(cell.out.with_suffix(".old"))
     assert started() == ["ensemble-seed-0", "more"]
+
+
+def test_what_was_to_be_made_anew_is_so_until_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A6, G4: ``run --force`` is interrupted: what stood there before does not pass for what it will make."""
+    out = tmp_path / "out"
+    planned = plan(str(write_toy(tmp_path / "toy.toml", "0")), out)
+    data, ensemble = (cell.out for cell in planned.cells)
+    run(planned, out, quiet=True)
+
+    def made() -> tuple[int, int]:
+        return data.stat().st_mtime_ns, (ensemble / "manifest.json").stat().st_mtime_ns
+
+    def interrupted(*given: object) -> None:
+        made_anew(*given)  # type: ignore[arg-type]
+        raise KeyboardInterrupt
+
+    first = made()
+    with monkeypatch.context() as patch:
+        patch.setattr("hypogoal.experiments.engines.local.made_anew", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(planned, out, force=True, quiet=True)
+    second = made()
+    assert second[0] > first[0] and second[1] == first[1]
+    assert [one.state for one in read_status(out).states] == ["done", "waiting"] and not (out / "run.json").exists()
+    gather(out)
+    assert "ensemble" not in (out / "results.csv").read_text() and not (out / "run.json").exists()
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm._check", lambda options: None)
+    with pytest.raises(UserError, match="still to be made again"):
+        submit(planned, out, Options(), quiet=True)
+    run(planned, out, force=True, resume=True, quiet=True)
+    third = made()
+    assert third[0] == second[0] and third[1] > second[1] and not read_plan(out)[0].anew
+    run(planned, out, resume=True, quiet=True)
+    assert made() == third and (out / "run.json").is_file()
 
 
 @pytest.mark.slow
