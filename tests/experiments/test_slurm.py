@@ -88,7 +88,7 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         "#SBATCH --time=4:00:00",
         "#SBATCH --gres=gpu:1",
         "#SBATCH --cpus-per-task=2",
-        "#SBATCH --mem=1908M",
+        "#SBATCH --mem=2194M",
         "#SBATCH --signal=B:USR2@90",
         "#SBATCH --requeue",
         "#SBATCH --account=x",

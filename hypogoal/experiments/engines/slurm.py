@@ -29,6 +29,7 @@ from hypogoal.experiments.records import AGAIN
 FOLDER, JOBS = "slurm", "jobs.json"
 MOST_ELEMENTS = 1000  # of one array: Slurm's own limit, if nobody changed it, is 1001
 LEAST_MEMORY = 500e6
+MARGIN, BESIDE = 1.1, 100e6  # of what is estimated: some clusters kill at the limit; bytes of the job's own process
 CANCEL_SECONDS = 120.0
 GATHER = "gather"
 
@@ -150,7 +151,8 @@ def _script(array: Array, run: Path, options: Options) -> str:
     """A plain batch script: element N runs the Nth of the cells it names."""
     cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
     estimated = cpus * max(cell.cost.memory for cell in array.cells)
-    memory = options.memory or (f"{ceil(max(estimated, LEAST_MEMORY) / 2**20)}M" if estimated else "")
+    asked = MARGIN * max(estimated, LEAST_MEMORY) + BESIDE
+    memory = options.memory or (f"{ceil(asked / 2**20)}M" if estimated else "")
     lines = _head(run, array.name, options)
     lines += [
         f"#SBATCH --array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
