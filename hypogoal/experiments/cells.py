@@ -92,7 +92,7 @@ def stage_cell(
     """The cell of a stage that writes ``out`` within the run's folder; its name is its place there."""
     if not all(map(plain_name, out.relative_to(run).parts)):
         raise UserError("this would be written outside the run", out, "Leave separators and dots out of names.")
-    name = out.relative_to(run).with_suffix("").as_posix().replace("/", "-")
+    name = out.relative_to(run).as_posix().removesuffix(".h5").replace("/", "-")
     if not plain_name(f"{name}.json"):
         raise UserError("this name is too long for a file", name, "Choose shorter ones.")
     return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), cost, tuple((axes or {}).items()))

@@ -230,10 +230,10 @@ def check_same(run: Path, cells: Sequence[Cell]) -> None:
     """
     if not (run / PLAN).is_file():
         return
-    now = {cell.name: moved(cell, str(run), RUN) for cell in cells}
+    now = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
     do = "Give the settings it was begun with, or choose another --out."
     for cell in read_plan(run)[0].cells:
-        before, after = moved(cell, str(run), RUN), now.get(cell.name)
+        before, after = moved(cell, str(run), RUN), now.get(cell.out.relative_to(run))
         if after is None:
             raise UserError(f"the sweep here has a cell that this one has not: {cell.name}", run, do)
         old, new = _meaning(before), _meaning(after)

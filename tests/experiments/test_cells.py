@@ -105,7 +105,8 @@ def begun(run: Path, *arguments: str) -> None:
 
 
 def test_a_sweep_is_the_same_whatever_the_order_of_its_settings(tmp_path: Path) -> None:
-    """Spec G4: one begun when commands were put together otherwise goes on; one that meant something else does not."""
+    """Spec G4: one begun when commands were put together otherwise goes on, as does one whose cells were
+    called otherwise; one that meant something else does not."""
 
     def same(*arguments: str) -> None:
         check_same(tmp_path, [Cell("e", ("train-ensemble", "d.h5", *arguments), tmp_path / "e")])
@@ -118,6 +119,8 @@ def test_a_sweep_is_the_same_whatever_the_order_of_its_settings(tmp_path: Path) 
     ):
         with pytest.raises(UserError, match=words):
             same("--set", "diversity=none", "--set", "members=1", *arguments)
+    begun(tmp_path, "--seed", "0")
+    check_same(tmp_path, [Cell("e-0.1", ("train-ensemble", "d.h5", "--seed", "0"), tmp_path / "e")])
     begun(tmp_path, "--members", "1", "--set", "members=3")  # what undid the single CNN
     with pytest.raises(UserError, match="'members=3', not 'members=1'"):
         same("--set", "members=3", "--set", "members=1")
