@@ -11,6 +11,7 @@ from typing import NamedTuple
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name
 
+DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
 Axes = tuple[tuple[str, str | int | float], ...]
 
 
@@ -116,15 +117,24 @@ def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> lis
 
 
 def moved(cell: Cell, here: str, there: str) -> Cell:
-    """The cell of the same run in another place: ``here`` is what its paths begin with now."""
+    """The cell of the same run in another place: ``here`` is what its paths begin with now.
+
+    Only what is a place moves: a run may be called like a stage, a domain or the value of a setting.
+    """
 
     def part(text: str) -> str:
-        inside = text == here or text.startswith(f"{here}/")
-        return there + text[len(here) :] if inside else text
+        return there + text[len(here) :] if within(text, here) else text
+
+    def within(text: str, place: object) -> bool:
+        return text == str(place) or text.startswith(f"{place}/")
+
+    def is_place(number: int, word: str) -> bool:
+        named = cell.arguments[number - 1] == "--out" or (number == 1 and cell.stage in DERIVED)
+        return named or any(within(word, place) for place in (cell.out, *cell.needs))
 
     return replace(
         cell,
-        arguments=tuple(map(part, cell.arguments)),
+        arguments=tuple(part(word) if is_place(n, word) else word for n, word in enumerate(cell.arguments)),
         out=Path(part(str(cell.out))),
         needs=tuple(Path(part(str(need))) for need in cell.needs),
     )

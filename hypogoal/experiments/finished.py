@@ -12,9 +12,7 @@ from hypogoal.core.artefacts import Artefact, check_files, find_input, open_arte
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.found import find
-from hypogoal.experiments.cells import Cell
-
-DERIVED = ("evaluate", "report")  # made again in minutes from what the other stages made
+from hypogoal.experiments.cells import DERIVED, Cell
 
 
 def is_finished(cell: Cell) -> bool:

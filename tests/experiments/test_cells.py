@@ -195,5 +195,10 @@ def test_a_moved_cell_is_the_same_in_another_place() -> None:
     assert there.arguments == ("train-meta", "{run}/a", "runs/xy", "--out", "{run}")
     assert (there.out, there.needs) == (Path("{run}/b"), (Path("{run}/a"),))
     assert moved(there, "{run}", "runs/x") == cell
+    for name in ("report", "train-meta", "collect", "doorkey", "steps=6", "demo"):
+        cells = plan("doorkey", Path(name), preset="demo", assignments=["train-meta.steps=6"]).cells
+        elsewhere = plan("doorkey", Path("{run}"), preset="demo", assignments=["train-meta.steps=6"]).cells
+        assert [moved(cell, name, "{run}") for cell in cells] == elsewhere
+        assert [moved(cell, "{run}", name) for cell in elsewhere] == cells
     depth = depths([Cell("a", ("x",), OUT / "a"), Cell("b", ("x",), OUT / "b", (OUT / "a",))])
     assert [*depth.values()] == [0, 1]
