@@ -67,7 +67,12 @@ def _cases(config: RunConfig) -> list[tuple[int, int]]:
 
 
 def cells(
-    out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
+    out: Path,
+    config: RunConfig,
+    resolved: Mapping[str, Any],
+    common: Mapping[str, tuple[str, ...]],
+    *,
+    short: bool = False,
 ) -> list[Cell]:
     """The cells of a run.
 
@@ -76,13 +81,14 @@ def cells(
         config: which cells.
         resolved: by stage, its configuration.
         common: by stage, the arguments that brought that configuration about.
+        short: where there is one agent only, leave its seed and layout out of names.
 
     Raises:
         UserError: layouts and seeds are to be paired and differ in number.
     """
     cases = _cases(config)
     domain = load_domain(DOMAIN)
-    single = len(cases) == 1
+    single = short and len(cases) == 1
     data = out / "data.h5"
     ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
     states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]

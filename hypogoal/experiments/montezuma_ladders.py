@@ -94,9 +94,14 @@ def _training(ensemble: EnsembleConfig, members: int) -> float:
 
 
 def cells(
-    out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
+    out: Path,
+    config: RunConfig,
+    resolved: Mapping[str, Any],
+    common: Mapping[str, tuple[str, ...]],
+    *,
+    short: bool = False,
 ) -> list[Cell]:
-    """The cells of a run; arguments as of ``experiments.doorkey.cells``.
+    """The cells of a run; arguments as of ``experiments.doorkey.cells``, but that no names are ``short``.
 
     Raises:
         UserError: an unknown ladder, or options of ensembles that the run does not have.

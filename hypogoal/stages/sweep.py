@@ -85,6 +85,7 @@ def plan(
     assignments: Iterable[str] = (),
     seeds: str | None = None,
     device: str = "auto",
+    short: bool = False,
 ) -> Plan:
     """The cells of an experiment.
 
@@ -95,6 +96,8 @@ def plan(
         assignments: ``KEY=VALUE`` or ``STAGE.KEY=VALUE``; of an own experiment ``AXIS=VALUES``.
         seeds: the run seeds, ``0-9``.
         device: of the training stages.
+        short: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
+            was begun with other names keeps those.
 
     Raises:
         UserError: unknown experiment or preset, a setting that no stage has, or no such device.
@@ -112,10 +115,21 @@ def plan(
         known = ", ".join([*EXPERIMENTS, *FIGURES])
         raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
     chosen = assignments + ([f"seeds={seeds}"] if seeds else [])
-    return _named_plan(name, out, preset or own_preset, chosen, device)
+    return _named_plan(name, out, preset or own_preset, chosen, device, _short(out, wanted=short))
 
 
-def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Sequence[str], device: str) -> Plan:
+def _short(out: Path, *, wanted: bool) -> bool:
+    """Whether names are to be short: as in the run's folder, where there is something."""
+    try:
+        before, _ = read_plan(out)
+    except UserError:  # none, or a damaged one, which is told when it is to be gone on with
+        return wanted
+    return out / "ensemble" in {cell.out for cell in before.cells}
+
+
+def _named_plan(
+    experiment: str, out: Path, preset: str | None, assignments: Sequence[str], device: str, short: bool
+) -> Plan:
     found = EXPERIMENTS[experiment]
     own, by_stage = _split(assignments)
     config = resolve(found.RunConfig, stage="run", preset=preset, assignments=own, domain=found.DOMAIN)
@@ -145,7 +159,7 @@ def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Seq
         )
         for stage in found.STAGES
     }
-    return Plan(experiment, found.cells(out, config, resolved, common), config.workers or cores())
+    return Plan(experiment, found.cells(out, config, resolved, common, short=short), config.workers or cores())
 
 
 def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:

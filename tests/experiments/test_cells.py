@@ -126,6 +126,17 @@ def test_a_sweep_is_the_same_whatever_the_order_of_its_settings(tmp_path: Path) 
         same("--set", "members=3", "--set", "members=1")
 
 
+def test_a_sweep_of_one_seed_can_be_given_more(tmp_path: Path) -> None:
+    """Spec G4: its cells are called as those of many; those of ``run``, and of what was begun so, have short names."""
+    one = plan("doorkey", tmp_path, preset="demo")
+    assert tmp_path / "meta" in {cell.out for cell in plan("doorkey", tmp_path, preset="demo", short=True).cells}
+    write_plan(tmp_path, one, 1.0)
+    check_same(tmp_path, plan("doorkey", tmp_path, preset="demo", seeds="0-2").cells)
+    assert plan("doorkey", tmp_path, preset="demo", short=True).cells == one.cells
+    write_plan(tmp_path / "x", plan("doorkey", tmp_path / "x", preset="demo", short=True), 1.0)
+    check_same(tmp_path / "x", plan("doorkey", tmp_path / "x", preset="demo").cells)
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
