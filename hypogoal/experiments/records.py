@@ -96,6 +96,14 @@ def forget_records(run: Path, cells: Sequence[Cell]) -> None:
         (run / LOGS / f"{cell.name}.json").unlink(missing_ok=True)
 
 
+def excuse(run: Path, cells: Sequence[Cell]) -> None:
+    """Have those of the cells that failed count as stopped: they are tried again."""
+    for cell in cells:
+        record = read_record(run, cell)
+        if record.code:  # and not None, which is said of one that runs
+            write_record(run, cell, replace(record, code=0))
+
+
 def open_log(run: Path, cell: Cell) -> BinaryIO:
     """A cell's log to append to, locked: nobody else runs this cell while it, or a copy of it, is open.
 

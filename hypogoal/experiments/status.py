@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST
-from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import duration
+from hypogoal.experiments.finished import is_current
 from hypogoal.experiments.records import Record, is_running, last_line, log_of, read_plan, read_record
 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
@@ -83,8 +84,17 @@ def read_status(run: Path) -> Status:
 
 
 def done_of(plan: Plan) -> set[Path]:
-    """The outputs of the cells that are done: there (what has a manifest is whole), and not to be made again."""
-    return {cell.out for cell in plan.cells if cell.name not in plan.anew and is_there(cell)}
+    """The outputs of the cells that are done: there (what has a manifest is whole), and not to be made again.
+
+    An evaluation or report of less than what the plan has now, or of something else, is not.
+    """
+    done: set[Path] = set()
+    for cell in plan.cells:
+        if cell.name in plan.anew or not is_there(cell):
+            continue
+        if cell.stage not in DERIVED or (done.issuperset(cell.needs) and is_current(cell)):
+            done.add(cell.out)
+    return done
 
 
 def is_there(cell: Cell) -> bool:

@@ -34,6 +34,7 @@ from hypogoal.experiments.records import (
     PLAN,
     RESULTS,
     check_same,
+    excuse,
     forget_records,
     read_plan,
     read_record,
@@ -297,6 +298,7 @@ def _begin(
     if force:
         forget_records(out, planned.cells)  # before the plan: what an attempt of now began is known by its record
     if todo:
+        excuse(out, todo)
         (out / FINISHED).unlink(missing_ok=True)
     write_plan(out, planned, factor)
     return planned

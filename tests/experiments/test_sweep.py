@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,7 +19,16 @@ from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.engines.local import run_cells
 from hypogoal.experiments.engines.slurm import Options
-from hypogoal.experiments.records import is_running, made_anew, open_log, read_plan, read_record
+from hypogoal.experiments.records import (
+    Record,
+    is_running,
+    made_anew,
+    open_log,
+    read_plan,
+    read_record,
+    write_plan,
+    write_record,
+)
 from hypogoal.experiments.status import read_status
 from hypogoal.stages.sweep import gather, plan, run, submit
 
@@ -155,6 +165,36 @@ def test_what_was_changed_by_hand_is_not_replaced(
     (out / "ensemble/seed-0").rename(out / "moved")
     assert main(arguments) == 0
     assert (out / "results.csv").read_bytes() == before
+
+
+def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G4: neither in the status nor in the results, before it is made again; one that failed is tried again."""
+    out, toy = tmp_path / "out", str(swept / "toy.toml")
+    shutil.copytree(swept / "whole" / "ensemble" / "seed-0", out / "ensemble" / "seed-0")
+    shutil.copy(swept / "whole" / "data.h5", out)
+    arguments = ["sweep", toy, "--out", str(out), "--set", "evaluate=true", "-q", "--seeds"]
+    assert main([*arguments, "0"]) == 0
+    assert read_status(out).count("done") == 4 and (out / "run.json").is_file()
+
+    def states() -> list[str]:
+        return [one.state for one in read_status(out).states]
+
+    both = plan(toy, out, assignments=["evaluate=true"])
+    write_plan(out, both, 1.0)
+    assert states() == ["done", "done", "waiting", "stopped", "stopped"]
+    shutil.copytree(swept / "whole" / "ensemble" / "seed-1", out / "ensemble" / "seed-1")
+    evaluation = both.cells[-2]
+    write_record(out, evaluation, Record(2, 5.0, 2))
+    assert states() == ["done", "done", "done", "failed", "held"]
+    (out / "run.json").unlink()
+    gather(out)
+    judged = [line for line in (out / "results.csv").read_text().splitlines() if ",heldout," in line]
+    assert {line.split(",")[0] for line in judged} == {"data"} and not (out / "run.json").exists()
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm.submit", lambda *given: [])
+    submit(both, out, Options(), quiet=True)
+    assert states() == ["done", "done", "done", "stopped", "stopped"]
+    assert main([*arguments, "0-1"]) == 0
+    assert states() == ["done"] * 5 and (out / "run.json").is_file()
 
 
 def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
