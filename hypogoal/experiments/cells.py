@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,12 +74,14 @@ class Plan:
         cells: in an order in which they can run.
         workers: how many cores they may use at once.
         anew: names of those that are still to be made again, whatever is there.
+        presets: the preset files that its commands name, each with its digest when the sweep was last started.
     """
 
     experiment: str
     cells: list[Cell]
     workers: int
     anew: frozenset[str] = frozenset()
+    presets: Mapping[str, str] = field(default_factory=dict)
 
 
 def stage_cell(

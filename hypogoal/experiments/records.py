@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hypogoal.core.config import parse_assignments
+from hypogoal.core.config import parse_assignments, preset_digest
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, replace_text
@@ -170,6 +170,7 @@ def write_plan(run: Path, plan: Plan, factor: float) -> None:
     about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
     lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
     about |= {"anew": sorted(plan.anew)} if plan.anew else {}
+    about |= {"presets": dict(plan.presets)} if plan.presets else {}
     head = json.dumps(about)[:-1]
     replace_text(run / PLAN, f'{head}, "cells": [\n{lines}\n]}}\n')
 
@@ -199,7 +200,8 @@ def read_plan(run: Path) -> tuple[Plan, float]:
         if about["format"] > FORMAT_VERSION:
             raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
         cells, anew = [_cell(row, run) for row in about["cells"]], frozenset(about.get("anew", ()))
-        plan = Plan(str(about["experiment"]), cells, int(about["workers"]), anew)
+        presets = {str(path): str(digest) for path, digest in about.get("presets", {}).items()}
+        plan = Plan(str(about["experiment"]), cells, int(about["workers"]), anew, presets)
         if not anew <= {cell.name for cell in cells}:
             raise ValueError
         seen: set[Path] = set()
@@ -234,13 +236,17 @@ def check_same(run: Path, cells: Sequence[Cell]) -> None:
     """Refuse cells that do not go on with what the folder has: every cell of before, commands as they were.
 
     Raises:
-        UserError: a cell of before is not there any more, or its command is another.
+        UserError: a cell of before is not there any more, its command is another, or a preset file was changed.
     """
     if not (run / PLAN).is_file():
         return
-    now = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
     do = "Give the settings it was begun with, or choose another --out."
-    for cell in read_plan(run)[0].cells:
+    there, digests = read_plan(run)[0], preset_digests(cells)
+    for path, digest in there.presets.items():
+        if digests.get(path, digest) != digest:
+            raise UserError("this preset was changed since the sweep here was begun", path, do)
+    now = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
+    for cell in there.cells:
         before, after = moved(cell, str(run), RUN), now.get(cell.out.relative_to(run))
         if after is None:
             raise UserError(f"the sweep here has a cell that this one has not: {cell.name}", run, do)
@@ -255,12 +261,7 @@ def _meaning(cell: Cell) -> list[str]:
 
     Of options and settings of one name the order stays or the last one counts; settings go before their options.
     """
-    groups: list[list[str]] = [[]]
-    for word in cell.arguments:
-        if word.startswith("-"):
-            groups.append([])
-        groups[-1] += word.split("=", 1) if word.startswith("--") else [word]
-    first, *options = groups
+    first, *options = _options(cell)
     short, given, rest = [], [], []
     for group in options:
         if len(group) == 2 and group[0] in SHORT:
@@ -273,3 +274,20 @@ def _meaning(cell: Cell) -> list[str]:
     rest.sort(key=lambda group: group[0])
     parts = [" ".join(group) for group in (first, *rest)]
     return [*parts, *(f"{key}={settings[key]}" for key in sorted(settings)), str(cell.out)]
+
+
+def _options(cell: Cell) -> list[list[str]]:
+    """A command's words: those before all options, then each option with what follows it."""
+    groups: list[list[str]] = [[]]
+    for word in cell.arguments:
+        if word.startswith("-"):
+            groups.append([])
+        groups[-1] += word.split("=", 1) if word.startswith("--") else [word]
+    return groups
+
+
+def preset_digests(cells: Sequence[Cell]) -> dict[str, str]:
+    """The preset files that commands name, each with its digest."""
+    options = (group for cell in cells for group in _options(cell))
+    files = {group[-1] for group in options if group[0] == "--preset" and group[-1].endswith(".toml")}
+    return {path: preset_digest(path) for path in sorted(files)}

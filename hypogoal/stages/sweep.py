@@ -36,6 +36,7 @@ from hypogoal.experiments.records import (
     check_same,
     excuse,
     forget_records,
+    preset_digests,
     read_plan,
     read_record,
     write_plan,
@@ -282,7 +283,7 @@ def _begin(
     if not force and (out / PLAN).is_file():
         check_same(out, planned.cells)
         anew = read_plan(out)[0].anew
-    planned = replace(planned, anew=anew)
+    planned = replace(planned, anew=anew, presets=preset_digests(planned.cells))
     done = done_of(planned)
     todo = [cell for cell in planned.cells if cell.out not in done]
     factor = machine_factor() if todo else 1.0
