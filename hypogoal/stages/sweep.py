@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
 from hypogoal.core.config import parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
@@ -228,6 +229,7 @@ def sweep(
         UserError: another process runs it, the folder has another sweep, or a cell failed.
     """
     say = (lambda text: None) if quiet else _say
+    _check_folder(out)
     with sole_writer(out):
         planned = _begin(planned, out, force=force, say=say, confirm=confirm)
         try:
@@ -261,6 +263,8 @@ def submit(
     """
     at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
     planned = replace(planned, workers=at_once)
+    slurm.check(out, options)
+    _check_folder(out)
     with sole_writer(out):
         planned = _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
         if planned.anew:
@@ -268,6 +272,12 @@ def submit(
             raise UserError(what, out, "Let 'hypogoal run --resume' do that.")
         todo = left_of(planned.cells)
         return slurm.submit(planned, out, todo, options) if todo else []
+
+
+def _check_folder(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise UserError("a run needs a folder, this is a file", out, "Choose another --out.")
+    check_parent(out)
 
 
 def _begin(

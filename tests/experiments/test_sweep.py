@@ -118,6 +118,19 @@ def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.Ca
         assert words in err and err.count("\n") == 1, err
 
 
+def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: as --out of a sweep or run, or where its folder would be: one line, and the file stays."""
+    there = tmp_path / "there"
+    there.write_text("mine")
+    for command in (["sweep"], ["run", "--force"]):
+        for out, words in ((there, "this is a file"), (there / "x", "a file is in the way")):
+            capsys.readouterr()
+            assert main([*command, "doorkey", "--preset", "demo", "--out", str(out), "-q"]) == 2
+            err = capsys.readouterr().err
+            assert words in err and err.count("\n") == 1, err
+    assert [path.name for path in tmp_path.iterdir()] == ["there"] and there.read_text() == "mine"
+
+
 FAILS = f"""
 [[cells]]
 name = "worse"
@@ -190,6 +203,7 @@ def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypa
     gather(out)
     judged = [line for line in (out / "results.csv").read_text().splitlines() if ",heldout," in line]
     assert {line.split(",")[0] for line in judged} == {"data"} and not (out / "run.json").exists()
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm.check", lambda run, options: None)
     monkeypatch.setattr("hypogoal.experiments.engines.slurm.submit", lambda *given: [])
     submit(both, out, Options(), quiet=True)
     assert states() == ["done", "done", "done", "stopped", "stopped"]
@@ -257,7 +271,7 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(tmp_path: Path, monkeypatch:
     assert [one.state for one in read_status(out).states] == ["done", "waiting"] and not (out / "run.json").exists()
     gather(out)
     assert "ensemble" not in (out / "results.csv").read_text() and not (out / "run.json").exists()
-    monkeypatch.setattr("hypogoal.experiments.engines.slurm._check", lambda options: None)
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm.check", lambda run, options: None)
     with pytest.raises(UserError, match="still to be made again"):
         submit(planned, out, Options(), quiet=True)
     run(planned, out, force=True, resume=True, quiet=True)
