@@ -35,7 +35,7 @@ def run(
     from hypogoal.stages.sweep import run as stage
 
     out = _folder(out)
-    planned = plan(experiment, out, preset=preset, assignments=set_ or (), device=device)
+    planned = plan(experiment, out, preset=preset, assignments=set_ or (), device=device, short=True)
     if dry_run:
         _list(planned)
         return

@@ -127,13 +127,22 @@ def claim(out: Path, *, force: bool = False, resume: bool = False) -> Path:
             raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
         if not ours and out.is_dir():
             raise UserError("--force replaces only artefacts, and this folder has no manifest", out, "Move it away.")
+    check_parent(out)
+    check_free(out, force=force, resume=resume)
+    return out
+
+
+def check_parent(out: Path) -> None:
+    """Check that the folder of an output is there or can be made, and can be written to.
+
+    Raises:
+        UserError: it is not so.
+    """
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir():
         raise UserError("the output's folder cannot be made, a file is in the way", parent, "Choose another --out.")
     if not os.access(parent, os.W_OK):
         raise UserError("no permission to write", parent, "Choose another --out.")
-    check_free(out, force=force, resume=resume)
-    return out
 
 
 @contextlib.contextmanager

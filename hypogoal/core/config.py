@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import hashlib
+import json
 import math
 import re
 import tomllib
@@ -81,6 +83,19 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str,
     if not isinstance(values, dict):
         raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
     return values
+
+
+def preset_digest(path: str) -> str:
+    """The sha256 of what a preset file says of stages, whichever way it is written; empty where it cannot be read.
+
+    Its ``[run]`` is left out: that says which cells there are, and a sweep may be given more.
+    """
+    try:
+        table = tomllib.loads(read_text(Path(path), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES))
+        text = json.dumps({**table, "run": None}, sort_keys=True, default=str)
+    except (UserError, ValueError, RecursionError):
+        return ""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:

@@ -25,6 +25,8 @@ def preflight(stage: str, out: Path, needs: tuple[float, float], *, quiet: bool 
     """
     memory, disk = needs
     free, space = free_memory(), free_disk(out)
+    if free is not None:
+        free += own_memory()  # which is part of what is needed: nobody needs it twice
     known = "unknown" if free is None else human(free)
     text = (
         f"{stage}: needs about {human(memory)} of memory ({known} free) and {human(disk)} of disk ({human(space)} free)"
@@ -48,6 +50,17 @@ def free_memory() -> int | None:
     """Bytes of memory that can be had: the system's, or less where a control group allows less; None if unknown."""
     known = [amount for amount in (_system(), *_groups()) if amount is not None]
     return min(known) if known else None
+
+
+def own_memory() -> int:
+    """Bytes that this process has of its own, files that it maps not counted; 0 if unknown."""
+    try:
+        for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("RssAnon:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        return 0
+    return 0
 
 
 def _system() -> int | None:

@@ -24,6 +24,14 @@ def cores() -> int:
     return max(1, min(given, int(told))) if told.isdigit() else given
 
 
+def allowed(wanted: int) -> int:
+    """How many processes a stage may use that was told to use ``wanted`` (0: all it can), no more than are allotted."""
+    if not wanted:
+        return cores()
+    told = os.environ.get(CORES, "")
+    return min(wanted, max(1, int(told))) if told.isdigit() else wanted
+
+
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
     """Run tasks, ``workers`` at once; where that is one, in this process.
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.workers import cores, in_processes
+from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
 from hypogoal.domains.montezuma_engine import MontezumaEngine
@@ -157,7 +157,7 @@ def collect(
             put(task, RoomStates(**states))
         else:
             left.append((task, place))
-    in_processes([task.gather for task, _ in left], config.workers or cores(), done)
+    in_processes([task.gather for task, _ in left], allowed(config.workers), done)
     heldout = _states_of(whole["heldout"])
     seen = np.full(len(heldout.labels), SEEN_NOWHERE)
     seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name
 
+DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
 Axes = tuple[tuple[str, str | int | float], ...]
 
 
@@ -66,11 +67,21 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment's cells, in an order in which they can run, and how many cores they may use at once."""
+    """An experiment.
+
+    Attributes:
+        experiment: its name.
+        cells: in an order in which they can run.
+        workers: how many cores they may use at once.
+        anew: names of those that are still to be made again, whatever is there.
+        presets: the preset files that its commands name, each with its digest when the sweep was last started.
+    """
 
     experiment: str
     cells: list[Cell]
     workers: int
+    anew: frozenset[str] = frozenset()
+    presets: Mapping[str, str] = field(default_factory=dict)
 
 
 def stage_cell(
@@ -84,10 +95,18 @@ def stage_cell(
     """The cell of a stage that writes ``out`` within the run's folder; its name is its place there."""
     if not all(map(plain_name, out.relative_to(run).parts)):
         raise UserError("this would be written outside the run", out, "Leave separators and dots out of names.")
-    name = out.relative_to(run).with_suffix("").as_posix().replace("/", "-")
+    name = out.relative_to(run).as_posix().removesuffix(".h5").replace("/", "-")
     if not plain_name(f"{name}.json"):
         raise UserError("this name is too long for a file", name, "Choose shorter ones.")
     return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), cost, tuple((axes or {}).items()))
+
+
+def with_common(arguments: Sequence[str], common: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """A cell's command with what is common to its stage: behind stage and input, so that the cell's own come last.
+
+    Of settings the last one counts: a method or a control is what it is called, whatever all cells were given.
+    """
+    return (*arguments[:2], *common[arguments[0]], *arguments[2:])
 
 
 def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> list[Cell]:
@@ -100,15 +119,24 @@ def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> lis
 
 
 def moved(cell: Cell, here: str, there: str) -> Cell:
-    """The cell of the same run in another place: ``here`` is what its paths begin with now."""
+    """The cell of the same run in another place: ``here`` is what its paths begin with now.
+
+    Only what is a place moves: a run may be called like a stage, a domain or the value of a setting.
+    """
 
     def part(text: str) -> str:
-        inside = text == here or text.startswith(f"{here}/")
-        return there + text[len(here) :] if inside else text
+        return there + text[len(here) :] if within(text, here) else text
+
+    def within(text: str, place: object) -> bool:
+        return text == str(place) or text.startswith(f"{place}/")
+
+    def is_place(number: int, word: str) -> bool:
+        named = cell.arguments[number - 1] == "--out" or (number == 1 and cell.stage in DERIVED)
+        return named or any(within(word, place) for place in (cell.out, *cell.needs))
 
     return replace(
         cell,
-        arguments=tuple(map(part, cell.arguments)),
+        arguments=tuple(part(word) if is_place(n, word) else word for n, word in enumerate(cell.arguments)),
         out=Path(part(str(cell.out))),
         needs=tuple(Path(part(str(need))) for need in cell.needs),
     )

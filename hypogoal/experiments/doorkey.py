@@ -11,12 +11,13 @@ from typing import Any
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell
+from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell, with_common
 from hypogoal.learners.baselines.settings import hyperparameters
 from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "doorkey"
 STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
+DECIDED = {"layout_seed": "layout_seeds", "agent": "baselines"}  # settings of stages, and which of the run's they are
 
 # What things cost on one core of the machine of docs/performance.md: seconds per environment step, per gradient step of
 # a member (all five sub-goals), per ensemble that is evaluated.
@@ -66,7 +67,12 @@ def _cases(config: RunConfig) -> list[tuple[int, int]]:
 
 
 def cells(
-    out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
+    out: Path,
+    config: RunConfig,
+    resolved: Mapping[str, Any],
+    common: Mapping[str, tuple[str, ...]],
+    *,
+    short: bool = False,
 ) -> list[Cell]:
     """The cells of a run.
 
@@ -75,13 +81,14 @@ def cells(
         config: which cells.
         resolved: by stage, its configuration.
         common: by stage, the arguments that brought that configuration about.
+        short: where there is one agent only, leave its seed and layout out of names.
 
     Raises:
         UserError: layouts and seeds are to be paired and differ in number.
     """
     cases = _cases(config)
     domain = load_domain(DOMAIN)
-    single = len(cases) == 1
+    single = short and len(cases) == 1
     data = out / "data.h5"
     ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
     states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
@@ -101,10 +108,9 @@ def cells(
     ) -> Path:
         place = name if single else f"{name}/seed-{seed}" if layout is None else f"{name}/layout-{layout}-seed-{seed}"
         at = ("--seed", str(seed), *(("--layout-seed", str(layout)) if layout is not None else ()))
-        stage = arguments[0]
         axes: dict[str, str | int | float] = {"agent": name, "seed": seed}
         axes |= {} if layout is None else {"layout_seed": layout}
-        planned.append(stage_cell(out / place, out, (*arguments, *common[stage], *at), needs, cost, axes))
+        planned.append(stage_cell(out / place, out, (*with_common(arguments, common), *at), needs, cost, axes))
         return out / place
 
     process = ensemble_process(taught, ensemble.members)

@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hypogoal.core.artefacts import Artefact, check_files, find_input, open_artefact
+from hypogoal.core.artefacts import MANIFEST, Artefact, check_files, find_input, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.found import find
-from hypogoal.experiments.cells import Cell
-
-DERIVED = ("evaluate", "report")  # made again in minutes from what the other stages made
+from hypogoal.experiments.cells import DERIVED, Cell
 
 
 def is_finished(cell: Cell) -> bool:
@@ -74,6 +72,20 @@ def _fault(cell: Cell) -> str:
         if cell.stage == "evaluate" and not _of_all(artefact, Path(cell.arguments[1]))
         else ""
     )
+
+
+def is_current(cell: Cell) -> bool:
+    """Whether an evaluation or report that is there is of what is there now, as manifests say; no other file is read.
+
+    Not by when they were written: copies of a run have other times.
+    """
+    try:
+        read = {entry["sha256"] for entry in open_artefact(cell.out).manifest["inputs"]}
+        run = Path(cell.arguments[1])
+        sources = [one.path for one in find(run).everything()] if cell.stage == "evaluate" else cell.needs
+        return read.issuperset(sha256_of(path / MANIFEST) for path in sources)
+    except (UserError, OSError):
+        return False
 
 
 def _of_all(evaluation: Artefact, run: Path) -> bool:

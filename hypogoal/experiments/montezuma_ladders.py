@@ -12,12 +12,13 @@ from hypogoal.core.config import as_dict, from_values, parse_assignments, settin
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.domains.montezuma_ladders import ladder_named
-from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell
+from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell, with_common
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.needs import BASE, LOGS, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "montezuma"
 STAGES = ("collect", "train-ensemble", "train-options")
+DECIDED: dict[str, str] = {}  # as of experiments.doorkey
 
 # What things cost on one core of the machine of docs/performance.md: seconds per collection, per gradient step of a
 # member, per localiser learned, per environment step of an option, per member that is evaluated.
@@ -30,9 +31,9 @@ PER_EVALUATED_MEMBER = 3.0
 EVALUATING = 6  # ensembles that an evaluation judges at once, at the most
 
 METHODS: dict[str, tuple[str, ...]] = {
-    "dbat": ("--diversity", "dbat"),
-    "none": ("--diversity", "none"),
-    "cnn": ("--diversity", "none", "--members", "1"),
+    "dbat": ("--set", "diversity=dbat"),
+    "none": ("--set", "diversity=none"),
+    "cnn": ("--set", "diversity=none", "--set", "members=1"),
 }
 
 
@@ -93,9 +94,14 @@ def _training(ensemble: EnsembleConfig, members: int) -> float:
 
 
 def cells(
-    out: Path, config: RunConfig, resolved: Mapping[str, Any], common: Mapping[str, tuple[str, ...]]
+    out: Path,
+    config: RunConfig,
+    resolved: Mapping[str, Any],
+    common: Mapping[str, tuple[str, ...]],
+    *,
+    short: bool = False,
 ) -> list[Cell]:
-    """The cells of a run; arguments as of ``experiments.doorkey.cells``.
+    """The cells of a run; arguments as of ``experiments.doorkey.cells``, but that no names are ``short``.
 
     Raises:
         UserError: an unknown ladder, or options of ensembles that the run does not have.
@@ -119,7 +125,7 @@ def cells(
     def add(
         place: str, arguments: tuple[str, ...], axes: dict[str, Any], cost: Cost, needs: tuple[Path, ...] = ()
     ) -> Path:
-        planned.append(stage_cell(out / place, out, (*arguments, *common[arguments[0]]), needs, cost, axes))
+        planned.append(stage_cell(out / place, out, with_common(arguments, common), needs, cost, axes))
         return out / place
 
     def training(method: str, variant: str) -> Cost:

@@ -32,6 +32,7 @@ TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *Number._fields
 TAKEN_NAMES = ("evaluation", "report", "logs", "slurm")  # what else is in a run's folder
 MAX_CELLS = 20_000
 MOST = 1e7  # minutes, gigabytes
+MEMORY = 1e9  # bytes of a process, where the file does not say
 MEND = "Mend the file, see docs/formats.md."
 
 Value = str | int | float
@@ -46,6 +47,7 @@ class _Group:
     axes: tuple[str, ...]
     minutes: float
     memory: float
+    cores: int
 
 
 def own_plan(path: Path, out: Path, assignments: Sequence[str] = ()) -> Plan:
@@ -153,12 +155,31 @@ def _group(row: Any, axes: Mapping[str, Any], known: Mapping[str, _Group], path:
         raise UserError("the command must be a stage", where, f"Choose one of {', '.join(STAGES)}.")
     if any(word.split("=")[0] in RESERVED for word in words):
         raise UserError(f"{', '.join(RESERVED)} are given by the sweep", where, MEND)
-    minutes, memory = float(row.get("minutes", 0)), float(row.get("memory_gb", 0))
+    minutes, memory = float(row.get("minutes", 0)), float(row.get("memory_gb", MEMORY / 1e9))
     if not (0 <= minutes < MOST and 0 <= memory < MOST):
         raise UserError("minutes and memory_gb cannot be this", where, MEND)
     if words[0] in ("collect", "train-baseline"):
-        load_domain(next((word for word in words[1:] if not word.startswith("-")), ""))
-    return _Group(name, words, tuple(own), minutes, memory)
+        load_domain(_domain(words))
+    return _Group(name, words, tuple(own), minutes, memory, _cores(words, known))
+
+
+def _cores(words: Sequence[str], known: Mapping[str, _Group]) -> int:
+    """Processes that a command can use: training ensembles one for each sub-goal, as far as those are simply seen."""
+    if words[0] != "train-ensemble":
+        return 1
+    text = " ".join(words)
+    settings = dict(re.findall(r"--set[ =](\w+)=(\S+)", text))
+    data = (known[name] for name in re.findall(r"\{([\w-]+)\}", text) if name in known)
+    domain = next((_domain(group.words) for group in data if group.words[0] == "collect"), "")
+    goals = (
+        settings["sub_goals"].split(",") if "sub_goals" in settings else load_domain(domain).sub_goals if domain else ()
+    )
+    asked = settings.get("workers", "")
+    return max(1, min(len(goals), int(asked) if asked.isdigit() and int(asked) else len(goals)))
+
+
+def _domain(words: Sequence[str]) -> str:
+    return next((word for word in words[1:] if not word.startswith("-")), "")
 
 
 def _cell(group: _Group, point: Mapping[str, Value], groups: Mapping[str, _Group], out: Path) -> Cell:
@@ -180,7 +201,7 @@ def _cell(group: _Group, point: Mapping[str, Value], groups: Mapping[str, _Group
         return str(needs[-1])
 
     words = [re.sub(r"\{([^{}]*)\}", filled, word) for word in group.words]
-    cost = Cost(60 * group.minutes, 1e9 * group.memory)
+    cost = Cost(60 * group.minutes, 1e9 * group.memory, cores=group.cores)
     return stage_cell(_place(group, point, out), out, words, needs, cost, {"group": group.name, **point})
 
 

@@ -11,11 +11,11 @@ import json
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from itertools import zip_longest
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from hypogoal.core.config import parse_assignments, preset_digest
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, replace_text
@@ -31,6 +31,7 @@ FORMAT_VERSION = 1
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
 COMMANDS = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "evaluate", "report")
+SHORT = ("--members", "--diversity", "--layout-seed", "--agent")  # options that are settings, which --set goes before
 AGAIN = "Start the sweep again."
 
 
@@ -87,6 +88,20 @@ def write_record(run: Path, cell: Cell, record: Record) -> None:
 def begun(before: Record) -> Record:
     """The record of a cell that is being started."""
     return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
+
+
+def forget_records(run: Path, cells: Sequence[Cell]) -> None:
+    """Have no record of cells: as if none of them had ever been started."""
+    for cell in cells:
+        (run / LOGS / f"{cell.name}.json").unlink(missing_ok=True)
+
+
+def excuse(run: Path, cells: Sequence[Cell]) -> None:
+    """Have those of the cells that failed count as stopped: they are tried again."""
+    for cell in cells:
+        record = read_record(run, cell)
+        if record.code:  # and not None, which is said of one that runs
+            write_record(run, cell, replace(record, code=0))
 
 
 def open_log(run: Path, cell: Cell) -> BinaryIO:
@@ -154,6 +169,8 @@ def write_plan(run: Path, plan: Plan, factor: float) -> None:
     rows = [_row(moved(cell, str(run), RUN)) for cell in plan.cells]
     about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
     lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
+    about |= {"anew": sorted(plan.anew)} if plan.anew else {}
+    about |= {"presets": dict(plan.presets)} if plan.presets else {}
     head = json.dumps(about)[:-1]
     replace_text(run / PLAN, f'{head}, "cells": [\n{lines}\n]}}\n')
 
@@ -182,7 +199,11 @@ def read_plan(run: Path) -> tuple[Plan, float]:
     try:
         if about["format"] > FORMAT_VERSION:
             raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
-        plan = Plan(str(about["experiment"]), [_cell(row, run) for row in about["cells"]], int(about["workers"]))
+        cells, anew = [_cell(row, run) for row in about["cells"]], frozenset(about.get("anew", ()))
+        presets = {str(path): str(digest) for path, digest in about.get("presets", {}).items()}
+        plan = Plan(str(about["experiment"]), cells, int(about["workers"]), anew, presets)
+        if not anew <= {cell.name for cell in cells}:
+            raise ValueError
         seen: set[Path] = set()
         for cell in plan.cells:
             if not seen.issuperset(cell.needs) or cell.out in seen:
@@ -205,21 +226,68 @@ def _cell(row: dict[str, Any], run: Path) -> Cell:
     return moved(Cell(row["name"], arguments, Path(row["out"]), needs, cost, axes), RUN, str(run))
 
 
+def made_anew(run: Path, cell: Cell) -> None:
+    """Write down that a cell which was to be made again has been."""
+    plan, factor = read_plan(run)
+    write_plan(run, replace(plan, anew=plan.anew - {cell.name}), factor)
+
+
 def check_same(run: Path, cells: Sequence[Cell]) -> None:
     """Refuse cells that do not go on with what the folder has: every cell of before, commands as they were.
 
     Raises:
-        UserError: a cell of before is not there any more, or its command is another.
+        UserError: a cell of before is not there any more, its command is another, or a preset file was changed.
     """
     if not (run / PLAN).is_file():
         return
-    now = {cell.name: moved(cell, str(run), RUN) for cell in cells}
     do = "Give the settings it was begun with, or choose another --out."
-    for cell in read_plan(run)[0].cells:
-        before, after = moved(cell, str(run), RUN), now.get(cell.name)
+    there, digests = read_plan(run)[0], preset_digests(cells)
+    for path, digest in there.presets.items():
+        if digests.get(path, digest) != digest:
+            raise UserError("this preset was changed since the sweep here was begun", path, do)
+    now = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
+    for cell in there.cells:
+        before, after = moved(cell, str(run), RUN), now.get(cell.out.relative_to(run))
         if after is None:
             raise UserError(f"the sweep here has a cell that this one has not: {cell.name}", run, do)
-        if (after.arguments, after.out) != (before.arguments, before.out):
-            pairs = zip_longest(before.arguments, after.arguments, fillvalue="")
-            one, other = next((pair for pair in pairs if pair[0] != pair[1]), (before.out, after.out))
+        old, new = _meaning(before), _meaning(after)
+        if old != new:
+            one, other = (next((part for part in a if part not in b), "") for a, b in ((old, new), (new, old)))
             raise UserError(f"{cell.name} of the sweep here was begun with '{one}', not '{other}'", run, do)
+
+
+def _meaning(cell: Cell) -> list[str]:
+    """A cell's command in parts, sorted where their order changes nothing: the same for two that mean the same.
+
+    Of options and settings of one name the order stays or the last one counts; settings go before their options.
+    """
+    first, *options = _options(cell)
+    short, given, rest = [], [], []
+    for group in options:
+        if len(group) == 2 and group[0] in SHORT:
+            short.append(f"{group[0][2:]}={group[1]}")
+        elif len(group) == 2 and group[0] == "--set" and "=" in group[1]:
+            given.append(group[1])
+        else:
+            rest.append(group)
+    settings = parse_assignments([*short, *given])
+    rest.sort(key=lambda group: group[0])
+    parts = [" ".join(group) for group in (first, *rest)]
+    return [*parts, *(f"{key}={settings[key]}" for key in sorted(settings)), str(cell.out)]
+
+
+def _options(cell: Cell) -> list[list[str]]:
+    """A command's words: those before all options, then each option with what follows it."""
+    groups: list[list[str]] = [[]]
+    for word in cell.arguments:
+        if word.startswith("-"):
+            groups.append([])
+        groups[-1] += word.split("=", 1) if word.startswith("--") else [word]
+    return groups
+
+
+def preset_digests(cells: Sequence[Cell]) -> dict[str, str]:
+    """The preset files that commands name, each with its digest."""
+    options = (group for cell in cells for group in _options(cell))
+    files = {group[-1] for group in options if group[0] == "--preset" and group[-1].endswith(".toml")}
+    return {path: preset_digest(path) for path in sorted(files)}

@@ -23,7 +23,7 @@ from hypogoal.evaluation.distance import ladder_numbers
 from hypogoal.evaluation.reading import read_episodes, read_executions, read_layout
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import RESULTS
-from hypogoal.experiments.status import is_there
+from hypogoal.experiments.status import done_of
 
 AGAIN = "Make the artefact again."
 
@@ -56,12 +56,13 @@ def write_results(plan: Plan, run: Path) -> Path:
 
 def _table(plan: Plan, run: Path) -> str:
     names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
-    judged = _judged(plan, run)
+    done = done_of(plan)
+    judged = _judged([cell for cell in plan.cells if cell.out in done])
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["cell", "stage", *names, *Number._fields[2:], *Number._fields[:2]])
     for cell in plan.cells:
-        if not is_there(cell):
+        if cell.out not in done:
             continue
         axes = dict(cell.axes)
         about = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
@@ -123,11 +124,11 @@ def _distances(artefact: Artefact) -> Iterator[Number]:
             yield from _named(numbers, sub_goal=row["sub_goal"], member=option["member"])
 
 
-def _judged(plan: Plan, run: Path) -> dict[str, list[Number]]:
+def _judged(cells: Iterable[Cell]) -> dict[str, list[Number]]:
     """What the sweep's evaluation says of each ensemble, by its path within the run; empty where there is none yet."""
     found: dict[str, list[Number]] = {}
-    for cell in plan.cells:
-        if cell.stage != "evaluate" or not is_there(cell):
+    for cell in cells:
+        if cell.stage != "evaluate":
             continue
         metrics = read_json(cell.out / "metrics.json", "the evaluation's numbers are", AGAIN)
         for ensemble in metrics["ensembles"]:

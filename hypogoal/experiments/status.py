@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST
-from hypogoal.experiments.cells import Cell
+from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import duration
+from hypogoal.experiments.finished import is_current
 from hypogoal.experiments.records import Record, is_running, last_line, log_of, read_plan, read_record
 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
@@ -54,20 +55,21 @@ class Status:
 def read_status(run: Path) -> Status:
     """Look at every cell.
 
-    A cell is done when its output is there (what has a manifest is whole); the next start checks it file by file.
+    A cell is done as of :func:`done_of`; the next start checks it file by file.
 
     Raises:
         UserError: there is no sweep.
     """
     plan, factor = read_plan(run)
     states: list[State] = []
+    done = done_of(plan)
     bad: set[Path] = set()
     for cell in plan.cells:
         record = read_record(run, cell)
         log = log_of(run, cell)
         if is_running(run, cell):
             one = State(cell, RUNNING, record, last_line(log))
-        elif is_there(cell):
+        elif cell.out in done:
             one = State(cell, DONE, record)
         elif record.code not in STOPS:
             one = State(cell, FAILED, record, last_line(log))
@@ -79,6 +81,20 @@ def read_status(run: Path) -> Status:
             bad.add(cell.out)
         states.append(one)
     return Status(run, plan.experiment, states, time_left(states, plan.workers, factor))
+
+
+def done_of(plan: Plan) -> set[Path]:
+    """The outputs of the cells that are done: there (what has a manifest is whole), and not to be made again.
+
+    An evaluation or report of less than what the plan has now, or of something else, is not.
+    """
+    done: set[Path] = set()
+    for cell in plan.cells:
+        if cell.name in plan.anew or not is_there(cell):
+            continue
+        if cell.stage not in DERIVED or (done.issuperset(cell.needs) and is_current(cell)):
+            done.add(cell.out)
+    return done
 
 
 def is_there(cell: Cell) -> bool:

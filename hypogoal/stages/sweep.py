@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
 from hypogoal.core.config import parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
@@ -28,9 +29,21 @@ from hypogoal.experiments.engines import slurm
 from hypogoal.experiments.engines.local import run_cells
 from hypogoal.experiments.finished import left_of
 from hypogoal.experiments.own import own_plan
-from hypogoal.experiments.records import FINISHED, LOGS, RESULTS, check_same, read_plan, read_record, write_plan
+from hypogoal.experiments.records import (
+    FINISHED,
+    LOGS,
+    PLAN,
+    RESULTS,
+    check_same,
+    excuse,
+    forget_records,
+    preset_digests,
+    read_plan,
+    read_record,
+    write_plan,
+)
 from hypogoal.experiments.results import write_results
-from hypogoal.experiments.status import is_there
+from hypogoal.experiments.status import done_of
 
 EXPERIMENTS: Mapping[str, Any] = {"doorkey": doorkey, "montezuma-ladders": montezuma_ladders}
 FIGURES = {  # of the paper: the experiment and its preset
@@ -75,6 +88,7 @@ def plan(
     assignments: Iterable[str] = (),
     seeds: str | None = None,
     device: str = "auto",
+    short: bool = False,
 ) -> Plan:
     """The cells of an experiment.
 
@@ -85,6 +99,8 @@ def plan(
         assignments: ``KEY=VALUE`` or ``STAGE.KEY=VALUE``; of an own experiment ``AXIS=VALUES``.
         seeds: the run seeds, ``0-9``.
         device: of the training stages.
+        short: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
+            was begun with other names keeps those.
 
     Raises:
         UserError: unknown experiment or preset, a setting that no stage has, or no such device.
@@ -102,16 +118,31 @@ def plan(
         known = ", ".join([*EXPERIMENTS, *FIGURES])
         raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
     chosen = assignments + ([f"seeds={seeds}"] if seeds else [])
-    return _named_plan(name, out, preset or own_preset, chosen, device)
+    return _named_plan(name, out, preset or own_preset, chosen, device, _short(out, wanted=short))
 
 
-def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Sequence[str], device: str) -> Plan:
+def _short(out: Path, *, wanted: bool) -> bool:
+    """Whether names are to be short: as in the run's folder, where there is something."""
+    try:
+        before, _ = read_plan(out)
+    except UserError:  # none, or a damaged one, which is told when it is to be gone on with
+        return wanted
+    return out / "ensemble" in {cell.out for cell in before.cells}
+
+
+def _named_plan(
+    experiment: str, out: Path, preset: str | None, assignments: Sequence[str], device: str, short: bool
+) -> Plan:
     found = EXPERIMENTS[experiment]
     own, by_stage = _split(assignments)
     config = resolve(found.RunConfig, stage="run", preset=preset, assignments=own, domain=found.DOMAIN)
-    for stage in by_stage:
+    for stage, pairs in by_stage.items():
         if stage not in found.STAGES:
             raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(found.STAGES)}.")
+        for key in parse_assignments(pairs):
+            if key in found.DECIDED:
+                do = f"Give --set {found.DECIDED[key]}=..."
+                raise UserError("the experiment gives each cell its own", f"{stage}.{key}", do)
     resolved: dict[str, Any] = {
         stage: resolve(
             config_class_of(stage, found.DOMAIN),
@@ -131,7 +162,7 @@ def _named_plan(experiment: str, out: Path, preset: str | None, assignments: Seq
         )
         for stage in found.STAGES
     }
-    return Plan(experiment, found.cells(out, config, resolved, common), config.workers or cores())
+    return Plan(experiment, found.cells(out, config, resolved, common, short=short), config.workers or cores())
 
 
 def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:
@@ -156,7 +187,17 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
     """
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
-    sweep(planned, out, force=force, quiet=quiet, go_on=GO_ON)
+    sweep(planned, out, force=force and not (resume and _begun(out, planned)), quiet=quiet, go_on=GO_ON)
+
+
+def _begun(out: Path, planned: Plan) -> bool:
+    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with."""
+    try:
+        before, _ = read_plan(out)
+        check_same(out, planned.cells)
+    except UserError:
+        return False
+    return len(done_of(replace(planned, anew=before.anew))) < len(planned.cells)
 
 
 def sweep(
@@ -188,10 +229,11 @@ def sweep(
         UserError: another process runs it, the folder has another sweep, or a cell failed.
     """
     say = (lambda text: None) if quiet else _say
+    _check_folder(out)
     with sole_writer(out):
-        _begin(planned, out, force=force, say=say, confirm=confirm)
+        planned = _begin(planned, out, force=force, say=say, confirm=confirm)
         try:
-            outcome = run_cells(planned, out, force=force, say=say)
+            outcome = run_cells(planned, out, say=say)
         except KeyboardInterrupt as error:
             error.add_note(f"what is done is kept: {go_on}")
             raise
@@ -221,21 +263,39 @@ def submit(
     """
     at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
     planned = replace(planned, workers=at_once)
+    slurm.check(out, options)
+    _check_folder(out)
     with sole_writer(out):
-        _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
+        planned = _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
+        if planned.anew:
+            what = f"{len(planned.anew)} cells are still to be made again, as 'hypogoal run --force' began to"
+            raise UserError(what, out, "Let 'hypogoal run --resume' do that.")
         todo = left_of(planned.cells)
         return slurm.submit(planned, out, todo, options) if todo else []
 
 
+def _check_folder(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise UserError("a run needs a folder, this is a file", out, "Choose another --out.")
+    check_parent(out)
+
+
 def _begin(
     planned: Plan, out: Path, *, force: bool, say: Callable[[str], None], confirm: Callable[[str], None] | None
-) -> None:
-    """Before the first cell: is this the sweep of this folder, what will it cost, is that wanted."""
+) -> Plan:
+    """Before the first cell: is this the sweep of this folder, what will it cost, is that wanted; the plan as written.
+
+    What is to be made again is so until it is, however often the sweep is started.
+    """
     if alive := slurm.queued(out):
         raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
-    if not force:
+    anew = frozenset(cell.name for cell in planned.cells) if force else frozenset()
+    if not force and (out / PLAN).is_file():
         check_same(out, planned.cells)
-    todo = planned.cells if force else [cell for cell in planned.cells if not is_there(cell)]
+        anew = read_plan(out)[0].anew
+    planned = replace(planned, anew=anew, presets=preset_digests(planned.cells))
+    done = done_of(planned)
+    todo = [cell for cell in planned.cells if cell.out not in done]
     factor = machine_factor() if todo else 1.0
     if len(todo) < len(planned.cells):
         say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
@@ -246,7 +306,13 @@ def _begin(
     if confirm is not None and seconds > LONG_SECONDS:
         confirm(cost_lines(todo, planned.workers, factor)[-1])
     (out / LOGS).mkdir(parents=True, exist_ok=True)
+    if force:
+        forget_records(out, planned.cells)  # before the plan: what an attempt of now began is known by its record
+    if todo:
+        excuse(out, todo)
+        (out / FINISHED).unlink(missing_ok=True)
     write_plan(out, planned, factor)
+    return planned
 
 
 def gather(out: Path) -> Path:
@@ -257,7 +323,7 @@ def gather(out: Path) -> Path:
     """
     planned, _ = read_plan(out)
     results = write_results(planned, out)
-    if all(map(is_there, planned.cells)):
+    if len(done_of(planned)) == len(planned.cells):
         seconds = sum(read_record(out, cell).seconds for cell in planned.cells)
         about = {"cells": [cell.text for cell in planned.cells], "seconds": round(seconds, 1)}
         replace_text(out / FINISHED, json.dumps(about, indent=1) + "\n")

@@ -20,7 +20,7 @@ from hypogoal.core.own_code import given
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.workers import cores, in_processes
+from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.networks import load_network
@@ -84,7 +84,7 @@ def train_ensemble(
         "domain": dataset.domain,
         "domain_config": dataset.config,
     }
-    workers = min(config.workers or cores(), len(sub_goals))
+    workers = min(allowed(config.workers), len(sub_goals))
     preflight(
         "train-ensemble", out, ensemble_needs(data, others or (data,), config, len(sub_goals), workers), quiet=quiet
     )

@@ -41,3 +41,18 @@ def test_where_nothing_is_known_nothing_is_refused(tmp_path: Path, monkeypatch: 
     """Spec G1: not every system says how much memory is free."""
     monkeypatch.setattr(preflight, "free_memory", lambda: None)
     preflight.preflight("collect", tmp_path / "a", (1e15, 1))
+
+
+def test_what_the_process_has_itself_is_not_needed_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1, G4: a cell whose job was given what it needs starts there, whatever it has of that already."""
+    held = bytearray(b"x" * 50_000_000)
+    own = preflight.own_memory()
+    assert own > len(held)
+    limit = own + 300_000_000
+    for name, text in (("memory.max", limit), ("memory.current", own), ("memory.stat", "file 0\n")):
+        (tmp_path / name).write_text(str(text))
+    names = ("memory.max", "memory.current", "file")
+    monkeypatch.setattr(preflight, "_folders", lambda: [(tmp_path, names)])
+    preflight.preflight("collect", tmp_path / "a", (limit - 20_000_000, 1))
+    with pytest.raises(UserError, match="not enough memory"):
+        preflight.preflight("collect", tmp_path / "a", (limit + 20_000_000, 1))

@@ -1,13 +1,17 @@
 """Experiments as data (Spec A6, G4): what their cells are, in which order they can run, and what they cost."""
 
+import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from hypogoal.core.errors import UserError
-from hypogoal.experiments.cells import Cell, Cost, depths, moved
+from hypogoal.experiments.cells import Cell, Cost, Plan, depths, moved
 from hypogoal.experiments.costs import cost_lines
-from hypogoal.stages.sweep import EXPERIMENTS, plan
+from hypogoal.experiments.engines.local import Outcome
+from hypogoal.experiments.records import check_same, write_plan
+from hypogoal.stages.sweep import EXPERIMENTS, plan, sweep
 
 OUT = Path("somewhere")
 
@@ -56,6 +60,100 @@ def test_each_variant_gives_one_more_ensemble_per_method_and_seed() -> None:
     assert {len(cell.out.relative_to(OUT).parts) for cell in trained} == {3}  # evaluate looks no deeper
     full = [cell for cell in trained if "view=full" in cell.arguments]
     assert len(full) == 4 and all("network=montezuma" in cell.arguments for cell in full)
+
+
+def settings(cell: Cell) -> dict[str, str]:
+    """What a cell's ``--set`` say: of two for one setting the last."""
+    words = cell.arguments
+    return dict(word.split("=", 1) for before, word in pairwise(words) if before == "--set")
+
+
+def test_what_all_cells_are_given_undoes_no_variant_and_no_method() -> None:
+    """Spec F1: the single CNN has one member and a variant its own setting, whatever --set train-ensemble.KEY says."""
+    common = [f"train-ensemble.{pair}" for pair in ("members=3", "diversity=none", "localiser=learned")]
+    changes = ["groups=1", "variants=localiser=ram", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
+    cells = plan("montezuma-ladders", OUT, assignments=[*changes, *common, "train-options.termination=learned"]).cells
+    trained = [cell for cell in cells if cell.stage == "train-ensemble"]
+    for cell in trained:
+        axes, has = dict(cell.axes), settings(cell)
+        assert has["diversity"] == ("dbat" if axes["method"] == "dbat" else "none")
+        assert has["members"] == ("1" if axes["method"] == "cnn" else "3")
+        assert has["localiser"] == ("ram" if axes["variant"] else "learned")
+        assert not {"--members", "--diversity"} & {*cell.arguments}  # before which any --set would go
+    options = [cell for cell in cells if cell.stage == "train-options"]
+    assert {settings(cell)["start"] for cell in options} == {"1L"}
+    assert [settings(cell)["termination"] for cell in options].count("oracle") == 1
+
+
+def test_controls_and_baselines_keep_the_agents_budget() -> None:
+    """Spec E6, E7: as many steps as options and agent together, also where those were changed for all cells."""
+    changes = ["train-meta.steps=5000", "train-options.steps=3000", "train-meta.chooser=ppo"]
+    changes += ["train-baseline.steps=7", "train-baseline.setting=tuned"]
+    for cell in plan("doorkey", OUT, preset="demo", assignments=changes).cells:
+        agent, has = dict(cell.axes).get("agent"), settings(cell)
+        if cell.stage in ("train-meta", "train-baseline"):
+            assert has["steps"] == ("5000" if agent == "meta" else "8000")
+        assert has.get("setting", "paper") == ("tuned" if str(agent).endswith("-tuned") else "paper")
+        if cell.stage == "train-meta":
+            assert has["chooser"] == ("random" if agent == "meta-random" else "ppo")
+    for given, instead in (("train-meta.layout_seed=3", "layout_seeds"), ("train-baseline.agent=dqn", "baselines")):
+        with pytest.raises(UserError, match=f"Give --set {instead}="):
+            plan("doorkey", OUT, assignments=[given])
+
+
+def begun(run: Path, *arguments: str) -> None:
+    """A folder in which the sweep of one ensemble was begun."""
+    write_plan(run, Plan("x", [Cell("e", ("train-ensemble", "d.h5", *arguments), run / "e")], 1), 1.0)
+
+
+def test_a_sweep_is_the_same_whatever_the_order_of_its_settings(tmp_path: Path) -> None:
+    """Spec G4: one begun when commands were put together otherwise goes on, as does one whose cells were
+    called otherwise; one that meant something else does not."""
+
+    def same(*arguments: str) -> None:
+        check_same(tmp_path, [Cell("e", ("train-ensemble", "d.h5", *arguments), tmp_path / "e")])
+
+    begun(tmp_path, "--diversity", "none", "--members", "1", "--seed", "0", "--preset", "demo", "--set", "steps=6")
+    same("--preset", "demo", "--set", "steps=6", "--set", "diversity=none", "--set", "members=1", "--seed", "0")
+    for words, arguments in (
+        ("'steps=6', not 'steps=7'", ("--preset", "demo", "--set", "steps=6", "--set", "steps=7", "--seed", "0")),
+        ("'--seed 0', not '--seed 1'", ("--preset", "demo", "--set", "steps=6", "--seed", "1")),
+    ):
+        with pytest.raises(UserError, match=words):
+            same("--set", "diversity=none", "--set", "members=1", *arguments)
+    begun(tmp_path, "--seed", "0")
+    check_same(tmp_path, [Cell("e-0.1", ("train-ensemble", "d.h5", "--seed", "0"), tmp_path / "e")])
+    begun(tmp_path, "--members", "1", "--set", "members=3")  # what undid the single CNN
+    with pytest.raises(UserError, match="'members=3', not 'members=1'"):
+        same("--set", "members=3", "--set", "members=1")
+
+
+def test_a_preset_file_may_not_change_under_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G4: cells made before would have other settings than those made now; which cells there are may change."""
+    preset, out = tmp_path / "my.toml", tmp_path / "out"
+    preset.write_text("[train-ensemble]\nsteps = 7\n")
+    monkeypatch.setattr("hypogoal.stages.sweep.run_cells", lambda planned, out, say: Outcome())
+    monkeypatch.setattr("hypogoal.stages.sweep.gather", lambda out: None)
+    sweep(plan("doorkey", out, preset=str(preset)), out, quiet=True)
+    preset.write_text("# more\n[run]\nseeds = [0, 1]\n[train-ensemble]\nsteps = 7\n")
+    sweep(plan("doorkey", out, preset=str(preset)), out, quiet=True)
+    preset.write_text("[run]\nseeds = [0, 1]\n[train-ensemble]\nsteps = 9\n")
+    with pytest.raises(UserError, match="this preset was changed since the sweep here was begun"):
+        sweep(plan("doorkey", out, preset=str(preset)), out, quiet=True)
+    about = (out / "sweep.json").read_text()
+    (out / "sweep.json").write_text(re.sub('"presets": {[^}]*}, ', "", about))
+    sweep(plan("doorkey", out, preset=str(preset)), out, quiet=True)  # begun when this was not written down
+
+
+def test_a_sweep_of_one_seed_can_be_given_more(tmp_path: Path) -> None:
+    """Spec G4: its cells are called as those of many; those of ``run``, and of what was begun so, have short names."""
+    one = plan("doorkey", tmp_path, preset="demo")
+    assert tmp_path / "meta" in {cell.out for cell in plan("doorkey", tmp_path, preset="demo", short=True).cells}
+    write_plan(tmp_path, one, 1.0)
+    check_same(tmp_path, plan("doorkey", tmp_path, preset="demo", seeds="0-2").cells)
+    assert plan("doorkey", tmp_path, preset="demo", short=True).cells == one.cells
+    write_plan(tmp_path / "x", plan("doorkey", tmp_path / "x", preset="demo", short=True), 1.0)
+    check_same(tmp_path / "x", plan("doorkey", tmp_path / "x", preset="demo").cells)
 
 
 @pytest.mark.parametrize(
@@ -127,5 +225,10 @@ def test_a_moved_cell_is_the_same_in_another_place() -> None:
     assert there.arguments == ("train-meta", "{run}/a", "runs/xy", "--out", "{run}")
     assert (there.out, there.needs) == (Path("{run}/b"), (Path("{run}/a"),))
     assert moved(there, "{run}", "runs/x") == cell
+    for name in ("report", "train-meta", "collect", "doorkey", "steps=6", "demo"):
+        cells = plan("doorkey", Path(name), preset="demo", assignments=["train-meta.steps=6"]).cells
+        elsewhere = plan("doorkey", Path("{run}"), preset="demo", assignments=["train-meta.steps=6"]).cells
+        assert [moved(cell, name, "{run}") for cell in cells] == elsewhere
+        assert [moved(cell, "{run}", name) for cell in elsewhere] == cells
     depth = depths([Cell("a", ("x",), OUT / "a"), Cell("b", ("x",), OUT / "b", (OUT / "a",))])
     assert [*depth.values()] == [0, 1]

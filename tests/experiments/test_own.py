@@ -52,6 +52,25 @@ def test_axes_from_the_command_line(tmp_path: Path) -> None:
     assert plan.workers == 3 and plan.cells[-1].stage == "train-meta"
 
 
+@pytest.mark.parametrize(
+    ("more", "cores"),
+    [("", 5), ("--set workers=2", 2), ("--set workers=9", 5), ("--set sub_goals=open-red-door,take-red-key", 2)],
+)
+def test_ensembles_get_a_process_for_each_sub_goal(tmp_path: Path, more: str, cores: int) -> None:
+    """Spec G4: as many processors are asked for as it can use, and a gigabyte for each process not spoken of."""
+    plan = planned(tmp_path, GOOD.replace("train-ensemble {data}", f"train-ensemble {{data}} {more}"))
+    costs = {cell.stage: cell.cost for cell in plan.cells}
+    assert (costs["train-ensemble"].cores, costs["train-ensemble"].memory) == (cores, 1.5e9)
+    assert (costs["train-meta"].cores, costs["train-meta"].memory) == (1, 1e9)
+
+
+def test_values_may_have_a_dot(tmp_path: Path) -> None:
+    """Spec G4: 0.1 and 0.2 are two cells, and of data only ``.h5`` is no part of the name."""
+    text = GOOD.replace("[0, 1]", "[0.1, 0.2]").replace("doorkey --seed 3", "doorkey").replace('"210-212"', "[1.5]")
+    names = [cell.name for cell in planned(tmp_path, text).cells]
+    assert names[:4] == ["data", "ensemble-seed-0.1", "ensemble-seed-0.2", "agent-seed-0.1-layout-1.5"]
+
+
 def test_the_example_is_one() -> None:
     """The file in examples/ is an experiment."""
     plan = own_plan(ROOT / "examples" / "sweep-doorkey.toml", OUT)

@@ -20,9 +20,10 @@ from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Cell, Cost, Plan
-from hypogoal.experiments.engines.slurm import MOST_ELEMENTS, Options, arrays, submit
+from hypogoal.experiments.engines.slurm import MOST_ELEMENTS, Options, arrays, most_elements, submit
 from hypogoal.experiments.records import read_plan, read_record
 from hypogoal.experiments.status import read_status
+from hypogoal.stages import sweep as sweeping
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0
@@ -58,6 +59,17 @@ def test_arrays_are_stages_and_wait_for_what_they_need_only() -> None:
     ]
 
 
+def test_arrays_are_as_long_as_slurm_allows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G4: MaxArraySize is asked of Slurm; where it does not say, its own default holds."""
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    for text, most in (("MaxArraySize            = 4\n", 3), ("error", MOST_ELEMENTS)):
+        (tmp_path / "scontrol").write_text(f"#!/bin/sh\nprintf 'MaxArrayTasks = 9\\n{text}'\n")
+        (tmp_path / "scontrol").chmod(0o755)
+        assert most_elements() == most
+    plan = some_plan(5)
+    assert max(len(array.cells) for array in arrays(plan, plan.cells, 3)) == 3
+
+
 COMMAND = """#!/bin/sh
 echo "$(basename "$0") $*" >> "$(dirname "$0")/asked"
 case "$(tail -n 1 "$(dirname "$0")/asked")" in
@@ -88,13 +100,19 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         "#SBATCH --time=4:00:00",
         "#SBATCH --gres=gpu:1",
         "#SBATCH --cpus-per-task=2",
-        "#SBATCH --mem=1908M",
+        "#SBATCH --mem=2194M",
         "#SBATCH --signal=B:USR2@90",
         "#SBATCH --requeue",
         "#SBATCH --account=x",
         "set -- e-0 e-1 e-2",
     ):
         assert f"\n{line}\n" in script, line
+    percent = submit(plan, tmp_path / "50%A", plan.cells[:1], Options())
+    text = (tmp_path / "50%A" / "slurm" / f"{percent[0]['name']}.sh").read_text()
+    assert "/50%%A/slurm/%x-%A-%a.out\n" in text or "/50%%A/slurm'/%x-%A-%a.out\n" in text
+    with pytest.raises(UserError, match="cannot stand in a batch script"):
+        sweeping.submit(plan, tmp_path / "a\\b", Options(), quiet=True)
+    assert not list(tmp_path.glob("*\\*"))
     lines = (tmp_path / "asked").read_text().splitlines()
     assert "--dependency=afterany:1 " in lines[2] and "--dependency=afterany:2:3 " in lines[3]
     (tmp_path / "full").touch()
@@ -110,7 +128,9 @@ def test_without_slurm_that_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match="there is no Slurm here"):
         submit(some_plan(), tmp_path / "out", some_plan().cells, Options())
-    assert not (tmp_path / "out").exists()
+    with pytest.raises(UserError, match="there is no Slurm here"):
+        sweeping.submit(some_plan(), tmp_path / "out", Options(), quiet=True)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(scope="module")

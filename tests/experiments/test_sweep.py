@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,9 +18,19 @@ from hypogoal.cli import main
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.engines.local import run_cells
-from hypogoal.experiments.records import is_running, open_log, read_plan, read_record
+from hypogoal.experiments.engines.slurm import Options
+from hypogoal.experiments.records import (
+    Record,
+    is_running,
+    made_anew,
+    open_log,
+    read_plan,
+    read_record,
+    write_plan,
+    write_record,
+)
 from hypogoal.experiments.status import read_status
-from hypogoal.stages.sweep import plan
+from hypogoal.stages.sweep import gather, plan, run, submit
 
 ROOT = Path(__file__).resolve().parents[2]
 WAIT_SECONDS = 300.0
@@ -107,6 +118,19 @@ def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.Ca
         assert words in err and err.count("\n") == 1, err
 
 
+def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: as --out of a sweep or run, or where its folder would be: one line, and the file stays."""
+    there = tmp_path / "there"
+    there.write_text("mine")
+    for command in (["sweep"], ["run", "--force"]):
+        for out, words in ((there, "this is a file"), (there / "x", "a file is in the way")):
+            capsys.readouterr()
+            assert main([*command, "doorkey", "--preset", "demo", "--out", str(out), "-q"]) == 2
+            err = capsys.readouterr().err
+            assert words in err and err.count("\n") == 1, err
+    assert [path.name for path in tmp_path.iterdir()] == ["there"] and there.read_text() == "mine"
+
+
 FAILS = f"""
 [[cells]]
 name = "worse"
@@ -156,6 +180,37 @@ def test_what_was_changed_by_hand_is_not_replaced(
     assert (out / "results.csv").read_bytes() == before
 
 
+def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G4: neither in the status nor in the results, before it is made again; one that failed is tried again."""
+    out, toy = tmp_path / "out", str(swept / "toy.toml")
+    shutil.copytree(swept / "whole" / "ensemble" / "seed-0", out / "ensemble" / "seed-0")
+    shutil.copy(swept / "whole" / "data.h5", out)
+    arguments = ["sweep", toy, "--out", str(out), "--set", "evaluate=true", "-q", "--seeds"]
+    assert main([*arguments, "0"]) == 0
+    assert read_status(out).count("done") == 4 and (out / "run.json").is_file()
+
+    def states() -> list[str]:
+        return [one.state for one in read_status(out).states]
+
+    both = plan(toy, out, assignments=["evaluate=true"])
+    write_plan(out, both, 1.0)
+    assert states() == ["done", "done", "waiting", "stopped", "stopped"]
+    shutil.copytree(swept / "whole" / "ensemble" / "seed-1", out / "ensemble" / "seed-1")
+    evaluation = both.cells[-2]
+    write_record(out, evaluation, Record(2, 5.0, 2))
+    assert states() == ["done", "done", "done", "failed", "held"]
+    (out / "run.json").unlink()
+    gather(out)
+    judged = [line for line in (out / "results.csv").read_text().splitlines() if ",heldout," in line]
+    assert {line.split(",")[0] for line in judged} == {"data"} and not (out / "run.json").exists()
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm.check", lambda run, options: None)
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm.submit", lambda *given: [])
+    submit(both, out, Options(), quiet=True)
+    assert states() == ["done", "done", "done", "stopped", "stopped"]
+    assert main([*arguments, "0-1"]) == 0
+    assert states() == ["done"] * 5 and (out / "run.json").is_file()
+
+
 def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
     """Spec G4: from files alone: who holds the lock on a log runs the cell; when that dies, nobody does."""
     run = swept / "whole"
@@ -183,13 +238,47 @@ def test_cells_are_run_in_the_plans_order(tmp_path: Path) -> None:
 
     def started() -> list[str]:
         told: list[str] = []
-        run_cells(planned, tmp_path / "out", force=False, say=told.append)
+        run_cells(planned, tmp_path / "out", say=told.append)
         return [line.split()[1] for line in told if line.endswith(" ...")]
 
     assert started() == ["data", "ensemble-seed-0", "more"]
     for cell in planned.cells[1:]:
         cell.out.rename(cell.out.with_suffix(".old"))
     assert started() == ["ensemble-seed-0", "more"]
+
+
+def test_what_was_to_be_made_anew_is_so_until_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A6, G4: ``run --force`` is interrupted: what stood there before does not pass for what it will make."""
+    out = tmp_path / "out"
+    planned = plan(str(write_toy(tmp_path / "toy.toml", "0")), out)
+    data, ensemble = (cell.out for cell in planned.cells)
+    run(planned, out, quiet=True)
+
+    def made() -> tuple[int, int]:
+        return data.stat().st_mtime_ns, (ensemble / "manifest.json").stat().st_mtime_ns
+
+    def interrupted(*given: object) -> None:
+        made_anew(*given)  # type: ignore[arg-type]
+        raise KeyboardInterrupt
+
+    first = made()
+    with monkeypatch.context() as patch:
+        patch.setattr("hypogoal.experiments.engines.local.made_anew", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(planned, out, force=True, quiet=True)
+    second = made()
+    assert second[0] > first[0] and second[1] == first[1]
+    assert [one.state for one in read_status(out).states] == ["done", "waiting"] and not (out / "run.json").exists()
+    gather(out)
+    assert "ensemble" not in (out / "results.csv").read_text() and not (out / "run.json").exists()
+    monkeypatch.setattr("hypogoal.experiments.engines.slurm.check", lambda run, options: None)
+    with pytest.raises(UserError, match="still to be made again"):
+        submit(planned, out, Options(), quiet=True)
+    run(planned, out, force=True, resume=True, quiet=True)
+    third = made()
+    assert third[0] == second[0] and third[1] > second[1] and not read_plan(out)[0].anew
+    run(planned, out, resume=True, quiet=True)
+    assert made() == third and (out / "run.json").is_file()
 
 
 @pytest.mark.slow

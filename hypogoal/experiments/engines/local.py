@@ -12,7 +12,7 @@ from hypogoal.core.preflight import free_memory
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.engines.running import Running, start
 from hypogoal.experiments.finished import is_finished
-from hypogoal.experiments.records import last_line, log_of
+from hypogoal.experiments.records import last_line, log_of, made_anew
 
 POLL_SECONDS = 0.2
 REPORT_SECONDS = 15.0
@@ -27,13 +27,12 @@ class Outcome:
     waiting: list[Cell] = field(default_factory=list)
 
 
-def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None]) -> Outcome:
+def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None]) -> Outcome:
     """Run what is not finished; a cell that fails stops only those that need it.
 
     Args:
-        plan: the cells, and how many cores they may use.
+        plan: the cells, which of them are to be made again though finished, and how many cores they may use.
         run: the run's folder.
-        force: make finished ones anew.
         say: told what happens, a line at a time.
     """
     outcome = Outcome(waiting=list(plan.cells))
@@ -49,7 +48,7 @@ def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None])
                 for cell in ready:  # of which those that are finished make others ready
                     outcome.waiting.remove(cell)
                     try:
-                        if not force and is_finished(cell):
+                        if cell.name not in plan.anew and is_finished(cell):
                             _add(outcome, made, cell)
                         else:
                             startable.append(cell)
@@ -59,7 +58,7 @@ def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None])
             while startable and (cores := _allotted(startable, running, plan.workers, budget)):
                 cell = startable.pop(0)
                 try:
-                    running.append(start(cell, run, cores=cores, force=force))
+                    running.append(start(cell, run, cores=cores, force=cell.name in plan.anew))
                     say(f"[{len(made)}/{total}] {cell.name} ...")
                 except UserError as error:
                     _fail(outcome, cell, str(error), say)
@@ -72,6 +71,8 @@ def run_cells(plan: Plan, run: Path, *, force: bool, say: Callable[[str], None])
                 if one.process.returncode:
                     _fail(outcome, one.cell, reason(run, one.cell, one.process.returncode), say)
                 else:
+                    if one.cell.name in plan.anew:
+                        made_anew(run, one.cell)
                     _add(outcome, made, one.cell)
                     say(f"[{len(made)}/{total}] {one.cell.name} done in {one.seconds:.0f} s")
             if running and time.monotonic() - told > REPORT_SECONDS:

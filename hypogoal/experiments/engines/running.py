@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
+from hypogoal.core.drafts import unfinished
 from hypogoal.core.workers import CORES, die_with_parent
 from hypogoal.experiments.cells import Cell
 from hypogoal.experiments.records import Record, begun, open_log, read_record, write_record
@@ -49,17 +50,19 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Runn
         cell: what to run.
         run: the run's folder.
         cores: processes that it may use.
-        force: begin anew, whatever is there.
+        force: make it again, whatever is there; what an attempt of that has begun is gone on with.
 
     Raises:
         UserError: another process runs it.
     """
     log = open_log(run, cell)
     try:
-        record = begun(read_record(run, cell))
+        before = read_record(run, cell)
+        record = begun(before)
         write_record(run, cell, record)
         log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
-        again = "--force" if force or cell.out.exists() else "--resume"  # what is there is an evaluation of before
+        fresh = force or cell.out.exists()  # what is there is an evaluation of before
+        again = "--force" if fresh and not (before.attempts and unfinished(cell.out)) else "--resume"
         command = [sys.executable, "-m", "hypogoal", *cell.arguments, again]
         environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores)}
         process = subprocess.Popen(

@@ -27,8 +27,9 @@ from hypogoal.experiments.cells import Cell, Plan, depths
 from hypogoal.experiments.records import AGAIN
 
 FOLDER, JOBS = "slurm", "jobs.json"
-MOST_ELEMENTS = 1000  # of one array: Slurm's own limit, if nobody changed it, is 1001
+MOST_ELEMENTS = 1000  # of one array, where Slurm does not say: its limit, if nobody changed it, is 1001
 LEAST_MEMORY = 500e6
+MARGIN, BESIDE = 1.1, 100e6  # of what is estimated: some clusters kill at the limit; bytes of the job's own process
 CANCEL_SECONDS = 120.0
 GATHER = "gather"
 
@@ -67,8 +68,8 @@ class Array:
     after: list[str]
 
 
-def arrays(plan: Plan, todo: Sequence[Cell]) -> list[Array]:
-    """The arrays of the cells that are to be run, each after those that make what it needs."""
+def arrays(plan: Plan, todo: Sequence[Cell], most: int = MOST_ELEMENTS) -> list[Array]:
+    """The arrays of the cells that are to be run, of ``most`` at most, each after those that make what it needs."""
     depth = depths(plan.cells)
     groups: dict[tuple[int, str], list[Cell]] = {}
     for cell in todo:
@@ -78,8 +79,8 @@ def arrays(plan: Plan, todo: Sequence[Cell]) -> list[Array]:
     for (level, stage), cells in sorted(groups.items()):
         needs = {need for cell in cells for need in cell.needs}
         after = list(dict.fromkeys(made[need] for need in made if need in needs))
-        for number in range(ceil(len(cells) / MOST_ELEMENTS)):
-            part = cells[number * MOST_ELEMENTS : (number + 1) * MOST_ELEMENTS]
+        for number in range(ceil(len(cells) / most)):
+            part = cells[number * most : (number + 1) * most]
             name = f"{level:02d}-{stage}" + (f"-{number}" if number else "")
             found.append(Array(name, part, after))
             made.update((cell.out, name) for cell in part)
@@ -101,7 +102,7 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
     Raises:
         UserError: there is no Slurm, it refuses, or jobs of this sweep are still in its queue.
     """
-    _check(options)
+    check(run, options)
     if alive := queued(run):
         do = "Look with --status, end them with --cancel."
         raise UserError(f"this sweep is in Slurm's queue already (job {alive[0]})", run, do)
@@ -110,7 +111,7 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
     jobs: list[dict[str, Any]] = []
     numbers: dict[str, str] = {}
     try:
-        for array in arrays(plan, todo):
+        for array in arrays(plan, todo, most_elements()):
             script = folder / f"{array.name}.sh"
             replace_text(script, _script(array, run, options))
             numbers[array.name] = _sbatch(script, [numbers[name] for name in array.after])
@@ -127,19 +128,36 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
     return jobs
 
 
-def _check(options: Options) -> None:
+def most_elements() -> int:
+    """How many cells an array may have here, as Slurm's configuration says."""
+    if shutil.which("scontrol") is None:
+        return MOST_ELEMENTS
+    told = re.search(r"^MaxArraySize\s*=\s*(\d+)", _command("scontrol", "show", "config").stdout, re.MULTILINE)
+    return max(1, int(told[1]) - 1) if told else MOST_ELEMENTS
+
+
+def check(run: Path, options: Options) -> None:
+    """Check, before anything is written, that jobs can be asked for.
+
+    Raises:
+        UserError: there is no Slurm, or an option or the run's path is not one that a batch script can have.
+    """
     if shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     for text in (options.partition, options.time, options.memory, *options.extra):
         if not text.isprintable():
             raise UserError("not an option of sbatch", repr(text), "See 'man sbatch'.")
+    place = str(run.resolve())
+    if "\\" in place or not place.isprintable():  # upon a backslash Slurm takes %A and %a literally
+        raise UserError("a path with such signs cannot stand in a batch script", repr(place), "Choose another --out.")
 
 
 def _head(run: Path, name: str, options: Options) -> list[str]:
+    place = str((run / FOLDER).resolve()).replace("%", "%%")
     lines = [
         "#!/bin/sh",
         f"#SBATCH --job-name={re.sub(r'[^A-Za-z0-9_.-]', '-', run.name)}-{name}",
-        f"#SBATCH --output={shlex.quote(str((run / FOLDER).resolve()))}/%x-%A-%a.out",
+        f"#SBATCH --output={shlex.quote(place)}/%x-%A-%a.out",
         "#SBATCH --open-mode=append",
     ]
     lines += [f"#SBATCH --partition={options.partition}"] if options.partition else []
@@ -150,7 +168,8 @@ def _script(array: Array, run: Path, options: Options) -> str:
     """A plain batch script: element N runs the Nth of the cells it names."""
     cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
     estimated = cpus * max(cell.cost.memory for cell in array.cells)
-    memory = options.memory or (f"{ceil(max(estimated, LEAST_MEMORY) / 2**20)}M" if estimated else "")
+    asked = MARGIN * max(estimated, LEAST_MEMORY) + BESIDE
+    memory = options.memory or (f"{ceil(asked / 2**20)}M" if estimated else "")
     lines = _head(run, array.name, options)
     lines += [
         f"#SBATCH --array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
