@@ -21,9 +21,9 @@ DECIDED = {"layout_seed": "layout_seeds", "agent": "baselines"}  # settings of s
 
 # What things cost on one core of the machine of docs/performance.md: seconds per environment step, per gradient step of
 # a member (all five sub-goals), per ensemble that is evaluated.
-PER_STEP = {"light": 1e-3, "paper": 65e-3}
+PER_STEP = {"light": 0.8e-3, "paper": 65e-3}
 PER_BASELINE_STEP = {"ppo-paper": 1.5e-3, "dqn-paper": 1.7e-3, "ppo-tuned": 0.45e-3, "dqn-tuned": 0.3e-3}
-PER_MEMBER_STEP = 0.2
+PER_MEMBER_STEP = 0.15
 PER_COLLECTION = 15.0
 PER_EVALUATION = 20.0
 
