@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.meta.playing import LEARNERS, PlayConfig
+from hypogoal.meta.playing import PlayConfig, frames_kept
 from hypogoal.options.recording import STOPS_KEPT
 
 BASE = 450e6
@@ -70,7 +70,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
     paper = config.network == "paper"
     replays = options if paper else 1
     weights = options * PAPER_POLICY if paper else 8e6
-    frames = LEARNERS[config.network].reach(config, options) * prod(domain.observation_shape[:2])
+    frames = frames_kept(config, options) * prod(domain.observation_shape[:2])
     kept = frames if getattr(domain, "starts", ()) else 0
     if hasattr(domain, "played_bytes"):
         kept = domain.played_bytes(getattr(config, "steps", 0))

@@ -239,6 +239,17 @@ class MontezumaDomain:
                 "epsilon_final": 0.01,
                 "random_episodes": 0,
             },
+            "train-meta": {  # of options, what makes them those of train-options
+                "option_timeout": MAX_STEPS,
+                "experience": "own",
+                "option_gamma": 0.99,
+                "option_batch": 32,
+                "n_step": 10,
+                "exploration": "persistent",
+                "epsilon_steps": 10_000,
+                "epsilon_final": 0.01,
+                "random_episodes": 0,
+            },
         }
     )
 

@@ -21,13 +21,18 @@ class Episodes:
         step: environment steps when it ended, summed over parallel environments and stages.
         length: steps.
         reward: undiscounted.
-        terminated: it reached a terminal state (the goal); else it was cut at the cap.
+        terminated: it reached a terminal state; else it was cut at the cap.
     """
 
     step: NDArray[np.int64]
     length: NDArray[np.int64]
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
+
+    @property
+    def succeeded(self) -> NDArray[np.bool_]:
+        """Spec F5: it terminated, and with a reward: an agent that dies reaches a terminal state too."""
+        return self.terminated & (self.reward > 0)
 
     def last(self, count: int = WINDOW) -> Episodes:
         """The last ``count`` episodes, or all where there are fewer."""
@@ -61,7 +66,7 @@ def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = WINDOW) ->
     """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`."""
     return {
         "reward": trailing_mean(episodes.step, episodes.reward, grid, window, FIRST),
-        "success": trailing_mean(episodes.step, episodes.terminated.astype(np.float64), grid, window, FIRST),
+        "success": trailing_mean(episodes.step, episodes.succeeded.astype(np.float64), grid, window, FIRST),
         "length": trailing_mean(episodes.step, episodes.length.astype(np.float64), grid, window, FIRST),
     }
 
@@ -70,7 +75,7 @@ def steps_to_solve(episodes: Episodes, window: int = WINDOW, share: float = SOLV
     """Spec F5: the first step at which ``share`` of the last ``window`` episodes succeeded; None: never, or too few."""
     if len(episodes.step) < window:
         return None
-    sums = np.concatenate([[0], np.cumsum(episodes.terminated.astype(np.int64))])
+    sums = np.concatenate([[0], np.cumsum(episodes.succeeded.astype(np.int64))])
     recent = sums[window:] - sums[:-window]
     reached = np.flatnonzero(recent >= share * window)
     return int(episodes.step[reached[0] + window - 1]) if len(reached) else None
@@ -104,7 +109,7 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WIN
     return {
         "episodes": len(episodes.step),
         "window": count,
-        "success": float(last.terminated.mean()) if count else float("nan"),
+        "success": float(last.succeeded.mean()) if count else float("nan"),
         "reward": float(last.reward.mean()) if count else float("nan"),
         "length": length,
         "length_over_shortest": length / shortest_path if shortest_path else float("nan"),

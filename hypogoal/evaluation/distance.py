@@ -150,21 +150,23 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
         ``by_ladder``: per method, N, ladder: the distance of the best, validated, mean and worst member and the best
         member's shares, over seeds. ``over_ladders``: per method and N: the same, each seed's mean over ladders first.
         A seed that lacks one of the ladders is left out there, so that nothing is compared over unlike ladders.
+        Artefacts alike in all of this count each for itself.
     """
-    cells: dict[tuple[str, int | None, str], dict[tuple[int, str], dict[str, float]]] = {}
+    cells: dict[tuple[str, int | None, str], dict[tuple[tuple[int, int], str], dict[str, float]]] = {}
     for row in rows:
-        key = (row["method"], row["groups"], row["sub_goal"])
-        cells.setdefault(key, {})[row["seed"], row["ladder"]] = _numbers(row)
+        own = cells.setdefault((row["method"], row["groups"], row["sub_goal"]), {})
+        before = sum((seed, ladder) == (row["seed"], row["ladder"]) for (seed, _), ladder in own)
+        own[(row["seed"], before), row["ladder"]] = _numbers(row)  # of one seed there may be several ensembles' options
     by_ladder, over_ladders = [], []
     for key in sorted(cells, key=_order):
         found = cells[key]
         about = dict(zip(("method", "groups", "sub_goal"), key, strict=True))
         seeds = sorted({seed for seed, _ in found})
         for ladder in ladders:
-            own = [found[seed, ladder] for seed in seeds if (seed, ladder) in found]
-            if own:
+            here = [found[seed, ladder] for seed in seeds if (seed, ladder) in found]
+            if here:
                 by_ladder.append(
-                    {**about, "ladder": ladder, "seeds": len(own), **_over_seeds(own, *map(str, key), ladder)}
+                    {**about, "ladder": ladder, "seeds": len(here), **_over_seeds(here, *map(str, key), ladder)}
                 )
         whole = [seed for seed in seeds if all((seed, ladder) in found for ladder in ladders)]
         means = [
@@ -176,7 +178,7 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
                 **about,
                 "ladders": list(ladders),
                 "seeds": len(whole),
-                "incomplete_seeds": [seed for seed in seeds if seed not in whole],
+                "incomplete_seeds": [seed[0] for seed in seeds if seed not in whole],
                 **_over_seeds(means, *map(str, key)),
             }
         )

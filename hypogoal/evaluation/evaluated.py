@@ -9,10 +9,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import Artefact, find_artefacts
+from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+from hypogoal.evaluation.found import find
 
 AGAIN = "Evaluate the run again."
 PARTS = ("agents", "ensembles", "hypotheses", "rooms", "distance", "saliency", "selection", "settings", "provenance")
@@ -34,6 +35,8 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
         run: a folder with an evaluation artefact in it.
         start: of the arrays only those whose names begin so.
 
+    What was made since is among ``missing``.
+
     Raises:
         UserError: the run was not evaluated, or the evaluation is damaged.
     """
@@ -42,7 +45,20 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
         raise UserError("this run was not evaluated", run, f"First run: hypogoal evaluate {run}")
     source = next((artefact for artefact in found if artefact.path == run / "evaluation"), found[0])
     source.whole()
-    return Evaluated(source, _metrics(source.path / "metrics.json"), _arrays(source.path / "arrays.h5", start))
+    metrics = _metrics(source.path / "metrics.json")
+    metrics["missing"] = [*metrics.get("missing", ()), *_since(run, source)]
+    return Evaluated(source, metrics, _arrays(source.path / "arrays.h5", start))
+
+
+def _since(run: Path, source: Artefact) -> list[str]:
+    """A line for each artefact of the run that the evaluation does not know: it was made, or made again, since."""
+    known = {entry["sha256"] for entry in source.manifest["inputs"]}
+    try:
+        found = find(run)
+    except UserError:  # evaluations may lie where nothing else does
+        return []
+    names = [found.name(one) for one in found.everything() if sha256_of(one.path / MANIFEST) not in known]
+    return [f"{name}: made since this evaluation ('hypogoal evaluate {run} --force' reads it)" for name in names]
 
 
 def _metrics(path: Path) -> dict[str, Any]:

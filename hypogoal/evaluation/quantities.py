@@ -24,7 +24,10 @@ QUANTITIES: dict[str, dict[str, str]] = {
     },
     "says_yes_unlabelled": {"unit": "fraction", "meaning": "share of unlabelled states that a member calls positive"},
     "disagreement": {"unit": "fraction", "meaning": "share of states on which two members' verdicts differ"},
-    "success": {"unit": "fraction", "meaning": "share of the last 100 training episodes that reached the goal"},
+    "success": {
+        "unit": "fraction",
+        "meaning": "share of the last 100 training episodes that succeeded: terminated with a reward above 0",
+    },
     "reward": {"unit": "reward", "meaning": "mean undiscounted reward of the last 100 training episodes"},
     "length": {
         "unit": "steps",
@@ -114,11 +117,15 @@ QUANTITIES: dict[str, dict[str, str]] = {
         "unit": "fraction",
         "meaning": "share of pairs of runs, alike in layout and seed, in which the first is better; a tie counts half",
     },
+    "units": {"unit": "layouts or seeds", "meaning": "that pairs are of: those of one are not independent"},
     "wins": {"unit": "pairs", "meaning": "in which the first is better"},
     "ties": {"unit": "pairs", "meaning": "in which both are the same"},
     "difference": {"unit": "as said beside it", "meaning": "mean over pairs of first - second"},
     "difference_interval": {"unit": "as said beside it", "meaning": "95 % bootstrap interval of the difference"},
-    "sign_test": {"unit": "probability", "meaning": "of wins and losses as uneven as these if neither were better"},
+    "sign_test": {
+        "unit": "probability",
+        "meaning": "of units won and lost as unevenly as these if neither were better",
+    },
     "mean": {"unit": "as said beside it", "meaning": "over runs"},
     "standard_error": {"unit": "as said beside it", "meaning": "of the mean over runs"},
     "iqm": {"unit": "as said beside it", "meaning": "interquartile mean over runs"},

@@ -108,38 +108,50 @@ def aggregate_with_deviation(
 def compare_pairs(
     first: NDArray[np.float64],
     second: NDArray[np.float64],
-    strata: Sequence[Hashable],
+    units: Sequence[Hashable],
     rng: np.random.Generator,
     *,
+    within: bool = False,
     higher: bool = True,
 ) -> dict[str, Any]:
     """Spec F5: the first of two methods against the second over n pairs of runs that share layout and seed.
 
-    The probability of improvement is the share of pairs in which the first is better, a tie counting half. Its interval
-    is drawn within strata (see :func:`bootstrap_interval`); where one wins every pair there is nothing to resample and
-    it has no width, so the sign test stands beside it, which few pairs cannot make small.
+    The probability of improvement is the share of pairs in which the first is better, a tie counting half. Pairs of one
+    unit (one seed's ensemble on several ladders, one layout with several seeds) are not independent: interval and sign
+    test are over units, each of which counts once, by its mean. Where one wins every pair there is nothing to resample
+    and the interval has no width, so the sign test stands beside it, which few units cannot make small.
 
     Args:
         first: float (n,), pair by pair; pairs with a NaN are left out.
         second: float (n,), of the other method.
-        strata: n hashable marks.
+        units: n hashable marks.
         rng: draws the resamples.
+        within: the intervals, not the sign test, are drawn within units where each has several pairs: they speak of
+            these layouts with other seeds (see :func:`bootstrap_interval`).
         higher: the better value is the higher one.
 
     Returns:
-        n, wins, ties, probability, interval (95 %) and interval_over, difference (mean of first - second) and
-        difference_interval (95 %), sign_test (two-sided p, ties left out). NaN without pairs.
+        n, units (how many), wins, ties, probability, interval (95 %) and interval_over, difference (mean of
+        first - second) and difference_interval (95 %), sign_test (two-sided p, ties left out). NaN without pairs.
     """
     known = ~(np.isnan(first) | np.isnan(second))
-    marks = [mark for mark, one in zip(strata, known, strict=True) if one]
+    marks = [mark for mark, one in zip(units, known, strict=True) if one]
     difference = first[known] - second[known]
     better = np.sign(difference if higher else -difference)
     scores = (1 + better) / 2
     count, wins, ties = len(scores), int((better > 0).sum()), int((better == 0).sum())
-    low, high, over = bootstrap_interval(scores, marks, rng, np.mean)
-    *around, _ = bootstrap_interval(difference, marks, rng, np.mean)
+    of_units, differences = (_by_unit(values, marks) for values in (scores, difference))
+    if within:
+        low, high, over = bootstrap_interval(scores, marks, rng, np.mean)
+        *around, _ = bootstrap_interval(difference, marks, rng, np.mean)
+    else:
+        nothing = [0] * len(of_units)
+        low, high, over = bootstrap_interval(of_units, nothing, rng, np.mean)
+        *around, _ = bootstrap_interval(differences, nothing, rng, np.mean)
+    won, lost = int((of_units > 0.5).sum()), int((of_units < 0.5).sum())
     return {
         "n": count,
+        "units": len(of_units),
         "wins": wins,
         "ties": ties,
         "probability": float(scores.mean()) if count else float("nan"),
@@ -147,5 +159,10 @@ def compare_pairs(
         "interval_over": over,
         "difference": float(difference.mean()) if count else float("nan"),
         "difference_interval": list(around),
-        "sign_test": float(binomtest(wins, count - ties).pvalue) if count > ties else float("nan"),
+        "sign_test": float(binomtest(won, won + lost).pvalue) if won + lost else float("nan"),
     }
+
+
+def _by_unit(values: NDArray[np.float64], marks: Sequence[Hashable]) -> NDArray[np.float64]:
+    """The mean of each unit's values, in the order in which units come."""
+    return np.array([values[[mark == own for own in marks]].mean() for mark in dict.fromkeys(marks)], dtype=np.float64)

@@ -17,6 +17,7 @@ from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
+from hypogoal.options.memory import STACK
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.running import MemberVerdicts
 from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
@@ -121,8 +122,15 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
     if config.start not in starts:
         what = "unknown start" if config.start else "where are episodes to begin?"
         raise UserError(what, config.start or "start", f"Give --set start=X, X one of {', '.join(starts)}.")
-    memory = LEARNERS[config.network].reach(config, options)
+    memory = frames_kept(config, options)
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
+
+
+def frames_kept(config: PlayConfig, options: int) -> int:
+    """How many states back an engine must remember: what the replays hold, and the meta-policy's open decisions."""
+    decisions = getattr(config, "decisions", 0)
+    asked = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
+    return max(LEARNERS[config.network].reach(config, options), asked)
 
 
 def play(

@@ -23,7 +23,9 @@ class OptionConfig:
         source="own: paper",
         choices=("own", "shared"),
     )
-    option_timeout: int = setting(10, "an option ends after this many steps", unit="steps", source="paper", low=1)
+    option_timeout: int = setting(
+        10, "an option ends after this many steps", unit="steps", source="paper", low=1, high=32_000
+    )
     restart_options: bool = setting(False, "every option begins a new episode, at a start state", source="Spec D4")
     mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="Spec D6")
     initiation: str = setting(

@@ -83,7 +83,7 @@ class LightLearner:
         self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
         fields = {
             "s": np.int32,
-            "a": np.int8,
+            "a": np.int16,
             "next": np.int32,
             "steps": np.int16,
             "option": np.int16,
@@ -158,7 +158,8 @@ class LightLearner:
                 self.positive[name][option, slot] = values[place]
             self.positives[option] += 1
         np.add.at(self.option_steps, options, 1)
-        np.add.at(self.steps_since_positive, options, self.positives[options] > 0)
+        found = (self.positives > 0) | (self.steps_since_positive > 0)  # the latter: in the run that this one continues
+        np.add.at(self.steps_since_positive, options, found[options])
         self.steps += len(ids)
         self._due += len(ids)
 
@@ -178,7 +179,7 @@ class LightLearner:
     def learn(self) -> dict[str, float]:
         """As many updates as are due; returns the last one's numbers, empty when none was due."""
         numbers: dict[str, float] = {}
-        if self.steps < self.config.warm_up:
+        if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
             self._due = 0
             return numbers
         while self._due >= self.config.update_interval:
@@ -195,6 +196,7 @@ class LightLearner:
             counts = kept.sum(1)
         have = np.flatnonzero(counts)
         extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
+        extra = min(extra, self.config.option_batch - 1)  # priorities need one drawn by them
         indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
         batch = {name: values[indices] for name, values in self.replay.data.items()}
         if extra:

@@ -10,16 +10,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
+from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 
 CELL = 8  # pixels
+SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
 
 class CellEmbedding(nn.Module):
     """A convolution whose kernel and stride are one cell (8 pixels), then ReLU.
 
     Where an image is made of few distinct tiles, the same function is a look-up: convolve each tile once, then
-    gather by tile code. Both ways give the same values and gradients (a test asserts it).
+    gather by tile code. Both ways give the same values and gradients (a test asserts it). An image that whole cells do
+    not fill is continued in black.
 
     Args:
         observation_shape: (H, W, C) of the images.
@@ -30,12 +33,22 @@ class CellEmbedding(nn.Module):
         super().__init__()
         height, width, depth = observation_shape
         self.conv = nn.Conv2d(depth, channels, CELL, stride=CELL)
-        self.features = channels * (height // CELL) * (width // CELL)
+        self._more = (
+            0,
+            0,
+            0,
+            -width % CELL,
+            0,
+            -height % CELL,
+        )  # of channels none, of columns and rows behind the last
+        self.features = channels * -(-height // CELL) * -(-width // CELL)
         self._tiles: NDArray[np.uint8] | None = None
         self._pixels = torch.empty(0)
 
     def forward(self, images: Tensor) -> Tensor:
         """uint8 (N, H, W, C) -> float32 (N, features), cells row by row."""
+        if any(self._more):
+            images = nn.functional.pad(images, self._more)
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
         return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
 
@@ -55,6 +68,8 @@ class PictureEmbedding(nn.Module):
 
     Chosen by measurement, for (84, 84, 4) in one thread: with kernels 6x6/6 and 3x3/2 an update with 32 transitions
     takes 10 ms and acting for 8 environments 0.8 ms; with the usual 8x8/4 and 4x4/2 it is 19 and 1.2 ms.
+
+    What the strides do not reach is not seen: of 84 pixels the last 6, of others up to 11.
 
     Args:
         observation_shape: (H, W, C) of the images.
@@ -77,9 +92,16 @@ class PictureEmbedding(nn.Module):
 
 
 def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | PictureEmbedding:
-    """Cells where whole ones fill the image, else convolutions over the picture."""
+    """Cells where whole ones fill the image, else convolutions over the picture.
+
+    Raises:
+        UserError: it is too small for these.
+    """
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
+    if not whole and min(height, width) < SMALLEST:
+        do = f"Scale them up: {SMALLEST} x {SMALLEST} at least, or multiples of {CELL}."
+        raise UserError("images are too small for the light networks", f"{height} x {width}", do)
     return CellEmbedding(observation_shape) if whole else PictureEmbedding(observation_shape)
 
 
@@ -149,7 +171,7 @@ class PaperQNetwork(nn.Module):
 
 
 def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
-    """A cell network's output on states of an engine: by tile codes where the engine has them, else by images."""
+    """A network's output on states of an engine: by tile codes where both know them, else by images."""
     return apply_all_to_states((network,), engine, ids)[0]
 
 
@@ -157,7 +179,7 @@ def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDAr
     """As :func:`apply_to_states`, several networks' outputs on the same states."""
     device = next(networks[0].parameters()).device
     tiles = getattr(engine, "tiles", None)
-    if tiles is not None:
+    if tiles is not None and all(hasattr(network, "from_codes") for network in networks):
         codes = tensor(engine.codes(ids).astype(np.int64), device)  # type: ignore[attr-defined]
         return [network.from_codes(codes, tiles) for network in networks]  # type: ignore[operator]
     images = tensor(engine.images(ids), device)

@@ -124,9 +124,9 @@ class Recorder:
         self.episodes.append((self.steps, length, reward, int(terminated)))
 
     def success(self, last: int = 100) -> float:
-        """Share of the last episodes that reached a terminal state; NaN before the first."""
+        """Share of the last episodes that terminated with a reward above 0; NaN before the first."""
         tail = self.episodes[-last:]
-        return sum(row[3] for row in tail) / len(tail) if tail else float("nan")
+        return sum(bool(row[3]) and row[2] > 0 for row in tail) / len(tail) if tail else float("nan")
 
     def length(self, last: int = 100) -> float:
         """Mean steps of the last episodes; NaN before the first."""

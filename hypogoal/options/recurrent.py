@@ -32,7 +32,7 @@ from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 FIELDS = {
-    "s": np.int32, "a": np.int8, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
+    "s": np.int32, "a": np.int16, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
     "place": np.int16,  # steps since the option began
     "execution": np.int32,
 }  # fmt: skip
@@ -184,7 +184,7 @@ class RecurrentLearner:
         """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
         numbers: dict[str, float] = {}
         for option, member in enumerate(self.members):
-            if member.steps < self.config.warm_up:
+            if member.replay.size < min(self.config.warm_up, self.config.replay):  # not steps: a continued one has none
                 member.due = 0
             while member.due >= self.config.update_interval:
                 member.due -= self.config.update_interval

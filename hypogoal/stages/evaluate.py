@@ -39,6 +39,9 @@ from hypogoal.evaluation.saliency import BASELINE
 from hypogoal.evaluation.selecting import evaluate_selection
 from hypogoal.evaluation.shown import show_states, show_stops
 from hypogoal.evaluation.summary import hypotheses_summary, summary_table
+from hypogoal.experiments.cells import DERIVED
+from hypogoal.experiments.records import PLAN, read_plan
+from hypogoal.experiments.status import is_there
 from hypogoal.hypotheses.ensemble import THRESHOLD
 from hypogoal.needs import evaluation_needs
 
@@ -273,7 +276,17 @@ def missing(
         lines += missing_ladders(rooms, distance["options"])
     if names or not (rooms or found.ladders):
         lines += missing_agents(names)
-    return lines
+    return lines + _unfinished_cells(found.run)
+
+
+def _unfinished_cells(run: Path) -> list[str]:
+    """Of a sweep, the cells that it was to have and has not: failed, or not run yet."""
+    if not (run / PLAN).is_file():
+        return []
+    planned, _ = read_plan(run)
+    left = [cell.name for cell in planned.cells if cell.stage not in DERIVED and not is_there(cell)]
+    names = ", ".join([*left[:5], *(["..."] if len(left) > 5 else [])])
+    return [f"{len(left)} of the sweep's cells are not done: {names}"] if left else []
 
 
 def _unknown_goals(selection: list[dict[str, Any]]) -> list[str]:

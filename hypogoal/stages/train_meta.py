@@ -153,7 +153,7 @@ def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> 
             trained.path,
             f"Train them from {source.path}.",
         )
-    for key in ("network", "termination", "layout_seed", "start"):
+    for key in ("network", "termination", "layout_seed", "start", "option_timeout"):
         if trained.config[key] != getattr(config, key):
             raise UserError(
                 f"these options were trained with {key}={trained.config[key]}, train-meta has {getattr(config, key)}",

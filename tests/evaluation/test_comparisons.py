@@ -14,9 +14,9 @@ from hypogoal.evaluation.page.comparisons import comparison_tables
 from hypogoal.evaluation.statistics import compare_pairs
 
 
-def pairs(first, second, strata=None, **more):
+def pairs(first, second, units=None, **more):
     first, second = np.array(first, dtype=float), np.array(second, dtype=float)
-    return compare_pairs(first, second, strata or [0] * len(first), np.random.default_rng(0), **more)
+    return compare_pairs(first, second, units or range(len(first)), np.random.default_rng(0), **more)
 
 
 def test_probability_of_improvement_by_hand():
@@ -42,9 +42,21 @@ def test_the_interval_is_drawn_within_strata():
     Drawn from all four pairs, 1 in 16 resamples would be all wins, so the 95 % interval would be 0 to 1.
     """
     first, second = [1, 1, 0, 0], [0, 0, 1, 1]
-    within = pairs(first, second, [5, 5, 6, 6])
+    within = pairs(first, second, [5, 5, 6, 6], within=True)
     assert (within["interval"], within["interval_over"]) == ([0.5, 0.5], "runs within layouts")
-    assert pairs(first, second, [5, 6, 7, 8])["interval"] == [0, 1]
+    assert pairs(first, second, [5, 6, 7, 8], within=True)["interval"] == [0, 1]
+
+
+def test_pairs_of_one_unit_are_one_piece_of_evidence():
+    """Spec F5: one ensemble that wins on nine ladders has won once; two of three units won is no 6 of 9."""
+    once = pairs([1] * 9, [0] * 9, [0] * 9)
+    assert (once["n"], once["units"], once["wins"], once["sign_test"]) == (9, 1, 9, 1.0)
+    assert np.isnan(once["interval"]).all()
+    found = pairs([1, 1, 0, 1, 1, 1, 0, 0, 0], [0] * 2 + [1] + [0] * 3 + [1] * 3, [5, 5, 5, 6, 6, 6, 7, 7, 7])
+    assert (found["units"], found["wins"], found["n"]) == (3, 5, 9)
+    assert found["sign_test"] == 1.0  # two of three
+    assert found["difference_interval"] == pytest.approx([-1, 1])
+    assert pairs([3, 3], [1, 3], [0, 1])["sign_test"] == 1.0  # a unit that ties is left out
 
 
 def test_pairs_without_a_number_are_left_out():
@@ -95,6 +107,7 @@ def test_ensembles_are_paired_by_seed_and_sub_goal():
     best = {row["where"]: row for row in rows if "best" in row["quantity"]}
     assert list(best) == [ALL, "door", "red"] or list(best) == [ALL, "red", "door"]
     assert best[ALL]["first"] == "dbat, K=2"
+    assert best[ALL]["units"] == 2
     assert (best[ALL]["n"], best[ALL]["wins"], best["red"]["wins"], best["door"]["wins"]) == (4, 3, 2, 1)
     assert best[ALL]["difference"] == pytest.approx((0.2 + 0.2 - 0.1 + 0.1) / 4)
 
@@ -118,7 +131,7 @@ def test_methods_on_ladders_are_paired_at_each_number_of_groups():
 def stopped(method, ladder, seed, distance):
     option = {"distance": distance}
     about = {"method": method, "groups": None if method.startswith("oracle") else 2, "ladder": ladder, "seed": seed}
-    return {**about, "sub_goal": "down", "best": 0, "options": [option]}
+    return {**about, "sub_goal": "down", "best": 0, "validated": None, "options": [option]}
 
 
 def test_options_are_paired_by_ladder_and_seed():
@@ -129,9 +142,30 @@ def test_options_are_paired_by_ladder_and_seed():
             stopped("dbat", "1R", 0, 20), stopped("oracle termination", "1L", 0, 0),
         ]
     )  # fmt: skip
-    (row,) = rows
+    row, _, mean = rows
     assert (row["first"], row["second"], row["wins"], row["n"], row["where"]) == ("dbat", "none", 1, 2, "N=2")
-    assert row["difference"] == -10
+    assert (row["units"], row["difference"]) == (1, -10)
+    assert (mean["quantity"], mean["difference"]) == ("distance, mean member", -10)
+
+
+def test_the_mean_member_does_not_gain_by_being_one_of_many():
+    """Spec F3: of many alike the nearest is near; their mean is not."""
+    many, one = stopped("dbat", "1L", 0, 10), stopped("cnn", "1L", 0, 50)
+    many["options"] = [{"distance": value} for value in (10, 50, 90, float("nan"))]
+    found = {row["quantity"]: row["difference"] for row in compare_distances([many, one])}
+    assert found["distance, best member"] == -40
+    assert found["distance, mean member"] == 0
+    assert np.isnan(found["distance, validated member"])
+
+
+def test_what_is_alike_in_all_counts_each_for_itself():
+    """Spec F5: options of three ensembles, all with the same seed: three pairs, not the last one read."""
+    runs = [run(5, 0, length) for length in (10, 20, 30)]
+    others = [run(5, 0, length) for length in (11, 22, 33)]
+    rows = compare_agents([{"name": "a", "runs": runs}, {"name": "b", "runs": others}])
+    length = next(row for row in rows if row["quantity"] == "length")
+    assert (length["n"], length["wins"], length["units"]) == (3, 3, 1)
+    assert length["difference"] == pytest.approx(-2)
 
 
 def test_the_table_says_each_method_once():

@@ -292,7 +292,7 @@ def _pairs(about: Mapping[str, Any]) -> Block:
     first = about["runs"][0]["label"]
     digits = {"length": 0, "success": 2, "discounted_return": 2, "distance, best member": 1}
     rows = about["comparisons"]
-    blocks = comparison_tables(rows, "seed, and layout, sub-goal or ladder", "layouts, sub-goals or ladders", digits)
+    blocks = comparison_tables(rows, "seed, and layout, sub-goal or ladder", "layouts, or seeds of ensembles,", digits)
     text = (
         f"{first} against each other run, over what both have with the same seed."
         if blocks

@@ -10,21 +10,21 @@ from hypogoal.evaluation.page.blocks import Block, cell, fixed, row, table
 
 CAPTION = (
     "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
-    "better, a tie counting half, with its 95 % bootstrap interval (2,000 resamples, within {strata} where each has "
-    "several); 0.5: neither is. An interval without width means that every pair came out alike, not that it is "
-    "certain: see the number of pairs and the sign test (two-sided, ties left out). Difference: mean of first − "
-    "second, with its 95 % interval."
+    "better, a tie counting half, with its 95 % bootstrap interval (2,000 resamples {drawn}); 0.5: neither is. An "
+    "interval without width means that every pair came out alike, not that it is certain: see the sign test "
+    "(two-sided, ties left out) and over how many {units} it is, each of which counts once, by its mean: pairs of one "
+    "are not independent. Difference: mean of first − second, with its 95 % interval."
 )
 
 
 def comparison_tables(
-    rows: Sequence[Mapping[str, Any]], shared: str, strata: str, digits: Mapping[str, int] | None = None
+    rows: Sequence[Mapping[str, Any]], shared: str, units: str = "seeds", digits: Mapping[str, int] | None = None
 ) -> list[Block]:
     """The table, where there are pairs.
 
     Args:
         rows: what ``evaluation/comparisons.py`` found.
-        shared, strata: what pairs share, and within what they are drawn.
+        shared, units: what pairs share, and what is independent of each other.
         digits: decimals of a quantity's difference, 3 where it is not named.
     """
     pairs = [entry for entry in rows if entry["n"]]
@@ -48,7 +48,7 @@ def comparison_tables(
                 entry["second"],
                 cell(fixed(entry["probability"], 2), _between(entry["interval"], 2)),
                 f"{entry['wins']}–{entry['n'] - entry['wins'] - entry['ties']}–{entry['ties']}",
-                fixed(entry["sign_test"], 3),
+                cell(fixed(entry["sign_test"], 3), f"n = {entry['units']}"),
                 cell(_signed(entry["difference"], places), _between(entry["difference_interval"], places)),
                 mark="first" if key != last else "",
             )
@@ -63,7 +63,11 @@ def comparison_tables(
             texts=len(shown) + 1,
             tight=True,
             heading=title,
-            caption=CAPTION.format(shared=shared, strata=strata),
+            caption=CAPTION.format(
+                shared=shared,
+                units=units,
+                drawn="within layouts where each has several" if units == "layouts" else "of seeds",
+            ),
         )
     ]
 

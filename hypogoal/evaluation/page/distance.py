@@ -44,7 +44,7 @@ def distance_section(material: Material) -> Block:
     )
     blocks = [_bars(material), _table(found["over_ladders"]), _intervals(found["over_ladders"])]
     digits = {"distance, best member": 1}
-    blocks += comparison_tables(material.comparisons("distance"), "ladder, N and seed", "ladders", digits)
+    blocks += comparison_tables(material.comparisons("distance"), "ladder, N and seed", digits=digits)
     blocks += [_ladders(found["by_ladder"]), _options(found["options"])]
     return section("distance", title, [text], blocks)
 

@@ -47,7 +47,7 @@ def hypotheses_section(material: Material) -> Block:
         return section("hypotheses", "Hypotheses", [], [nothing])
     pairs = [entry for entry in material.comparisons("hypotheses") if entry["where"] == ALL]
     shared = "ensemble seed and sub-goal (each sub-goal by itself is in metrics.json)"
-    compared = comparison_tables(pairs, shared, "sub-goals")
+    compared = comparison_tables(pairs, shared)
     return section(
         "hypotheses", "Hypotheses", [text], [_dots(material), _table(metrics), *compared, *_members(metrics)]
     )

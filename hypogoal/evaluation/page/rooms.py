@@ -63,7 +63,7 @@ def rooms_section(material: Material) -> Block:
         blocks += [_best(material, own), _four(material, own), *(_table(own, scope) for scope in SCOPES)]
         blocks += [_intervals(own), _differences(own)]
         blocks += kinds_tables(material, own) + room_tables(material, own)
-    blocks += comparison_tables(material.comparisons("rooms"), "ensemble seed and N", "sub-goals")
+    blocks += comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
     blocks.append(members_table(material))
     return section("rooms", title, [text], blocks)
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.errors import NumericalError
+from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.learners.baselines import resuming
 from hypogoal.learners.baselines.engine_env import EngineEnv
@@ -82,8 +82,8 @@ class _Watch(BaseCallback):
             self.report.restore(snapshot["told"])  # type: ignore[union-attr]
 
     def _on_step(self) -> bool:
-        for step, _, _, terminated in self.env.episodes[self._seen :]:
-            if terminated and self.first_goal is None:
+        for step, _, reward, terminated in self.env.episodes[self._seen :]:
+            if terminated and reward > 0 and self.first_goal is None:
                 self.first_goal = step
         self._seen = len(self.env.episodes)
         if self.env.steps >= self._next:
@@ -115,7 +115,14 @@ def check_finite(model: BaseAlgorithm, step: int) -> None:
 
 
 def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int, device: str = "cpu") -> BaseAlgorithm:
-    """A fresh agent with the hyperparameters ``chosen``."""
+    """A fresh agent with the hyperparameters ``chosen``.
+
+    Raises:
+        UserError: PPO has more environments than steps between two updates.
+    """
+    if isinstance(chosen, PPOSettings) and env.num_envs > chosen.rollout:
+        what = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
+        raise UserError(what, f"environments={env.num_envs}", f"Give --set environments={chosen.rollout} or fewer.")
     policy: dict[str, Any] = {
         "features_extractor_class": NETWORKS[chosen.network],
         "features_extractor_kwargs": {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL},

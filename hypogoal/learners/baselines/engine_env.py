@@ -83,9 +83,9 @@ class EngineEnv(VecEnv):
         self._rewards[:] = snapshot["rewards"]
 
     def success(self, last: int = 100) -> float:
-        """Share of the last episodes that reached a terminal state; 0 before the first."""
+        """Share of the last episodes that terminated with a reward above 0; 0 before the first."""
         tail = self.episodes[-last:]
-        return sum(row[3] for row in tail) / len(tail) if tail else 0.0
+        return sum(bool(row[3]) and row[2] > 0 for row in tail) / len(tail) if tail else 0.0
 
     def close(self) -> None:
         """Nothing to close."""

@@ -1,0 +1,152 @@
+"""Spec D2, D8, E1, E2: settings on the real DoorKey engine, and what training from an options artefact begins with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hypogoal.cli import main
+from hypogoal.core.errors import UserError
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.learners.baselines.agents import make_agent
+from hypogoal.learners.baselines.engine_env import EngineEnv
+from hypogoal.learners.baselines.settings import hyperparameters
+from hypogoal.meta.networks import LightMetaNetwork
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.light import LightLearner
+from hypogoal.options.networks import LightQNetwork
+from hypogoal.options.recurrent import RecurrentLearner
+from hypogoal.options.verdicts import Verdicts, oracle_terminations
+
+GOALS = 5
+QUICK: dict[str, Any] = {"environments": 2, "warm_up": 20, "update_interval": 4, "option_batch": 8, "replay": 200}
+
+
+def learner_of(kind: type, **changes: Any) -> Any:
+    engine = DoorKeyEngine(100, 2, max_steps=50)
+    verdicts = Verdicts(oracle_terminations(engine), GOALS)
+    return kind(engine, verdicts, OptionConfig(**{**QUICK, **changes}), seed=0)
+
+
+def walk(learner: Any, steps: int) -> None:
+    """So many steps of option 0 in both environments, none of which reaches anything."""
+    engine = learner.engine
+    options, rng = np.zeros(2, dtype=np.int64), np.random.default_rng(0)
+    nothing, ends = np.zeros(2, dtype=np.bool_), np.ones(2, dtype=np.bool_)
+    for _ in range(steps):
+        ids, actions = engine.ids.copy(), rng.integers(2, size=2)  # it only turns
+        step = engine.step(actions)
+        learner.observe(ids, actions, step.next_ids, options, terminated=nothing, timed_out=nothing, ended=ends)
+        learner.learn()
+
+
+@pytest.fixture(scope="module")
+def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small real one."""
+    folder = tmp_path_factory.mktemp("continued")
+    data = str(folder / "data.h5")
+    few = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1", "-q"]
+    assert main(["collect", "doorkey", "--out", data, *few]) == 0
+    few = ["--set", "steps=2", "--set", "members=2", "--set", "workers=1", "-q"]
+    assert main(["train-ensemble", data, "--out", str(folder / "ensemble"), *few]) == 0
+    return folder / "ensemble"
+
+
+def test_the_papers_preset_plays_and_learns(ensemble: Path, tmp_path: Path) -> None:
+    """Spec E1, E2, Tables 3 to 5: its networks on the real engine, options and meta-policy updated."""
+    few = ["--set", "steps=260", "--set", "decisions=20", "--set", "warm_up=8", "--set", "random_episodes=2", "-q"]
+    out = tmp_path / "meta"
+    assert main(["train-meta", str(ensemble), "--out", str(out), "--preset", "paper", *few]) == 0
+    assert (out / "meta.safetensors").is_file()
+    assert (out / "choices.csv").read_text().count("\n") > 1
+
+
+def test_options_go_on_with_the_time_they_learned_for(
+    ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec D1: the timeout is part of an option; another one is refused, not put in its place."""
+    few = ["--set", "steps=64", "--set", "random_episodes=2", "-q"]
+    options, out = str(tmp_path / "options"), str(tmp_path / "meta")
+    assert main(["train-options", str(ensemble), "--out", options, "--set", "option_timeout=40", *few]) == 0
+    assert main(["train-meta", str(ensemble), "--options", options, "--out", out, *few]) == 2
+    assert "trained with option_timeout=40, train-meta has 10" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", [LightLearner, RecurrentLearner])
+def test_exploration_goes_on_falling_where_options_go_on(kind: type) -> None:
+    """Spec D8: a member that found its sub-goal in the run before has found it; one that never did has not."""
+    own = {"experience": "own", "mask_reached": False} if kind is RecurrentLearner else {}
+    learner = learner_of(kind, epsilon_from="first-positive", epsilon_steps=1000, **own)
+    state = {**learner.state(), "option_steps": torch.full((GOALS,), 500)}
+    state["steps_since_positive"] = torch.tensor([300, 0, 0, 0, 0])
+    learner.load(state)
+    before = learner.epsilon()
+    walk(learner, 40)
+    assert learner.epsilon()[0] < before[0] < 1
+    fresh = learner_of(kind, epsilon_from="first-positive", epsilon_steps=1000, **own)
+    walk(fresh, 40)
+    assert (fresh.epsilon() == 1).all()
+
+
+def test_a_continued_paper_learner_fills_its_replay_first() -> None:
+    """Spec D2: updates begin when the replay has ``warm_up`` transitions, not when earlier runs had so many steps."""
+    learner = learner_of(RecurrentLearner, experience="own", mask_reached=False)
+    learner.load({**learner.state(), "option_steps": torch.full((GOALS,), 5000)})
+    walk(learner, 9)
+    assert learner.members[0].updates == 0
+    walk(learner, 10)
+    assert learner.members[0].updates > 0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"positives": 1.0},
+        {"option_batch": 1, "positives": 0.6},
+        {"warm_up": 1, "n_step": 10, "update_interval": 1, "experience": "own", "mask_reached": False},
+    ],
+)
+def test_odd_settings_of_options_learn_too(changes: dict[str, Any]) -> None:
+    """Spec D8: a batch of positives only keeps one transition that priorities draw; an empty replay waits."""
+    learner = learner_of(LightLearner, **changes)
+    learner.positives[0] = learner.option_steps[0] = 1  # one is known
+    walk(learner, 30)
+    assert learner.updates > 0
+
+
+def test_replays_keep_any_action() -> None:
+    """Spec D2, B6: an own domain may have more than 128 of them."""
+    learner = learner_of(LightLearner)
+    own = learner_of(RecurrentLearner, experience="own", mask_reached=False)
+    for data in (learner.replay.data, own.members[0].replay.data):
+        data["a"][0] = 300
+        assert data["a"][0] == 300
+
+
+@pytest.mark.parametrize("shape", [(84, 84, 4), (45, 45, 3), (60, 60, 3), (7, 7, 3)])
+def test_the_light_meta_policy_sees_the_whole_picture(shape: tuple[int, ...]) -> None:
+    """Spec E2: rows and columns that no whole cells fill count too."""
+    torch.manual_seed(0)
+    image = torch.zeros(3, *shape, dtype=torch.uint8)
+    image[1, -3:], image[2, :, -3:] = 255, 255
+    dark, below, right = LightMetaNetwork(shape, 6)(image)
+    assert not torch.equal(dark, below) and not torch.equal(dark, right)
+
+
+def test_pictures_too_small_for_options_are_refused() -> None:
+    """Spec D8, G2: one line instead of what a convolution raises."""
+    with pytest.raises(UserError, match="too small for the light networks: 7 x 7"):
+        LightQNetwork((7, 7, 3), 6, 4)
+
+
+def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:
+    """Spec E7, G2: one line instead of what the library raises."""
+    env = EngineEnv(DoorKeyEngine(100, 4, max_steps=50))
+    chosen = replace(hyperparameters("ppo", "paper"), rollout=3)
+    with pytest.raises(UserError, match="fewer than there are environments: environments=4"):
+        make_agent(env, chosen, 0)
