@@ -60,6 +60,18 @@ def test_numbers_of_a_run():
     assert nothing["steps_to_95"] is None
 
 
+def test_to_die_is_no_success():
+    """Spec F5: of four that terminated one had a reward, another a loss; a reward before the cap is none either."""
+    run = Episodes(
+        np.arange(1, 6), np.full(5, 10), np.array([0.0, 0, 1, -1, 1]), np.array([True, True, True, True, False])
+    )
+    assert run.succeeded.tolist() == [False, False, True, False, False]
+    assert run_numbers(run, None)["success"] == 0.2
+    assert curves(run, np.array([5]), window=5)["success"][0] != 0.8
+    hundred = Episodes(np.arange(1, 101), np.full(100, 10), np.zeros(100), np.ones(100, dtype=bool))
+    assert steps_to_solve(hundred) is None
+
+
 def test_mean_and_standard_error_by_hand():
     """Spec F5: of 2, 4, 6: mean 4, variance 4, error 2 / sqrt(3)."""
     assert mean_and_error(np.array([2.0, 4.0, 6.0])) == pytest.approx((4, 2 / np.sqrt(3)))

@@ -127,6 +127,15 @@ def test_mean_over_ladders_then_over_seeds():
     assert np.isnan(by_ladder["oracle termination", "1L"]["validated"]["mean"])
 
 
+def test_options_of_several_ensembles_with_one_seed_all_count():
+    """Spec F3: three artefacts alike in seed and ladder are three, not the last one read."""
+    rows = [row("1L", 0, [distance]) for distance in (10, 200, 90)]
+    tables = distance_tables(rows, ("1L",))
+    (found,) = tables["by_ladder"]
+    assert (found["seeds"], found["best"]["mean"]) == (3, 100)
+    assert tables["over_ladders"][0]["seeds"] == 3
+
+
 def test_unlike_ladders_are_not_averaged():
     """Spec F3: a seed that lacks one of the ladders is left out of the mean over ladders, and told."""
     rows = [row("1L", 0, [10]), row("2-6", 0, [30]), row("1L", 1, [1])]

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import h5py
@@ -13,9 +14,13 @@ from rich.console import Console
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
+from hypogoal.evaluation.evaluated import read_evaluation
+from hypogoal.evaluation.found import find
 from hypogoal.evaluation.summary import hypotheses_summary
+from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.experiments.records import write_plan
 from hypogoal.stages.collect import collect
-from hypogoal.stages.evaluate import evaluate, summary_table
+from hypogoal.stages.evaluate import evaluate, missing, summary_table
 from hypogoal.stages.report import draw_figures, report
 from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
 from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
@@ -77,6 +82,23 @@ def test_an_agent_without_a_whole_episode_is_said_to_be_one(run, tmp_path):
     page = report(tmp_path).read_text(encoding="utf-8")
     assert "No episode of the option agent came to its end (1 run: layout seed 100" in page
     assert "reached the goal in" not in page
+
+
+def test_what_was_made_since_is_said(run, metrics, tmp_path):
+    """Spec A5, F7: a report of an evaluation that does not know all that is there says what, and what to do."""
+    shutil.copytree(run, tmp_path / "run")
+    assert not [line for line in read_evaluation(tmp_path / "run").metrics["missing"] if "since" in line]
+    train_meta(run / "ensemble", TrainMetaConfig(steps=512, **SHORT), tmp_path / "run" / "later", **QUIET)
+    page = report(tmp_path / "run", force=True).read_text(encoding="utf-8")
+    assert "later: made since this evaluation" in page
+
+
+def test_cells_of_a_sweep_that_are_not_done_are_said(run, metrics, tmp_path):
+    """Spec A5, G4: a mean over nine of ten seeds says that it is one."""
+    shutil.copytree(run / "ensemble", tmp_path / "ensemble")
+    cells = [Cell(name, ("train-ensemble", "d"), tmp_path / name) for name in ("ensemble", "other")]
+    write_plan(tmp_path, Plan("own", cells, 1), 1.0)
+    assert "1 of the sweep's cells are not done: other" in missing(find(tmp_path), [], [], {"options": []}, [])
 
 
 def test_members_are_judged_on_heldout_states(run, metrics):
