@@ -24,6 +24,8 @@ COLOURS = {
 }  # fmt: skip
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, GREY)
 MARKERS = "osD^vPX"
+Bounds = tuple[float | None, float | None]
+SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
 WIDTH = 5.6  # inches; readable on a phone where it is scaled to the screen
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -66,12 +68,23 @@ class Line:
     dashed: bool = False
 
 
+def reward_bounds(lines: Sequence[Line]) -> Bounds:
+    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values.
+
+    Args:
+        lines: those that are drawn.
+    """
+    values = np.concatenate([np.zeros(0), *(line.values.ravel() for line in lines)])
+    known = values[np.isfinite(values)]
+    return SHARES if bool(((known >= 0) & (known <= 1)).all()) else (None, None)
+
+
 def learning_curves(
     grid: NDArray[np.int64],
     lines: Sequence[Line],
     quantity: str,
     references: Sequence[tuple[str, float]] = (),
-    bounds: tuple[float, float | None] = (0.0, None),
+    bounds: Bounds = (0.0, None),
 ) -> Figure:
     """Figure 6: a quantity of episodes against environment steps; mean over runs, bands of one standard error.
 
@@ -80,7 +93,7 @@ def learning_curves(
         lines: one per agent.
         quantity: the y axis's label, with its unit.
         references: horizontal lines with their names.
-        bounds: of the y axis.
+        bounds: of the y axis, None for what fits the values.
     """
     with styled():
         rows = -(-(len(lines) + len(references)) // 2)

@@ -8,7 +8,20 @@ from typing import Any
 import numpy as np
 
 from hypogoal.evaluation.agents import LEARNED, ORACLE, ORACLE_RANDOM, PRETRAINING, RANDOM
-from hypogoal.evaluation.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Line, learning_curves
+from hypogoal.evaluation.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SHARES,
+    SKY,
+    VERMILLION,
+    Bounds,
+    Line,
+    learning_curves,
+    reward_bounds,
+)
 from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
@@ -137,11 +150,13 @@ def _curve(material: Material, quantity: str) -> Block:
         colour, dashed = COLOURS.get(agent["name"]) or next(others)
         lines.append(Line(agent["name"], material.arrays[f"curves/{index}/{quantity}"], colour, dashed))
     layouts = metrics["layouts"]
-    bounds: tuple[float, float | None]
+    bounds: Bounds
     if quantity == "reward":
-        random = [layout["random_success"] for layout in layouts if layout["random_success"] is not None]
+        label, axis, bounds = "Undiscounted reward per episode", "reward per episode", reward_bounds(lines)
+        # A share of episodes says nothing on an axis of other rewards.
+        known = [layout["random_success"] for layout in layouts if bounds == SHARES]
+        random = [share for share in known if share is not None]
         references = [("random play", float(np.mean(random)))] if random else []
-        label, axis, bounds = "Undiscounted reward per episode", "reward per episode", (-0.02, 1.04)
     else:
         shortest = [layout["shortest_path"] for layout in layouts if layout["shortest_path"]]
         references = [("shortest path", float(np.mean(shortest)))] if shortest else []
@@ -150,10 +165,11 @@ def _curve(material: Material, quantity: str) -> Block:
     number = "Figure 6 of the paper" if quantity == "reward" else "Beside Figure 6 of the paper"
     first = metrics["agents"][0]
     dotted = "uniformly random play" if quantity == "reward" else "the shortest path"
+    reference = f" Dotted: mean over layouts of {dotted}." if references else ""
     caption = (
         f"{number}: {label.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
         f"bands: ± one standard error over runs. {first['name']}: {_runs(first)}; "
-        f"the other agents: {_others(metrics['agents'])}. Dotted: mean over layouts of {dotted}."
+        f"the other agents: {_others(metrics['agents'])}.{reference}"
     )
     return figure(material, quantity, label, drawn, caption)
 
