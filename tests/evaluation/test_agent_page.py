@@ -5,7 +5,7 @@ import pytest
 
 from hypogoal.evaluation.agents import Run, agent_curves, agent_metrics, common_grid, group_runs
 from hypogoal.evaluation.curves import Episodes
-from hypogoal.evaluation.page.agents import curves_section
+from hypogoal.evaluation.page.agents import curves_section, summary_section
 from hypogoal.evaluation.page.blocks import Material
 from hypogoal.evaluation.quantities import plain
 
@@ -32,6 +32,12 @@ def material_of(*runs):
     return Material(plain(metrics), arrays)
 
 
+def answer(*runs):
+    """What the summary says of the option agent."""
+    material = material_of(*runs)
+    return summary_section(material)["paragraphs"][1]
+
+
 @pytest.mark.parametrize("reward", [20.0, -3.0])
 def test_figure_6_shows_rewards_of_any_size(reward):
     """Spec F5: limits that fit the rewards; no share of successes drawn or told of on an axis of other rewards."""
@@ -54,3 +60,24 @@ def test_figure_6_of_rewards_that_are_shares_is_the_same_for_all_tasks():
     assert axes.get_lines()[1].get_ydata()[0] == 0.25
     caption = next(block["caption"] for block in section["blocks"] if block.get("id") == "figure-reward")
     assert caption.endswith("Dotted: mean over layouts of uniformly random play.")
+
+
+def test_the_summary_leaves_out_a_shortest_path_that_is_not_known():
+    """Spec F5: no dash in the sentence."""
+    assert "took 20 steps, 2.0 times the shortest path (1 run: layout seed 200" in answer(made())
+    assert "took 20 steps (1 run: layout seed 200" in answer(made(shortest=None))
+
+
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [
+        ((120, 100), "last 100 training episodes,"),
+        ((40,), "last 40 training episodes,"),
+        ((1,), "last 1 training episode,"),
+        ((0, 40, 120), "last 40 to 100 training episodes,"),
+    ],
+)
+def test_the_summary_says_of_how_many_episodes_it_speaks(counts, said):
+    """Spec F5: fewer than the window where a run had fewer; runs without an episode have no share in it."""
+    budget = {"steps": 3_000}
+    assert said in answer(*(made(seed, episodes=count, **budget) for seed, count in enumerate(counts)))

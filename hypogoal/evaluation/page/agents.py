@@ -70,10 +70,12 @@ def _answer(material: Material) -> str:
         return ""
     if agent["success"]["mean"] is None:
         return f"No episode of the option agent came to its end ({_runs(agent)}): it needs more steps."
-    ratio = fixed(agent["length_over_shortest"]["mean"], 1)
+    ratio = agent["length_over_shortest"]["mean"]
+    against = "" if ratio is None else f", {fixed(ratio, 1)} times the shortest path"
     text = (
-        f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last 100 training episodes, "
-        f"which took {fixed(agent['length']['mean'], 0)} steps, {ratio} times the shortest path ({_runs(agent)})."
+        f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last "
+        f"{_episodes(agent, material.metrics['settings']['window'])}, which took {fixed(agent['length']['mean'], 0)} "
+        f"steps{against} ({_runs(agent)})."
     )
     if control is None:
         return text
@@ -81,6 +83,14 @@ def _answer(material: Material) -> str:
         f"{text} Uniformly random choice among the same options: {percent(control['success']['mean'])}, "
         f"{fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
     )
+
+
+def _episodes(agent: Mapping[str, Any], window: int) -> str:
+    """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
+    counts = [min(window, run["episodes"]) for run in agent["runs"] if run["episodes"]]
+    fewest, most = min(counts), max(counts)
+    count = str(most) if fewest == most else f"{fewest} to {most}"
+    return f"{count} training episode{'s' if most > 1 else ''}"
 
 
 def _runs(agent: Mapping[str, Any]) -> str:
