@@ -23,7 +23,7 @@ from hypogoal.evaluation.page.blocks import (
     table,
 )
 from hypogoal.evaluation.page.comparisons import comparison_tables
-from hypogoal.evaluation.page.rooms import panel
+from hypogoal.evaluation.page.rooms import bands, panel
 from hypogoal.evaluation.summary import percent, solved
 
 Runs = Mapping[str, Mapping[str, Any]]  # a run's label -> its metrics
@@ -223,7 +223,7 @@ def _rooms(runs: Runs, material: Material) -> Block:
         ]
         caption = (
             f"{name}: balanced accuracy on rooms that training never saw, against labelled ladder groups. Lines: mean "
-            "over ensemble seeds; bands: ± one standard deviation over seeds. Dotted: chance."
+            f"over ensemble seeds; {bands(rows)}: ± one standard deviation over seeds. Dotted: chance."
         )
         drawn = scores_over_groups(panels, list(runs))
         label = f"Scores on unseen rooms: {name}"
