@@ -26,7 +26,6 @@ from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
     figure,
-    first_named,
     fixed,
     interval,
     listed,
@@ -36,6 +35,7 @@ from hypogoal.evaluation.page.blocks import (
     table,
 )
 from hypogoal.evaluation.page.comparisons import comparison_tables
+from hypogoal.evaluation.page.variants import control_of, same_settings, variants
 from hypogoal.evaluation.summary import percent, solved, thousands
 
 COLOURS = {
@@ -61,26 +61,44 @@ def summary_section(material: Material) -> Block:
         "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
         "hypotheses that are true there?"
     )
-    return section("summary", "Summary", [asked, _answer(material)], [_headline(material)], metrics["missing"])
+    return section("summary", "Summary", [asked, *_answers(material)], [_headline(material)], metrics["missing"])
 
 
-def _answer(material: Material) -> str:
-    agent, control = first_named(material.agents(), LEARNED), first_named(material.agents(), RANDOM)
-    if agent is None:
-        return ""
-    if agent["success"]["mean"] is None:
-        return f"No episode of the option agent came to its end ({_runs(agent)}): it needs more steps."
-    ratio = agent["length_over_shortest"]["mean"]
+def _answers(material: Material) -> list[str]:
+    """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
+    agents = material.agents()
+    found = variants(agents)
+    several = len(found) > 1
+    paragraphs = []
+    for agent in found:
+        name = f"the agent '{agent['name']}'" if several else "the option agent"
+        text = _achieved(agent, name, material.metrics["settings"]["window"])
+        control = control_of(material, agent, agents)
+        if agent["success"]["mean"] is not None and control is not None:
+            alike = not several or same_settings(agent, control)
+            text += f" {_by_chance(control, 'the same options' if alike else 'options of its ensemble')}"
+        elif several and control is None:
+            text += " No random choice among the same options was run."
+        paragraphs.append(text)
+    return paragraphs
+
+
+def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
+    success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
+    if success is None:
+        return f"No episode of {name} came to its end ({_runs(agent)}): it needs more steps."
     against = "" if ratio is None else f", {fixed(ratio, 1)} times the shortest path"
-    text = (
-        f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last "
-        f"{_episodes(agent, material.metrics['settings']['window'])}, which took {fixed(agent['length']['mean'], 0)} "
-        f"steps{against} ({_runs(agent)})."
-    )
-    if control is None:
-        return text
     return (
-        f"{text} Uniformly random choice among the same options: {percent(control['success']['mean'])}, "
+        f"{name[0].upper()}{name[1:]} reached the goal in {percent(success)} of its last {_episodes(agent, window)}, "
+        f"which took {fixed(agent['length']['mean'], 0)} steps{against} ({_runs(agent)})."
+    )
+
+
+def _by_chance(control: Mapping[str, Any], among: str) -> str:
+    if control["success"]["mean"] is None:
+        return f"Of uniformly random choice among {among} no episode came to its end."
+    return (
+        f"Uniformly random choice among {among}: {percent(control['success']['mean'])}, "
         f"{fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
     )
 
