@@ -173,3 +173,12 @@ def test_a_member_s_options_are_those_of_every_variant_with_its_ensemble():
     found = _options(material_of(*two()), "none", SUB_GOALS[0], 1)
     assert [one["name"] for one in found] == [f"layout 200, run seed {seed}, ensemble=none" for seed in (0, 1)]
     assert [one["name"] for one in _options(material_of(made()), None, SUB_GOALS[0], 1)] == ["layout 200, run seed 0"]
+
+
+def test_no_two_agents_have_the_same_line():
+    """Spec F5: Figure 6 of many variants, none of which has a colour of its own."""
+    variants = [made(ensemble=name, chooser=who) for who in ("ppo", "random") for name in "abcde"]
+    material = material_of(*variants)
+    curves_section(material)
+    lines = material.figures["reward"].axes[0].get_lines()[: len(variants)]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(variants)

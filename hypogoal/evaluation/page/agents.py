@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,8 @@ COLOURS = {
     "DQN tuned": (PURPLE, False),
     "DQN paper": (PURPLE, True),
 }
-OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True))
+# Of agents with other names; the last ones only where no agent of the figure has them by its name.
+OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True), (BLUE, True), *COLOURS.values())
 
 
 def summary_section(material: Material) -> Block:
@@ -172,7 +174,8 @@ def curves_section(material: Material) -> Block:
 
 def _curve(material: Material, quantity: str) -> Block:
     metrics, grid = material.metrics, material.arrays["curves/grid"]
-    others = iter(OTHERS * len(metrics["agents"]))
+    used = {COLOURS.get(agent["name"]) for agent in metrics["agents"]}
+    others = cycle(look for look in OTHERS if look not in used)
     lines = []
     for index, agent in enumerate(metrics["agents"]):
         colour, dashed = COLOURS.get(agent["name"]) or next(others)
