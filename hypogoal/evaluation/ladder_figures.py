@@ -31,7 +31,7 @@ from hypogoal.evaluation.figures import (
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 METHOD_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 STYLES = ("-", "--", "-.", ":", (0, (5, 1)))  # 5 beside 6 colours: both come again together after 30
-HATCHES = ("", "//", "..", "xx")  # of bars, from one round of colours to the next
+HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
 BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 STOPS = {
     HIT: ("at a true base", "o", SKY),
@@ -141,7 +141,8 @@ def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> F
                 turn, method = divmod(names.index(bar.name), len(METHOD_COLOURS)) if bar.name in names else (0, -1)
                 colour = METHOD_COLOURS[method] if method >= 0 else GREY
                 hatch = HATCHES[turn % len(HATCHES)]
-                axes.bar(x, bar.mean, width * 0.92, color=colour, alpha=0.8, hatch=hatch, label=bar.name)
+                look: dict[str, Any] = {"color": colour, "edgecolor": INK, "linewidth": 0, "alpha": 0.8, "hatch": hatch}
+                axes.bar(x, bar.mean, width * 0.92, label=bar.name, **look)
                 if np.isfinite(bar.deviation):
                     axes.errorbar(x, bar.mean, bar.deviation, color=INK, capsize=3, linewidth=1.2)
                 spots = np.full(len(bar.seeds), x)

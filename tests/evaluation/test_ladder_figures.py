@@ -89,6 +89,7 @@ def test_many_methods_are_told_apart():
     drawn = [(line.get_color(), str(line._dash_pattern)) for line in curves.axes[0].get_lines()[:20]]
     assert len(set(drawn)) == 20
     assert len({(patch.get_facecolor(), patch.get_hatch()) for patch in columns.axes[0].patches}) == 20
+    assert all(patch.get_edgecolor() != patch.get_facecolor() for patch in columns.axes[0].patches)  # hatches are seen
 
 
 def test_with_one_n_methods_stand_side_by_side_with_error_bars():
