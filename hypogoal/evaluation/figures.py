@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -11,7 +12,9 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -23,11 +26,15 @@ COLOURS = {
     ORANGE: "orange", SKY: "sky", GREY: "soft",
 }  # fmt: skip
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, GREY)
-MARKERS = "osD^vPX"
+MARKERS = "osD^vPX*<>p"  # 11, so that a colour has the same one again late
+Bounds = tuple[float | None, float | None]
+SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
 WIDTH = 5.6  # inches; readable on a phone where it is scaled to the screen
+LABEL = 60  # characters of a legend's line, which fits the figure also in capitals
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
     "font.size": 10.5,
+    "text.parse_math": False,  # names are shown as they are, dollars too
     "axes.edgecolor": INK,
     "axes.labelcolor": INK,
     "axes.titlesize": 10,
@@ -43,6 +50,7 @@ STYLE: dict[str, Any] = {
     "ytick.color": INK,
     "legend.frameon": False,
     "legend.fontsize": 9,
+    "legend.columnspacing": 1.4,
     "figure.facecolor": "none",
     "axes.facecolor": "none",
     "savefig.facecolor": "none",
@@ -56,6 +64,31 @@ def styled(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None
     return matplotlib.rc_context(settings)
 
 
+def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any) -> None:
+    """A legend under the plots, for which the figure becomes higher: each label once, whichever of the plots has it.
+
+    Args:
+        figure: as wide as it is to be.
+        places: its plots.
+        most: columns; fewer where labels are too long for so many, and very long labels are broken.
+        more: matplotlib's settings of a legend.
+    """
+    handles: dict[str, Artist] = {}
+    for place in places:
+        for handle, label in zip(*place.get_legend_handles_labels(), strict=True):
+            handles.setdefault(textwrap.fill(label, LABEL), handle)
+    if not handles:
+        return
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for columns in range(most, 0, -1):
+        legend = figure.legend(handles.values(), handles.keys(), loc="outside lower left", ncols=columns, **more)
+        box = legend.get_window_extent(renderer)
+        if box.width <= figure.bbox.width or columns == 1:
+            figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
+            return
+        legend.remove()
+
+
 @dataclass(frozen=True)
 class Line:
     """One agent's curve: values float (R, G), a row per run, NaN where it has no value."""
@@ -66,12 +99,23 @@ class Line:
     dashed: bool = False
 
 
+def reward_bounds(lines: Sequence[Line]) -> Bounds:
+    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values.
+
+    Args:
+        lines: those that are drawn.
+    """
+    values = np.concatenate([np.zeros(0), *(line.values.ravel() for line in lines)])
+    known = values[np.isfinite(values)]
+    return SHARES if bool(((known >= 0) & (known <= 1)).all()) else (None, None)
+
+
 def learning_curves(
     grid: NDArray[np.int64],
     lines: Sequence[Line],
     quantity: str,
     references: Sequence[tuple[str, float]] = (),
-    bounds: tuple[float, float | None] = (0.0, None),
+    bounds: Bounds = (0.0, None),
 ) -> Figure:
     """Figure 6: a quantity of episodes against environment steps; mean over runs, bands of one standard error.
 
@@ -80,11 +124,10 @@ def learning_curves(
         lines: one per agent.
         quantity: the y axis's label, with its unit.
         references: horizontal lines with their names.
-        bounds: of the y axis.
+        bounds: of the y axis, None for what fits the values.
     """
     with styled():
-        rows = -(-(len(lines) + len(references)) // 2)
-        figure = Figure(figsize=(WIDTH, 3.1 + 0.22 * rows), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
         axes = figure.subplots()
         for line in lines:
             _draw_curve(axes, grid / 1000, line)
@@ -94,7 +137,7 @@ def learning_curves(
         axes.set_ylabel(quantity)
         axes.set_xlim(0, grid[-1] / 1000)
         axes.set_ylim(*bounds)
-        figure.legend(loc="outside lower left", ncols=2, handlelength=2.4)
+        legend_below(figure, [axes], 2, handlelength=2.4)
         return figure
 
 
@@ -121,7 +164,7 @@ def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str,
     """
     with styled():
         step = 0.8 / max(1, len(kinds))
-        height = 1.2 + len(sub_goals) * max(0.42, 0.2 * len(kinds)) + 0.25 * -(-len(kinds) // 3)
+        height = 1.2 + len(sub_goals) * max(0.42, 0.2 * len(kinds))
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
         places = np.arange(len(sub_goals), dtype=np.float64)
@@ -138,7 +181,7 @@ def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str,
         axes.grid(visible=False, axis="y")
         axes.set_xlim(min(0.45, float(np.nanmin([values for _, values in kinds])) - 0.03), 1.02)
         axes.set_xlabel("balanced accuracy on held-out layouts (0.5: chance)")
-        figure.legend(loc="outside lower left", ncols=3)
+        legend_below(figure, [axes], 3)
         return figure
 
 
@@ -157,7 +200,7 @@ def preference_against_match(
         control: the same two arrays, flat, of the random chooser.
     """
     with styled():
-        figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
         axes = figure.subplots()
         if control is not None:
             x, y = control
@@ -175,7 +218,7 @@ def preference_against_match(
         axes.set_ylim(-0.04, ticks[-1] * 1.1)
         axes.set_xlabel("match: balanced accuracy on the run's layout")
         axes.set_ylabel("preference: chosen / expected")
-        figure.legend(loc="outside lower left", ncols=3, handletextpad=0.3)
+        legend_below(figure, [axes], 3, handletextpad=0.3)
         return figure
 
 

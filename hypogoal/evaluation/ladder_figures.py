@@ -13,11 +13,26 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from hypogoal.evaluation.distance import BEGAN_INSIDE, HIT, MISS
-from hypogoal.evaluation.figures import BLUE, GREEN, GREY, INK, MARKERS, ORANGE, PURPLE, SKY, VERMILLION, WIDTH, styled
+from hypogoal.evaluation.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    MARKERS,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    WIDTH,
+    legend_below,
+    styled,
+)
 
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 METHOD_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
-STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+STYLES = ("-", "--", "-.", ":", (0, (5, 1)))  # 5 beside 6 colours: both come again together after 30
+HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
+BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 STOPS = {
     HIT: ("at a true base", "o", SKY),
     MISS: ("elsewhere", "x", ORANGE),
@@ -47,20 +62,22 @@ class Panel:
 def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
     """Figure 3: scores against the number of labelled ladder groups; bands of one standard deviation.
 
+    A method with one N has an error bar instead of a band, a little beside the other methods'.
+
     Args:
         panels: two in a row.
         names: all methods, in the order of their colours.
     """
     with styled():
         rows = -(-len(panels) // 2)
-        figure = Figure(figsize=(WIDTH, 2.25 * rows + 0.35), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 2.25 * rows + 0.05), layout="constrained")
         axes = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
         values = [series.mean - np.nan_to_num(series.deviation) for panel in panels for series in panel.series]
         known = np.concatenate([*values, [0.5]])
         ticks = sorted({int(group) for panel in panels for series in panel.series for group in series.groups})
         for place, panel in zip(axes.flat, panels, strict=False):
             for series in panel.series:
-                _draw_series(place, series, names.index(series.name))
+                _draw_series(place, series, names.index(series.name), len(names))
             place.plot(list(panel.blind), list(panel.blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
             place.set_title(panel.title, fontsize=9.5)
             place.set_ylim(max(0.0, float(np.nanmin(known)) - 0.03), 1.03)
@@ -72,29 +89,24 @@ def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
             place.set_ylabel("fraction")
         for place in axes.flat[len(panels) :]:
             place.set_visible(False)
-        _legend(figure, list(axes.flat), 3)
+        legend_below(figure, list(axes.flat), 3, handlelength=2.6)
         return figure
 
 
-def _draw_series(axes: Axes, series: Series, index: int) -> None:
+def _draw_series(axes: Axes, series: Series, index: int, count: int) -> None:
+    """The series of method ``index`` of ``count``."""
     colour, line = METHOD_COLOURS[index % len(METHOD_COLOURS)], STYLES[index % len(STYLES)]
     marker = MARKERS[index % len(MARKERS)]
-    axes.plot(
-        series.groups, series.mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=series.name
-    )
+    groups = series.groups.astype(np.float64)
+    if len(groups) == 1:  # the others with one N lie at the same place
+        groups += (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
+    axes.plot(groups, series.mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=series.name)
     shown = ~(np.isnan(series.mean) | np.isnan(series.deviation))
-    low, high = (series.mean - series.deviation)[shown], (series.mean + series.deviation)[shown]
-    axes.fill_between(series.groups[shown], low, high, color=colour, alpha=0.15, linewidth=0)
-
-
-def _legend(figure: Figure, places: Sequence[Axes], columns: int) -> None:
-    """Each label once, whichever of the plots has it."""
-    found = [pair for place in places for pair in zip(*place.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in reversed(found)}
-    labels = list(dict.fromkeys(label for _, label in found))
-    figure.legend(
-        [handles[label] for label in labels], labels, loc="outside lower left", ncols=columns, handlelength=2.6
-    )
+    mean, deviation = series.mean[shown], series.deviation[shown]
+    if len(mean) == 1:  # a band would have no width
+        axes.errorbar(groups[shown], mean, deviation, color=colour, capsize=3, linewidth=1.2)
+    else:
+        axes.fill_between(groups[shown], mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
 
 
 @dataclass(frozen=True)
@@ -117,7 +129,7 @@ def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> F
         inside: what an execution counts that begins inside its own termination set, drawn as a line if it is near.
     """
     with styled():
-        figure = Figure(figsize=(WIDTH, 3.5), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
         axes = figure.subplots()
         groups = list(dict.fromkeys(bar.group for bar in bars))
         highest = max((bar.mean + np.nan_to_num(bar.deviation) for bar in bars), default=1.0)
@@ -126,8 +138,11 @@ def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> F
             width = min(0.26, 0.84 / len(own))
             for index, bar in enumerate(own):
                 x = place + (index - (len(own) - 1) / 2) * width
-                colour = METHOD_COLOURS[names.index(bar.name) % len(METHOD_COLOURS)] if bar.name in names else GREY
-                axes.bar(x, bar.mean, width * 0.92, color=colour, alpha=0.8, label=bar.name)
+                turn, method = divmod(names.index(bar.name), len(METHOD_COLOURS)) if bar.name in names else (0, -1)
+                colour = METHOD_COLOURS[method] if method >= 0 else GREY
+                hatch = HATCHES[turn % len(HATCHES)]
+                look: dict[str, Any] = {"color": colour, "edgecolor": INK, "linewidth": 0, "alpha": 0.8, "hatch": hatch}
+                axes.bar(x, bar.mean, width * 0.92, label=bar.name, **look)
                 if np.isfinite(bar.deviation):
                     axes.errorbar(x, bar.mean, bar.deviation, color=INK, capsize=3, linewidth=1.2)
                 spots = np.full(len(bar.seeds), x)
@@ -139,7 +154,7 @@ def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> F
         axes.grid(visible=False, axis="x")
         axes.set_ylim(0, None)
         axes.set_ylabel("distance to the nearest true base\n(units of position)")
-        _legend(figure, [axes], 2)
+        legend_below(figure, [axes], 2, handlelength=2.6)
         return figure
 
 

@@ -65,6 +65,41 @@ def test_the_curve_is_the_mean_of_runs_that_have_a_value():
     assert np.isnan(line.get_ydata()[0])
 
 
+LONG = [
+    "options (learned members), ensemble=dbat, K=3, initiation=learned, option_gamma=0.99",
+    "options (learned members), ensemble=no diversity, K=3",
+    "PPO tuned, COST=$a_1$ b$^$",
+    "RANDOM CHOICE WHILE OPTIONS LEARN, ENSEMBLE=NO DIVERSITY, AND MORE",
+]
+
+
+def long_curves():
+    values = np.linspace(0, 1, 11)[None]
+    return learning_curves(GRID, [Line(name, values, BLUE) for name in LONG], "reward per episode")
+
+
+def long_members():
+    return best_mean_worst_members(["red"], [(name, np.full((1, 3), 0.8)) for name in LONG])
+
+
+def long_preferences():
+    match = np.full((1, len(LONG), 2), 0.8)
+    return preference_against_match(LONG, match, match)
+
+
+@pytest.mark.parametrize("draw", [long_curves, long_members, long_preferences])
+def test_every_entry_of_a_legend_is_on_the_picture(draw):
+    """Spec F: fewer columns and broken lines for long names, a higher figure for many; a dollar is a dollar."""
+    figure = draw()
+    assert to_png(figure)  # lays it out
+    (legend,) = figure.legends
+    assert [" ".join(text.get_text().split()) for text in legend.get_texts()] == LONG
+    box, whole = legend.get_window_extent(), figure.bbox
+    assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= whole.x1
+    assert figure.axes[0].get_window_extent().y0 > box.y1
+    assert figure.axes[0].get_window_extent().height / figure.dpi > 0.8
+
+
 def test_an_observation_as_png_is_the_same_pixels():
     """Spec F7: the picture in the page is the state itself."""
     import io

@@ -13,6 +13,7 @@ from hypogoal.evaluation.ladder_figures import (
     scores_over_groups,
     stops_over_rooms,
 )
+from hypogoal.evaluation.page.rooms import bands
 
 GROUPS = np.array([1, 2, 7])
 
@@ -68,6 +69,48 @@ def test_where_there_is_no_number_there_is_no_point():
     assert scores().axes[1].get_xticks().tolist() == [1, 2, 7]
     blind = scores().axes[0].get_lines()[-1]
     assert (list(blind.get_xdata()), list(blind.get_ydata())) == ([1, 7], [0.9, 0.8])
+
+
+NAMES = [f"dbat, K=3, some_setting=value-{index}" for index in range(20)]
+
+
+def test_many_methods_are_told_apart():
+    """Figures 3 and 4: all of them in the legend, which the figure has room for, and no two drawn alike."""
+    lines = [Series(name, GROUPS, np.full(3, 0.6), np.full(3, 0.1)) for name in NAMES]
+    bars = [Bar(name, "N=1", 40.0, np.nan, (40.0,)) for name in NAMES]
+    curves, columns = scores_over_groups([Panel("all rooms", {}, lines)], NAMES), distance_bars(bars, NAMES, 300)
+    for figure in (curves, columns):
+        to_png(figure)  # lays it out
+        (legend,) = figure.legends
+        assert [text.get_text() for text in legend.get_texts()] == NAMES
+        box = legend.get_window_extent()
+        assert box.x1 <= figure.bbox.x1 and box.y0 >= 0
+        assert figure.axes[0].get_window_extent().height / figure.dpi > 1.5
+    drawn = [(line.get_color(), str(line._dash_pattern)) for line in curves.axes[0].get_lines()[:20]]
+    assert len(set(drawn)) == 20
+    assert len({(patch.get_facecolor(), patch.get_hatch()) for patch in columns.axes[0].patches}) == 20
+    assert all(patch.get_edgecolor() != patch.get_facecolor() for patch in columns.axes[0].patches)  # hatches are seen
+
+
+def test_with_one_n_methods_stand_side_by_side_with_error_bars():
+    """Figure 3: a band would have no width, and methods would hide each other."""
+    names = NAMES[:3]
+    one = [Series(name, GROUPS[:1], np.array([0.8]), np.array([0.1])) for name in names]
+    axes = scores_over_groups([Panel("all rooms", {1: 0.5}, one)], names).axes[0]
+    assert len(axes.containers) == 3
+    places = [bars.lines[2][0].get_segments()[0] for bars in axes.containers]
+    np.testing.assert_allclose([place[:, 1] for place in places], [[0.7, 0.9]] * 3)
+    np.testing.assert_allclose([place[0, 0] for place in places], [0.94, 1.0, 1.06])
+    marks = [line.get_xdata()[0] for line in axes.get_lines() if line.get_label() in names]
+    np.testing.assert_allclose(marks, [0.94, 1.0, 1.06])
+
+
+def test_captions_say_what_shows_the_spread():
+    """Figure 3: bands over several N, bars at one."""
+    one, several = [{"method": "a", "groups": 1}], [{"method": "b", "groups": 1}, {"method": "b", "groups": 2}]
+    assert bands(several) == "bands"
+    assert bands(one) == "bars (methods side by side, all at the same N)"
+    assert bands(one + several) == "bands, and bars where a method has one N (those methods side by side)"
 
 
 def test_a_bar_is_as_high_as_its_mean():

@@ -148,3 +148,21 @@ def test_curves_on_another_grid():
     """Spec F5: the last value known, nothing before the first and past the end."""
     found = on_grid(np.array([[1.0, 2.0, 3.0]]), np.array([10, 20, 30]), np.array([0, 10, 15, 30, 40]))
     np.testing.assert_array_equal(found, [[np.nan, 1, 1, 3, np.nan]])
+
+
+def test_rewards_of_any_size_are_seen(runs, compared):
+    """Spec F5: the reward axis of several runs has limits that fit rewards that are no shares of episodes."""
+    from hypogoal.evaluation.evaluated import read_evaluation
+    from hypogoal.evaluation.page.blocks import Material
+    from hypogoal.evaluation.page.compared import compared_sections
+
+    read = {name: read_evaluation(runs / name) for name in ("slow", "fast")}
+    for factor, limits in ((1, (-0.02, 1.04)), (20, None)):
+        curves = {
+            name: {key: values * factor if key.endswith("reward") else values for key, values in one.arrays.items()}
+            for name, one in read.items()
+        }
+        material = Material({}, {})
+        compared_sections({name: one.metrics for name, one in read.items()}, curves, compared, material)
+        low, high = material.figures["reward-0"].axes[0].get_ylim()
+        assert (low, high) == limits if limits else low < factor < high

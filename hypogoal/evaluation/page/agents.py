@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from hypogoal.evaluation.agents import LEARNED, ORACLE, ORACLE_RANDOM, PRETRAINING, RANDOM
-from hypogoal.evaluation.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Line, learning_curves
+from hypogoal.evaluation.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SHARES,
+    SKY,
+    VERMILLION,
+    Bounds,
+    Line,
+    learning_curves,
+    reward_bounds,
+)
 from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
     figure,
-    first_named,
     fixed,
     interval,
     listed,
@@ -23,6 +36,7 @@ from hypogoal.evaluation.page.blocks import (
     table,
 )
 from hypogoal.evaluation.page.comparisons import comparison_tables
+from hypogoal.evaluation.page.variants import control_of, same_settings, variants
 from hypogoal.evaluation.summary import percent, solved, thousands
 
 COLOURS = {
@@ -36,7 +50,8 @@ COLOURS = {
     "DQN tuned": (PURPLE, False),
     "DQN paper": (PURPLE, True),
 }
-OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True))
+# Of agents with other names; the last ones only where no agent of the figure has them by its name.
+OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True), (BLUE, True), *COLOURS.values())
 
 
 def summary_section(material: Material) -> Block:
@@ -48,26 +63,54 @@ def summary_section(material: Material) -> Block:
         "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
         "hypotheses that are true there?"
     )
-    return section("summary", "Summary", [asked, _answer(material)], [_headline(material)], metrics["missing"])
+    return section("summary", "Summary", [asked, *_answers(material)], [_headline(material)], metrics["missing"])
 
 
-def _answer(material: Material) -> str:
-    agent, control = first_named(material.agents(), LEARNED), first_named(material.agents(), RANDOM)
-    if agent is None:
-        return ""
-    if agent["success"]["mean"] is None:
-        return f"No episode of the option agent came to its end ({_runs(agent)}): it needs more steps."
-    ratio = fixed(agent["length_over_shortest"]["mean"], 1)
-    text = (
-        f"The option agent reached the goal in {percent(agent['success']['mean'])} of its last 100 training episodes, "
-        f"which took {fixed(agent['length']['mean'], 0)} steps, {ratio} times the shortest path ({_runs(agent)})."
-    )
-    if control is None:
-        return text
+def _answers(material: Material) -> list[str]:
+    """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
+    agents = material.agents()
+    found = variants(agents)
+    several = len(found) > 1
+    paragraphs = []
+    for agent in found:
+        name = f"the agent '{agent['name']}'" if several else "the option agent"
+        text = _achieved(agent, name, material.metrics["settings"]["window"])
+        control = control_of(material, agent, agents)
+        if agent["success"]["mean"] is not None and control is not None:
+            alike = not several or same_settings(agent, control)
+            text += f" {_by_chance(control, 'the same options' if alike else 'options of its ensemble')}"
+        elif several and control is None:
+            text += " No random choice among the same options was run."
+        paragraphs.append(text)
+    return paragraphs
+
+
+def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
+    success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
+    if success is None:
+        return f"No episode of {name} came to its end ({_runs(agent)}): it needs more steps."
+    against = "" if ratio is None else f", {fixed(ratio, 1)} times the shortest path"
     return (
-        f"{text} Uniformly random choice among the same options: {percent(control['success']['mean'])}, "
+        f"{name[0].upper()}{name[1:]} reached the goal in {percent(success)} of its last {_episodes(agent, window)}, "
+        f"which took {fixed(agent['length']['mean'], 0)} steps{against} ({_runs(agent)})."
+    )
+
+
+def _by_chance(control: Mapping[str, Any], among: str) -> str:
+    if control["success"]["mean"] is None:
+        return f"Of uniformly random choice among {among} no episode came to its end."
+    return (
+        f"Uniformly random choice among {among}: {percent(control['success']['mean'])}, "
         f"{fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
     )
+
+
+def _episodes(agent: Mapping[str, Any], window: int) -> str:
+    """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
+    counts = [min(window, run["episodes"]) for run in agent["runs"] if run["episodes"]]
+    fewest, most = min(counts), max(counts)
+    count = str(most) if fewest == most else f"{fewest} to {most}"
+    return f"{count} training episode{'s' if most > 1 else ''}"
 
 
 def _runs(agent: Mapping[str, Any]) -> str:
@@ -131,17 +174,20 @@ def curves_section(material: Material) -> Block:
 
 def _curve(material: Material, quantity: str) -> Block:
     metrics, grid = material.metrics, material.arrays["curves/grid"]
-    others = iter(OTHERS * len(metrics["agents"]))
+    used = {COLOURS.get(agent["name"]) for agent in metrics["agents"]}
+    others = cycle(look for look in OTHERS if look not in used)
     lines = []
     for index, agent in enumerate(metrics["agents"]):
         colour, dashed = COLOURS.get(agent["name"]) or next(others)
         lines.append(Line(agent["name"], material.arrays[f"curves/{index}/{quantity}"], colour, dashed))
     layouts = metrics["layouts"]
-    bounds: tuple[float, float | None]
+    bounds: Bounds
     if quantity == "reward":
-        random = [layout["random_success"] for layout in layouts if layout["random_success"] is not None]
+        label, axis, bounds = "Undiscounted reward per episode", "reward per episode", reward_bounds(lines)
+        # A share of episodes says nothing on an axis of other rewards.
+        known = [layout["random_success"] for layout in layouts if bounds == SHARES]
+        random = [share for share in known if share is not None]
         references = [("random play", float(np.mean(random)))] if random else []
-        label, axis, bounds = "Undiscounted reward per episode", "reward per episode", (-0.02, 1.04)
     else:
         shortest = [layout["shortest_path"] for layout in layouts if layout["shortest_path"]]
         references = [("shortest path", float(np.mean(shortest)))] if shortest else []
@@ -150,10 +196,11 @@ def _curve(material: Material, quantity: str) -> Block:
     number = "Figure 6 of the paper" if quantity == "reward" else "Beside Figure 6 of the paper"
     first = metrics["agents"][0]
     dotted = "uniformly random play" if quantity == "reward" else "the shortest path"
+    reference = f" Dotted: mean over layouts of {dotted}." if references else ""
     caption = (
         f"{number}: {label.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
         f"bands: ± one standard error over runs. {first['name']}: {_runs(first)}; "
-        f"the other agents: {_others(metrics['agents'])}. Dotted: mean over layouts of {dotted}."
+        f"the other agents: {_others(metrics['agents'])}.{reference}"
     )
     return figure(material, quantity, label, drawn, caption)
 

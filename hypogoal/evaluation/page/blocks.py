@@ -42,11 +42,6 @@ class Material:
         return list(self.metrics.get("comparisons", {}).get(of, ()))
 
 
-def first_named(entries: Iterable[Mapping[str, Any]], name: str) -> Mapping[str, Any] | None:
-    """The first entry called ``name``, also where settings that differ between runs were added to it."""
-    return next((entry for entry in entries if f"{entry['name']}, ".startswith(f"{name}, ")), None)
-
-
 def section(
     identity: str,
     title: str,

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.agents import LEARNED, RANDOM
 from hypogoal.evaluation.figures import preference_against_match
 from hypogoal.evaluation.page.blocks import (
     Block,
     Material,
     figure,
-    first_named,
     fixed,
     interval,
     listed,
@@ -23,6 +21,7 @@ from hypogoal.evaluation.page.blocks import (
     section,
     table,
 )
+from hypogoal.evaluation.page.variants import control_of, variants, which
 
 QUANTITIES = {
     "preference": "preference",
@@ -33,7 +32,8 @@ QUANTITIES = {
 
 def terminations_section(material: Material) -> Block:
     """Figures 7 and 8: where the most and the least preferred member's options stopped."""
-    agent = first_named(material.metrics["selection"], LEARNED)
+    selection = material.metrics["selection"]
+    agent = next(iter(variants(selection)), None)
     title = "Where options stop"
     if agent is None:
         missing = ["Overlaid termination states: they need a meta artefact with learned terminations: train-meta."]
@@ -56,7 +56,7 @@ def terminations_section(material: Material) -> Block:
                 "states, 128 at most, in which the option's own classifier said yes.",
             }
         )
-    return section("terminations", title, [text], blocks)
+    return section("terminations", title, [text, which(agent, selection)], blocks)
 
 
 def _pair(material: Material, run: Mapping[str, Any], goal: Mapping[str, Any]) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def _pair(material: Material, run: Mapping[str, Any], goal: Mapping[str, Any]) -
 def choices_section(material: Material) -> Block:
     """Question 5: does reward lead to the hypotheses that transfer?"""
     selection = material.metrics["selection"]
-    agent, control = first_named(selection, LEARNED), first_named(selection, RANDOM)
+    agent = next(iter(variants(selection)), None)
     title = "Which hypotheses are chosen"
     if agent is None:
         needed = "It needs a meta artefact with learned terminations: train-meta."
@@ -92,11 +92,16 @@ def choices_section(material: Material) -> Block:
         "nearly always, one that never fires is always offered. The random chooser's numbers show what no preference "
         "looks like."
     )
+    control = control_of(material, agent, selection)
     blocks = [_scatter(material, agent, control), _correlations(material)]
     for index, run in enumerate(agent["runs"]):
         blocks.append(_members(run, folded=index > 0))
     missing = [] if control else ["No random chooser beside it: it needs a meta artefact with chooser=random."]
-    return section("choices", title, [text], blocks, missing)
+    shown = which(agent, selection)
+    if shown:
+        shown = f"{shown} Rank correlations are those of every variant."
+        missing = [] if control else [f"No random choice among the options of {agent['name']} was run."]
+    return section("choices", title, [text, shown], blocks, missing)
 
 
 def _values(agent: Mapping[str, Any], key: str) -> NDArray[np.float64]:
@@ -122,8 +127,8 @@ def _scatter(material: Material, agent: Mapping[str, Any], control: Mapping[str,
     caption = (
         "Question 5 of the paper: a point per member and run, over all of training; up: chosen more often than by a "
         f"uniform chooser; right: closer to the true sub-goal on that layout (layout seed {listed(layouts)}; runs: "
-        f"{len(agent['runs'])})."
-    )
+        f"{len(agent['runs'])}). {which(agent, material.metrics['selection'])}"
+    ).rstrip()
     return figure(material, "preference", "Preference against match", drawn, caption)
 
 

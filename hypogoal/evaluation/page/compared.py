@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation.comparing import common_names, on_grid
-from hypogoal.evaluation.figures import PALETTE, Line, learning_curves
+from hypogoal.evaluation.figures import PALETTE, Line, learning_curves, reward_bounds
 from hypogoal.evaluation.ladder_figures import scores_over_groups
 from hypogoal.evaluation.page.blocks import (
     Block,
@@ -23,7 +23,7 @@ from hypogoal.evaluation.page.blocks import (
     table,
 )
 from hypogoal.evaluation.page.comparisons import comparison_tables
-from hypogoal.evaluation.page.rooms import panel
+from hypogoal.evaluation.page.rooms import bands, panel
 from hypogoal.evaluation.summary import percent, solved
 
 Runs = Mapping[str, Mapping[str, Any]]  # a run's label -> its metrics
@@ -158,7 +158,7 @@ def _curve(
         values = on_grid(own[f"curves/{place}/{quantity}"], own["curves/grid"], grid)
         lines.append(Line(called, values, PALETTE[index], dashed=index % 2 == 1))
     axis = "reward per episode" if quantity == "reward" else "episode length (steps)"
-    drawn = learning_curves(grid, lines, axis, (), (-0.02, 1.04) if quantity == "reward" else (0.0, None))
+    drawn = learning_curves(grid, lines, axis, (), reward_bounds(lines) if quantity == "reward" else (0.0, None))
     counts = "; ".join(f"{label}, {_count(runs[label], agent)}" for label, agent, _ in shown)
     more = f" Not drawn: {listed([called for _, _, called in wanted[MOST_LINES:]])}." if wanted[MOST_LINES:] else ""
     caption = (
@@ -223,7 +223,7 @@ def _rooms(runs: Runs, material: Material) -> Block:
         ]
         caption = (
             f"{name}: balanced accuracy on rooms that training never saw, against labelled ladder groups. Lines: mean "
-            "over ensemble seeds; bands: ± one standard deviation over seeds. Dotted: chance."
+            f"over ensemble seeds; {bands(rows)}: ± one standard deviation over seeds. Dotted: chance."
         )
         drawn = scores_over_groups(panels, list(runs))
         label = f"Scores on unseen rooms: {name}"

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.evaluation.agents import LEARNED
-from hypogoal.evaluation.page.blocks import Block, Material, first_named, fixed, picture, section, texts
+from hypogoal.evaluation.page.blocks import Block, Material, fixed, picture, section, texts
+from hypogoal.evaluation.page.variants import settings_of, variants
 from hypogoal.evaluation.pictures import FULL, attribution_png
 from hypogoal.evaluation.summary import percent
 
@@ -111,23 +111,25 @@ def _states(material: Material, sub_goal: str) -> list[dict[str, Any]]:
 def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> list[dict[str, Any]]:
     """What a member's options came to: one entry per agent, or per ladder, that was learned with this ensemble."""
     found = []
-    agent = first_named(material.metrics["selection"], LEARNED)
-    for run in agent["runs"] if agent else ():
-        goal = next((one for one in run["sub_goals"] if one["sub_goal"] == sub_goal), None)
-        if run["ensemble"] == ensemble and goal is not None:
-            found.append(_chosen(material, run, goal, member))
+    for agent in variants(material.metrics["selection"]):
+        for run in agent["runs"]:
+            goal = next((one for one in run["sub_goals"] if one["sub_goal"] == sub_goal), None)
+            if run["ensemble"] == ensemble and goal is not None:
+                found.append(_chosen(material, run, goal, member, settings_of(agent)))
     for row in material.metrics["distance"]["options"]:
         if row["ensemble"] == ensemble and row["sub_goal"] == sub_goal:
             found.append(_stopped(material, row, member))
     return found
 
 
-def _chosen(material: Material, run: Mapping[str, Any], goal: Mapping[str, Any], member: int) -> dict[str, Any]:
+def _chosen(
+    material: Material, run: Mapping[str, Any], goal: Mapping[str, Any], member: int, settings: str
+) -> dict[str, Any]:
     own = goal["members"][member]
     chosen, expected = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
     notes = [word for word in ("most", "least") if goal[word] == member]
     return {
-        "name": f"layout {run['layout_seed']}, run seed {run['seed']}",
+        "name": f"layout {run['layout_seed']}, run seed {run['seed']}{f', {settings}' if settings else ''}",
         "note": f"{notes[0]} preferred of its sub-goal" if notes else "",
         "facts": [
             ("chosen", f"{own['chosen']:,} of {own['offered']:,} offers"),

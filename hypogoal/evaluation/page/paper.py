@@ -8,14 +8,14 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from hypogoal.evaluation.agents import LEARNED
 from hypogoal.evaluation.page.agents import curves_section
-from hypogoal.evaluation.page.blocks import Block, Material, first_named, fixed, texts
+from hypogoal.evaluation.page.blocks import Block, Material, fixed, texts
 from hypogoal.evaluation.page.choices import choices_section
 from hypogoal.evaluation.page.distance import distance_section, stops_section
 from hypogoal.evaluation.page.hypotheses import hypotheses_section
 from hypogoal.evaluation.page.rooms import rooms_section
 from hypogoal.evaluation.page.saliency import KINDS
+from hypogoal.evaluation.page.variants import variants, which
 from hypogoal.evaluation.state_figures import (
     Explained,
     attributions_of_every_frame,
@@ -117,7 +117,8 @@ _KEYS = ("observations", "seen", "attributions", "probabilities", "verdicts", "l
 
 def _terminations(material: Material) -> Iterable[Drawn]:
     """Figures 7 and 8, and the other sub-goals', of the agent's first run."""
-    agent = first_named(material.metrics["selection"], LEARNED)
+    selection = material.metrics["selection"]
+    agent = next(iter(variants(selection)), None)
     if agent is None:
         return
     run = agent["runs"][0]
@@ -131,8 +132,9 @@ def _terminations(material: Material) -> Iterable[Drawn]:
             f"{number} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
             f"prefers most and of the one it prefers least ({run['path']}, layout seed {run['layout_seed']}, run seed "
             f"{run['seed']}); the last states, 128 at most, in which the member's classifier ended its option. "
-            "Preference: chosen / expected under uniform choice; match: balanced accuracy on that layout."
-        )
+            "Preference: chosen / expected under uniform choice; match: balanced accuracy on that layout. "
+            f"{which(agent, selection)}"
+        ).rstrip()
         yield Drawn(name, caption, termination_states(sides))
 
 

@@ -97,6 +97,17 @@ def panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str,
     return Panel(title, blind, series)
 
 
+def bands(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What a figure of these rows shows spread by: a method with one N has a bar in place of a band."""
+    alone = [
+        len({entry["groups"] for entry in rows if entry["method"] == name and entry["groups"] is not None}) == 1
+        for name in _names(rows)
+    ]
+    if all(alone):
+        return "bars (methods side by side, all at the same N)"
+    return "bands, and bars where a method has one N (those methods side by side)" if any(alone) else "bands"
+
+
 def _identity(base: str, rows: Sequence[Mapping[str, Any]], material: Material) -> str:
     """A figure's name; with the sub-goal where there are several."""
     several = len({entry["sub_goal"] for entry in material.metrics["rooms"]}) > 1
@@ -115,9 +126,9 @@ def _best(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
         ]
         drawn = scores_over_groups(panels, _names(rows))
     caption = (
-        f"Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; bands: ± "
-        f"one standard deviation over seeds, as in the paper. Dotted: never saying yes. {_seeds(material, rows)} "
-        f"{_why_dashes(rows)}{PAPER}"
+        "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
+        f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
+        f"{_seeds(material, rows)} {_why_dashes(rows)}{PAPER}"
     )
     return figure(material, _identity("figure3", rows, material), label, drawn, caption, missing)
 
@@ -129,7 +140,7 @@ def _four(material: Material, rows: Sequence[Mapping[str, Any]]) -> Block:
         drawn = scores_over_groups(panels, _names(rows))
     caption = (
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
-        f"over ensemble seeds, bands: ± one standard deviation. {_why_dashes(rows)}"
+        f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
         "Only the second can be had without labels from the rooms it is for."
     )
     label = "Balanced accuracy on unseen rooms"

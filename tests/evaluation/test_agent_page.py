@@ -1,0 +1,184 @@
+"""Spec F5, F6: what the page says and draws of agents, from episodes as they are recorded."""
+
+import numpy as np
+import pytest
+
+from hypogoal.evaluation.agents import Run, agent_curves, agent_metrics, common_grid, group_runs
+from hypogoal.evaluation.choices import Choices, over_training, selection_of_run
+from hypogoal.evaluation.curves import Episodes
+from hypogoal.evaluation.page.agents import curves_section, summary_section
+from hypogoal.evaluation.page.blocks import Material
+from hypogoal.evaluation.page.choices import choices_section, terminations_section
+from hypogoal.evaluation.page.explorer import _options
+from hypogoal.evaluation.page.paper import paper_figures
+from hypogoal.evaluation.quantities import plain
+
+SUB_GOALS = ["open-red-door"]
+
+
+def made(seed=0, *, chooser="ppo", episodes=120, reward=1.0, length=20, shortest=10, **config):
+    """A run whose episodes are all alike: the last of them came to its end where there is a reward."""
+    end = np.arange(1, episodes + 1) * length
+    rewards = np.full(episodes, reward, dtype=np.float64)
+    found = Episodes(end, np.full(episodes, length), rewards, rewards > 0)
+    layout = {"layout_seed": 200, "shortest_path": shortest, "random_success": 0.25, "random_episodes": 10}
+    about = {"termination": "learned", "chooser": chooser, "steps": episodes * length, **config}
+    return Run("meta", f"meta-{chooser}-{config.get('ensemble', '')}-{seed}", seed, about, found, layout)
+
+
+def material_of(*runs):
+    """What an evaluation of these runs holds of agents."""
+    groups = group_runs(runs)
+    grid = common_grid(runs)
+    arrays = {"curves/grid": grid}
+    for index, same in enumerate(groups.values()):
+        arrays |= {f"curves/{index}/{key}": values for key, values in agent_curves(same, grid).items()}
+    agents = [agent_metrics(name, same) for name, same in groups.items()]
+    metrics = {"agents": agents, "layouts": [runs[0].layout], "settings": {"window": 100}, "missing": []}
+    metrics["selection"] = [chosen(name, same, arrays) for name, same in groups.items()]
+    nothing = {"hypotheses": [], "rooms": [], "saliency": None, "distance": {"options": [], "shown": []}}
+    return Material(plain({**metrics, **nothing}), arrays)
+
+
+def chosen(name, runs, arrays):
+    """Two members of one sub-goal: the second is chosen more often, and an ensemble for each name of one."""
+    columns = ([100, 100], [0, 1], [50, 50], [10, 40], [25.0, 25.0], [5, 30], [50, 60])
+    choices = Choices(*(np.array(column) for column in columns))
+    rows = []
+    for run in runs:
+        found = selection_of_run(choices, np.array([0.6, 0.9]), SUB_GOALS, 2)
+        arrays |= {f"choices/{run.path}/{key}": counts for key, counts in over_training(choices, 2).items()}
+        about = {"path": run.path, "seed": run.seed, "layout_seed": 200, "ensemble": run.config.get("ensemble")}
+        rows.append({**about, **found})
+    empty = {"iqm": None, "n": 0}
+    correlations = {key: {"within": empty, "all": empty} for key in ("preference", "late_preference", "share")}
+    return {"name": name, "runs": rows, "rank_correlation": correlations}
+
+
+def answer(*runs):
+    """What the summary says of the option agent."""
+    material = material_of(*runs)
+    return summary_section(material)["paragraphs"][1]
+
+
+@pytest.mark.parametrize("reward", [20.0, -3.0])
+def test_figure_6_shows_rewards_of_any_size(reward):
+    """Spec F5: limits that fit the rewards; no share of successes drawn or told of on an axis of other rewards."""
+    material = material_of(made(reward=reward))
+    section = curves_section(material)
+    axes = material.figures["reward"].axes[0]
+    low, high = axes.get_ylim()
+    assert low < reward < high
+    assert [line.get_label() for line in axes.get_lines()] == ["options (learned members)"]
+    caption = next(block["caption"] for block in section["blocks"] if block.get("id") == "figure-reward")
+    assert "random play" not in caption
+
+
+def test_figure_6_of_rewards_that_are_shares_is_the_same_for_all_tasks():
+    """Spec F5: limits a little beyond 0 and 1, and what random play comes to."""
+    material = material_of(made())
+    section = curves_section(material)
+    axes = material.figures["reward"].axes[0]
+    assert axes.get_ylim() == (-0.02, 1.04)
+    assert axes.get_lines()[1].get_ydata()[0] == 0.25
+    caption = next(block["caption"] for block in section["blocks"] if block.get("id") == "figure-reward")
+    assert caption.endswith("Dotted: mean over layouts of uniformly random play.")
+
+
+def test_the_summary_leaves_out_a_shortest_path_that_is_not_known():
+    """Spec F5: no dash in the sentence."""
+    assert "took 20 steps, 2.0 times the shortest path (1 run: layout seed 200" in answer(made())
+    assert "took 20 steps (1 run: layout seed 200" in answer(made(shortest=None))
+
+
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [
+        ((120, 100), "last 100 training episodes,"),
+        ((40,), "last 40 training episodes,"),
+        ((1,), "last 1 training episode,"),
+        ((0, 40, 120), "last 40 to 100 training episodes,"),
+    ],
+)
+def test_the_summary_says_of_how_many_episodes_it_speaks(counts, said):
+    """Spec F5: fewer than the window where a run had fewer; runs without an episode have no share in it."""
+    budget = {"steps": 3_000}
+    assert said in answer(*(made(seed, episodes=count, **budget) for seed, count in enumerate(counts)))
+
+
+def two(chooser="ppo", **more):
+    """Two seeds with each of two ensembles."""
+    return [made(seed, chooser=chooser, ensemble=name, **more) for name in ("dbat", "none") for seed in (0, 1)]
+
+
+def answers(*runs):
+    return summary_section(material_of(*runs))["paragraphs"][1:]
+
+
+def test_each_variant_of_the_option_agent_has_its_own_answer_and_control():
+    """Spec F5: with its name, beside random choice among its own options; where that was not run it is said."""
+    dbat, none = answers(*two(), *two("random", reward=0.0, length=500))
+    assert dbat.startswith("The agent 'options (learned members), ensemble=dbat' reached the goal in 100 %")
+    assert none.startswith("The agent 'options (learned members), ensemble=none' reached the goal in 100 %")
+    for text in (dbat, none):
+        assert "Uniformly random choice among the same options: 0 %, 500 steps." in text
+    for text in answers(*two()):
+        assert text.endswith("No random choice among the same options was run.")
+
+
+def test_a_control_is_never_that_of_another_variant():
+    """Spec F5: its name has no settings where it is the only one, or has those that few of its runs have."""
+    dbat, none = answers(*two(), *two("random", reward=0.0)[2:])
+    assert dbat.endswith("No random choice among the same options was run.")
+    assert "Uniformly random choice among options of its ensemble: 0 %" in none
+    most = [*two()[:2], made(ensemble="none")]  # 'dbat' goes unsaid here, 'none' there
+    controls = [made(chooser="random", ensemble="dbat", reward=0.0), *two("random")[2:]]
+    usual, other = answers(*most, *controls)
+    assert usual.startswith("The agent 'options (learned members)' reached")
+    assert "Uniformly random choice among options of its ensemble: 0 %" in usual
+    assert "Uniformly random choice among options of its ensemble: 100 %" in other
+
+
+def test_of_one_variant_nothing_is_said_of_variants():
+    """Spec F7: the page of one option agent and its control, whatever their names, speaks of no variant."""
+    material = material_of(made(), made(chooser="random", reward=0.0))
+    (text,) = summary_section(material)["paragraphs"][1:]
+    assert text.startswith("The option agent reached the goal")
+    assert "Uniformly random choice among the same options: 0 %" in text
+    said = str([terminations_section(material), choices_section(material)])
+    assert "variant" not in said
+    drawn, _ = paper_figures(material)
+    assert "variant" not in str([one.caption for one in drawn])
+    assert [len(answers(made())), answers(made())[0].count("andom choice")] == [1, 0]
+
+
+def test_sections_that_show_one_variant_say_which():
+    """Spec F6: where options stop, preferences, and Figures 7 and 8; its control is its own or said to be missing."""
+    shown = "Shown is options (learned members), ensemble=dbat, one of 2 variants of the option agent."
+    material = material_of(*two(), *two("random")[2:])
+    assert shown in terminations_section(material)["paragraphs"]
+    choices = choices_section(material)
+    assert choices["paragraphs"][1].startswith(shown)
+    assert choices["missing"] == [
+        "No random choice among the options of options (learned members), ensemble=dbat was run."
+    ]
+    captions = {one.name: one.caption for one in paper_figures(material)[0]}
+    assert captions["figure7"].endswith(shown)
+    assert captions["preference"].endswith(shown)
+    assert choices_section(material_of(*two(), *two("random")))["missing"] == []
+
+
+def test_a_member_s_options_are_those_of_every_variant_with_its_ensemble():
+    """Spec F6: the browser of states names the variant, and shows none of another ensemble."""
+    found = _options(material_of(*two()), "none", SUB_GOALS[0], 1)
+    assert [one["name"] for one in found] == [f"layout 200, run seed {seed}, ensemble=none" for seed in (0, 1)]
+    assert [one["name"] for one in _options(material_of(made()), None, SUB_GOALS[0], 1)] == ["layout 200, run seed 0"]
+
+
+def test_no_two_agents_have_the_same_line():
+    """Spec F5: Figure 6 of many variants, none of which has a colour of its own."""
+    variants = [made(ensemble=name, chooser=who) for who in ("ppo", "random") for name in "abcde"]
+    material = material_of(*variants)
+    curves_section(material)
+    lines = material.figures["reward"].axes[0].get_lines()[: len(variants)]
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(variants)
