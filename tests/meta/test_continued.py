@@ -17,11 +17,13 @@ from hypogoal.learners.baselines.agents import make_agent
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import hyperparameters
 from hypogoal.meta.networks import LightMetaNetwork
+from hypogoal.meta.playing import frames_kept
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.networks import LightQNetwork
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
+from hypogoal.stages.train_meta import TrainMetaConfig
 
 GOALS = 5
 QUICK: dict[str, Any] = {"environments": 2, "warm_up": 20, "update_interval": 4, "option_batch": 8, "replay": 200}
@@ -150,3 +152,11 @@ def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:
     chosen = replace(hyperparameters("ppo", "paper"), rollout=3)
     with pytest.raises(UserError, match="fewer than there are environments: environments=4"):
         make_agent(env, chosen, 0)
+
+
+def test_an_engine_remembers_what_the_meta_policy_looks_back_at() -> None:
+    """Spec E2: states where all decisions of an update began, each of which may have taken an option's whole time."""
+    config = TrainMetaConfig(replay=100, environments=4, decisions=64, option_timeout=200)
+    assert frames_kept(config, GOALS) >= 64 * 200
+    config = TrainMetaConfig(replay=100_000, environments=4, decisions=64)
+    assert frames_kept(config, GOALS) == LightLearner.reach(config, GOALS)
