@@ -51,6 +51,20 @@ UNLABELLED_OTHER_ROOMS = (18, 12)
 SEEN_NOWHERE, SEEN_UNLABELLED, SEEN_LABELLED = range(3)
 
 
+# What lets options learn on a laptop, whether by themselves or below a meta-policy.
+LEARNING: Mapping[str, Any] = {
+    "option_timeout": MAX_STEPS,
+    "experience": "own",
+    "option_gamma": 0.99,
+    "option_batch": 32,
+    "n_step": 10,
+    "exploration": "persistent",
+    "epsilon_steps": 10_000,
+    "epsilon_final": 0.01,
+    "random_episodes": 0,
+}
+
+
 @dataclass(frozen=True)
 class MontezumaConfig:
     """What ``hypogoal collect montezuma`` can be told."""
@@ -223,33 +237,15 @@ class MontezumaDomain:
                 "class_weight_positive": 0.2,
             },
             "train-options": {
-                "option_timeout": MAX_STEPS,
+                **LEARNING,
                 "max_episode_steps": MAX_STEPS,
                 "restart_options": True,
                 "mask_reached": False,
-                "experience": "own",
                 "chooser": "even",
                 "steps": 40_000,
                 "steps_for": "each",
-                "option_gamma": 0.99,
-                "option_batch": 32,
-                "n_step": 10,
-                "exploration": "persistent",
-                "epsilon_steps": 10_000,
-                "epsilon_final": 0.01,
-                "random_episodes": 0,
             },
-            "train-meta": {  # of options, what makes them those of train-options
-                "option_timeout": MAX_STEPS,
-                "experience": "own",
-                "option_gamma": 0.99,
-                "option_batch": 32,
-                "n_step": 10,
-                "exploration": "persistent",
-                "epsilon_steps": 10_000,
-                "epsilon_final": 0.01,
-                "random_episodes": 0,
-            },
+            "train-meta": LEARNING,
         }
     )
 
