@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States
+from hypogoal.dataset import Collected, States, leave_out
 from hypogoal.domains.doorkey_engine import DoorKeyEngine, SingleDoorKey, draw
 from hypogoal.domains.doorkey_env import (
     DOOR_LABELS,
@@ -94,7 +94,8 @@ def collect(config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
 
     The scripted expert is an exhaustive sweep: every position and direction at every stage of the task (which
     keys are held; door locked, open, closed again) that can be reached without dropping a key, each image
-    once, found by breadth-first search. In the regime ``shuffled`` as many states as the layout has as it
+    once, found by breadth-first search. Held-out states that look like one of those for learning are left out: with
+    its keys picked up a layout can look like another. In the regime ``shuffled`` as many states as the layout has as it
     lies are kept, at random.
 
     Args:
@@ -122,6 +123,7 @@ def collect(config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         rng = rng_for(seed, "doorkey", "shuffled-states")
         keep = np.sort(rng.choice(total, min(amount, total), replace=False))
     labelled, unlabelled, test = _states_of(swept[0], keep), _states_of(swept[1]), _states_of(swept[2])
+    test = leave_out(test, labelled.observations, unlabelled.observations)
     for index, sub_goal in enumerate(SUB_GOALS):
         if len(np.unique(labelled.labels[:, index])) < 2:
             raise UserError(

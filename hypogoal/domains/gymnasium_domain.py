@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import blake2b
 from math import prod
 from typing import Any
 
@@ -18,7 +17,7 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States
+from hypogoal.dataset import Collected, States, digest
 from hypogoal.domains.gymnasium_engine import (
     MEMORY,
     RESET,
@@ -128,9 +127,10 @@ class GymnasiumDomain:
         seen: set[bytes] = set()
         sets = []
         for kind, seeds in enumerate(kinds):
-            own = [self._play(env, config, layout, seed, seen if kind == 2 else set(), progress) for layout in seeds]
-            sets.append(_joined(own, self.observation_shape, len(self.sub_goals)))
-            seen.update(map(_digest, sets[-1].observations))
+            known = seen if kind == 2 else set()
+            rows = [row for layout in seeds for row in self._play(env, config, layout, seed, known, progress)]
+            sets.append(_states(rows, self.observation_shape, len(self.sub_goals)))
+            seen.update(map(digest, sets[-1].observations))
         env.close()
         labelled, unlabelled, heldout = sets
         self._require_classes(labelled, unlabelled, heldout, config)
@@ -138,7 +138,7 @@ class GymnasiumDomain:
 
     def _play(
         self, env: gymnasium.Env, config: GymnasiumConfig, layout: int, seed: int, known: set[bytes], progress: Any
-    ) -> States:
+    ) -> list[_Row]:
         """The distinct states of one layout that are not ``known``: an even sample of each combination of sub-goals."""
         rng, known = rng_for(seed, "play", layout), set(known)
         groups: dict[bytes, _Sample] = {}
@@ -146,9 +146,9 @@ class GymnasiumDomain:
 
         def look(observation: Any) -> None:
             image = as_image(observation, self.observation_shape)
-            digest = _digest(image)
-            if digest not in known:
-                known.add(digest)
+            picture = digest(image)
+            if picture not in known:
+                known.add(picture)
                 labels = self.label(env)
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states, labels))
                 group.offer((image, layout, episode, step), rng)
@@ -171,7 +171,7 @@ class GymnasiumDomain:
                 with RESET:
                     observation, _info = env.reset(seed=layout)
                 episode, step = episode + 1, 0
-        return _shared_out(list(groups.values()), config.states, self.observation_shape, len(self.sub_goals))
+        return _shared_out(list(groups.values()), config.states, rng)
 
     def _require_classes(self, labelled: States, unlabelled: States, heldout: States, config: GymnasiumConfig) -> None:
         for states, what in ((unlabelled, "unlabelled"), (heldout, "held-out")):
@@ -191,14 +191,18 @@ class GymnasiumDomain:
                 )
 
 
+_Met = tuple[NDArray[np.uint8], int, int, int]  # a state's picture, layout seed, episode, step
+_Row = tuple[_Met, NDArray[np.bool_]]  # with its labels
+
+
 class _Sample:
     """So many of the states offered, each as likely as another; all of one combination of sub-goals."""
 
     def __init__(self, size: int, labels: NDArray[np.bool_]):
         self.size, self.labels, self.offered = size, labels, 0
-        self.kept: list[tuple[NDArray[np.uint8], int, int, int]] = []
+        self.kept: list[_Met] = []
 
-    def offer(self, state: tuple[NDArray[np.uint8], int, int, int], rng: np.random.Generator) -> None:
+    def offer(self, state: _Met, rng: np.random.Generator) -> None:
         """One more state, each once."""
         self.offered += 1
         if len(self.kept) < self.size:
@@ -209,27 +213,20 @@ class _Sample:
                 self.kept[place] = state
 
 
-def _shared_out(groups: list[_Sample], size: int, shape: tuple[int, ...], sub_goals: int) -> States:
+def _shared_out(groups: list[_Sample], size: int, rng: np.random.Generator) -> list[_Row]:
     """``size`` states of all groups, as evenly as they have them, in the order in which they were met."""
     left, rows = size, []
     for number, group in enumerate(sorted(groups, key=lambda group: len(group.kept))):
         take = min(len(group.kept), left // (len(groups) - number))
-        rows += [(state, group.labels) for state in group.kept[:take]]
+        # Not the first places: they hold what was met first, or, once a sample is full, nothing from just after that.
+        rows += [(group.kept[place], group.labels) for place in rng.permutation(len(group.kept))[:take]]
         left -= take
-    rows.sort(key=lambda row: row[0][1:])
+    return sorted(rows, key=lambda row: row[0][1:])
+
+
+def _states(rows: list[_Row], shape: tuple[int, ...], sub_goals: int) -> States:
     images = np.stack([row[0][0] for row in rows]) if rows else np.empty((0, *shape), np.uint8)
     labels = np.array([row[1] for row in rows], dtype=np.bool_).reshape(-1, sub_goals)
     whence = np.array([row[0][1:] for row in rows], dtype=np.int64).reshape(-1, 3)
     names = ("layout_seed", "episode", "step")
     return States(images, labels, {name: whence[:, column] for column, name in enumerate(names)})
-
-
-def _joined(sets: list[States], shape: tuple[int, ...], sub_goals: int) -> States:
-    sets = [_shared_out([], 0, shape, sub_goals), *sets]
-    origins = {name: np.concatenate([one.origins[name] for one in sets]) for name in sets[0].origins}
-    images, labels = (np.concatenate([getattr(one, name) for one in sets]) for name in ("observations", "labels"))
-    return States(images, labels, origins)
-
-
-def _digest(image: NDArray[np.uint8]) -> bytes:
-    return blake2b(image.tobytes(), digest_size=16).digest()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States, require_names
+from hypogoal.dataset import Collected, States, digest, leave_out, require_names
 
 FEW = 10  # states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
@@ -60,25 +60,62 @@ def collected_of(
     if parts.heldout_observations is not None and parts.heldout_labels is not None:
         heldout = as_images(parts.heldout_observations, "the held-out observations", shape)
         known = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
+        test = _unknown(heldout, known, (images, unlabelled), warned)
     else:
-        chosen = held_out(labels, share, seed)
-        heldout, known = images[chosen], labels[chosen]
+        _, first, picture = np.unique([digest(image) for image in images], return_index=True, return_inverse=True)
+        ordered = np.sort(first)  # each picture once, in the order given
+        chosen = np.zeros(len(images), np.bool_)
+        chosen[ordered[held_out(labels[ordered], share, seed)]] = True
+        chosen = chosen[first][picture]  # and all states that look like one held out
+        test = States(images[chosen], labels[chosen])
         images, labels = images[~chosen], labels[~chosen]
+        unlabelled = _unseen(unlabelled, test.observations, warned)
         warned.append(
             f"no held-out states were given: {int(chosen.sum())} of the labelled ones are held out, which says nothing "
             "of other contexts"
         )
     require_classes(labels, goals, warned)
-    for goal, told in zip(goals, known.T, strict=True):
+    for goal, told in zip(goals, test.labels.T, strict=True):
         if len(np.unique(told)) < 2:
             warned.append(f"{goal} has one class only in the held-out states, so it cannot be judged by them")
-    rows = [np.arange(len(part), dtype=np.int64) for part in (images, unlabelled, heldout)]
-    sets = (
-        States(images, labels, {"row": rows[0]}),
-        States(unlabelled, np.zeros((len(unlabelled), len(goals)), np.bool_), {"row": rows[1]}),
-        States(heldout, known, {"row": rows[2]}),
-    )
-    return Collected(tuple(shape), goals, *sets), warned
+    unknown = np.zeros((len(unlabelled), len(goals)), np.bool_)
+    sets = [States(images, labels), States(unlabelled, unknown), test]
+    numbered = [replace(one, origins={"row": np.arange(len(one.labels), dtype=np.int64)}) for one in sets]
+    return Collected(tuple(shape), goals, *numbered), warned
+
+
+def _unknown(
+    heldout: NDArray[np.uint8], labels: NDArray[np.bool_], known: Sequence[NDArray[np.uint8]], warned: list[str]
+) -> States:
+    """The held-out states that look like none that members learn from.
+
+    Raises:
+        UserError: there are none.
+    """
+    states = leave_out(States(heldout, labels), *known)
+    twice = len(heldout) - len(states.labels)
+    if twice:
+        warned.append(f"{twice} of {len(heldout)} held-out states look like one to learn from: they are left out")
+    if not len(states.labels):
+        raise UserError(
+            "every held-out state looks like one to learn from", None, "Hold out others, of other contexts."
+        )
+    return states
+
+
+def _unseen(unlabelled: NDArray[np.uint8], heldout: NDArray[np.uint8], warned: list[str]) -> NDArray[np.uint8]:
+    """The unlabelled states that look like none held out.
+
+    Raises:
+        UserError: there are none.
+    """
+    kept = leave_out(States(unlabelled, np.zeros((len(unlabelled), 0), np.bool_)), heldout).observations
+    if len(kept) < len(unlabelled):
+        twice = f"{len(unlabelled) - len(kept)} of {len(unlabelled)} unlabelled states"
+        warned.append(f"{twice} look like one held out: they are left out")
+    if not len(kept):
+        raise UserError("every unlabelled state looks like one held out", None, "Give some of other contexts.")
+    return kept
 
 
 def as_images(values: NDArray[Any], what: str, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:

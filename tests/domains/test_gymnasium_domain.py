@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import corridor_env
+import gymnasium
 import numpy as np
 import pytest
 from corridor_env import DOMAIN, LENGTH, SUB_GOALS, CorridorEnv
@@ -58,6 +60,39 @@ def test_few_states_are_shared_out_among_combinations_of_sub_goals() -> None:
     """Spec B3: of three states one is at each end, though most of what is met is in between."""
     states = collected(config=GymnasiumConfig(heldout_seeds=(4,), steps=300, states=3)).labelled
     assert sorted(map(tuple, states.labels.tolist())) == [(False, False), (False, True), (True, False)]
+
+
+class Counting(gymnasium.Env[np.ndarray, int]):
+    """Each picture is another: the number of the step."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.count = 10_000 * (seed or 0)
+        return self._picture(), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.count += 1
+        return self._picture(), 0.0, False, False, {}
+
+    def _picture(self) -> np.ndarray:
+        picture = np.zeros((8, 8, 3), np.uint8)
+        picture[0, 0] = self.count >> 16, self.count >> 8 & 255, self.count & 255
+        return picture
+
+
+@pytest.mark.parametrize(("states", "steps"), [(500, 1000), (400, 3000)])
+def test_the_sample_is_of_all_that_was_played(states: int, steps: int) -> None:
+    """Spec B7: each sixth of the play gives a sixth of the states, where there are fewer or more than are kept."""
+    goals = {"odd": lambda env: env.unwrapped.count % 2 == 1}
+    config = GymnasiumConfig(heldout_seeds=(4,), steps=steps, states=states, max_episode_steps=steps)
+    found = collected(GymnasiumDomain(Counting, goals), config).labelled
+    assert len(found.labels) == states and found.labels.sum() == states // 2
+    sixths = np.histogram(found.origins["step"], bins=6, range=(0, steps))[0]
+    # Drawn without replacement: at most binomial's spread, of which this is more than four times.
+    assert np.abs(sixths - states / 6).max() < 4 * np.sqrt(states * 5 / 36), sixths
 
 
 def test_a_policy_collects() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,33 @@ def test_a_share_is_held_out_of_many_small_groups_too() -> None:
         held_out(labels[:64], 0.2, seed=0)
 
 
+def test_held_out_states_that_are_known_are_left_out() -> None:
+    """Spec B3: members are not judged by what they learned; how many were left out is said."""
+    (images, _), (others, _), (held, known) = pictures(40), pictures(20, 1), pictures(16, 2)
+    mixed = arrays(heldout_observations=np.concatenate([images[:3], held, others[:4]]))
+    parts = Parts(**mixed | {"heldout_labels": np.concatenate([[0, 1, 0], known, [0, 1, 0, 1]])})
+    collected, warned = collected_of(parts, ())
+    assert warned == ["7 of 23 held-out states look like one to learn from: they are left out"]
+    np.testing.assert_array_equal(collected.heldout.observations, held)
+    np.testing.assert_array_equal(collected.heldout.labels[:, 0], known)
+    with pytest.raises(UserError, match="every held-out state looks like one to learn from"):
+        collected_of(Parts(**mixed | {"heldout_observations": images, "heldout_labels": arrays()["labels"]}), ())
+
+
+def test_a_share_that_is_held_out_is_of_pictures() -> None:
+    """Spec B3: what looks alike is held out together, from the unlabelled states too."""
+    (images, labels), (others, _) = pictures(20), pictures(10, 1)
+    parts = Parts(np.tile(images, (3, 1, 1, 1)), np.tile(labels, 3), np.concatenate([others, images]))
+    collected, warned = collected_of(parts, (), share=0.2)
+    sets = [collected.labelled, collected.unlabelled, collected.heldout]
+    known = [{image.tobytes() for image in one.observations} for one in sets]
+    assert [len(one.labels) for one in sets] == [48, 26, 12] and [len(one) for one in known] == [16, 26, 4]
+    assert not (known[0] | known[1]) & known[2]
+    assert "4 of 30 unlabelled states look like one held out: they are left out" in warned
+    with pytest.raises(UserError, match="every unlabelled state looks like one held out"):
+        collected_of(replace(parts, unlabelled=collected.heldout.observations), (), share=0.2)
+
+
 def test_unbalanced_classes_are_warned_of() -> None:
     """Spec B6."""
     labels = np.arange(40) < 3
@@ -162,11 +190,16 @@ def save_images(folder: Path, *, held: bool = True, grey: bool = False) -> Path:
     images, labels = pictures(24)
     for number, (image, label) in enumerate(zip(images, labels, strict=True)):
         names = ["positive" if label else "negative", *(["unlabelled"] if number % 3 == 0 else [])]
-        names += [f"heldout/{names[0]}"] if held and number >= 18 else []
-        for name in names:
-            (folder / name).mkdir(parents=True, exist_ok=True)
-            Image.fromarray(image[..., 0] if grey else image).save(folder / name / f"{number:02d}.png")
+        _save(image, [folder / name / f"{number:02d}.png" for name in names], grey)
+    for number, (image, label) in enumerate(zip(*pictures(6 * held, 2), strict=True)):
+        _save(image, [folder / "heldout" / ("positive" if label else "negative") / f"{number:02d}.png"], grey)
     return folder
+
+
+def _save(image: np.ndarray, paths: list[Path], grey: bool) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image[..., 0] if grey else image).save(path)
 
 
 def test_folders_of_images_become_states(tmp_path: Path) -> None:
