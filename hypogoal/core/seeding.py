@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,3 +34,19 @@ def torch_generator(seed: int, *names: str | int) -> torch.Generator:
     generator = torch.Generator()
     generator.manual_seed(seed_for(seed, *names))
     return generator
+
+
+def global_state(device: torch.device) -> list[torch.Tensor]:
+    """Where torch's global generators are, the CPU's and a CUDA ``device``'s, for what cannot be passed another."""
+    import torch
+
+    return [torch.get_rng_state(), *([torch.cuda.get_rng_state(device)] if device.type == "cuda" else [])]
+
+
+def restore_global(state: Sequence[torch.Tensor], device: torch.device) -> None:
+    """Undo what was drawn since :func:`global_state`."""
+    import torch
+
+    torch.set_rng_state(state[0])
+    if device.type == "cuda":
+        torch.cuda.set_rng_state(state[1], device)

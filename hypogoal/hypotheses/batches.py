@@ -71,7 +71,7 @@ class TrainingStates:
         networks: Sequence[nn.Sequential],
         *groups: NDArray[np.int64],
         counted: Sequence[bool] = (),
-        changes: np.random.Generator | None = None,
+        changes: Sequence[np.random.Generator] = (),
     ) -> list[list[Tensor]]:
         """Each network's logits of groups of states.
 
@@ -82,7 +82,8 @@ class TrainingStates:
             groups: states (B,) each.
             counted: for each group whether BatchNorm's running statistics take it in, in training mode; all where
                 empty.
-            changes: what the states are changed at random with, see ``grey`` and ``jitter``; None, they are not.
+            changes: for each group what its states are changed at random with, see ``grey`` and ``jitter``; where empty
+                they are not. What one group draws does not depend on the others.
 
         Returns:
             For each network each group's logits (B, 2).
@@ -91,7 +92,10 @@ class TrainingStates:
         if self._tables is not None:
             batch = patches.take(self._tables, *groups)
             return [list(patches.forward(network, batch, counted).split(sizes)) for network in networks]
-        inputs = self._inputs(np.concatenate(groups), changes)
+        if changes and (self._grey or self._jitter):
+            inputs = torch.cat([self._inputs(*group) for group in zip(groups, changes, strict=True)])
+        else:
+            inputs = self._inputs(np.concatenate(groups), None)
         return [list(_forward(network, inputs, sizes, counted).split(sizes)) for network in networks]
 
     def count_in(

@@ -76,7 +76,10 @@ def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
             if not plain or getattr(layer, "groups", 1) != 1 or getattr(layer, "ceil_mode", False):
                 return None
             windows.append((kernel, stride))
-        elif not isinstance(layer, (nn.BatchNorm2d, nn.ReLU, nn.Flatten, nn.Linear)):
+        elif isinstance(layer, nn.BatchNorm2d):
+            if not (layer.affine and layer.track_running_stats and layer.momentum):
+                return None
+        elif not isinstance(layer, (nn.ReLU, nn.Flatten, nn.Linear)):
             return None
     return windows or None
 
@@ -274,7 +277,8 @@ def _normed(layer: nn.BatchNorm2d, rows: Tensor, shares: Tensor, places: int, co
         assert running_mean is not None
         assert running_var is not None
         with torch.no_grad():
-            momentum = layer.momentum or 0.0
+            momentum = layer.momentum
+            assert momentum  # see ``windows_of``
             running_mean.lerp_(mean[0], momentum)
             running_var.lerp_(variance[0] * (places / max(places - 1, 1)), momentum)
             if layer.num_batches_tracked is not None:

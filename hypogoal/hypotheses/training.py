@@ -14,25 +14,16 @@ from torch.nn import functional
 
 from hypogoal.core.checkpoints import Checkpoints, State, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.seeding import rng_for, seed_for, torch_generator
+from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.localisers import (
-    LearnedLocaliser,
-    Localiser,
-    RamLocaliser,
-    fit_localiser,
-    montezuma_only,
-    pixels_of,
-)
-from hypogoal.hypotheses.views import ACTIONS, POSITION, AgentView, FullView, needed, positions_of
+from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 
 __all__ = ["EnsembleConfig", "fit", "total_steps"]
 
 OnStep = Callable[[int, dict[str, float]], None]
-Origins = Mapping[str, NDArray[np.int64]]
 QUANTILE, QUANTILE_LEVEL = "unlabelled-q95", 0.95
 REPORT_EVERY = 10  # steps between reports, and between looks for NaN: a look makes a GPU wait
 
@@ -88,7 +79,7 @@ def fit(
             raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
-    view = _view(
+    view = view_of(
         observations, unlabelled, config, seed_for(seed, "localiser"), origins, unlabelled_origins, fitted=not saved
     )
     generator = torch_generator(seed, "weights")
@@ -116,7 +107,8 @@ def fit(
         return {"round": number, "part": part, "ensemble": ensemble.state_dict(), **told}
 
     first = saved.get("round", 0)
-    with checkpoints:
+    drawing = [states.device] if states.device.type == "cuda" else []
+    with checkpoints, torch.random.fork_rng(devices=drawing):  # Dropout and the like draw there
         for number, members in enumerate(rounds[first:], start=first):
             _fit_members(
                 networks,
@@ -145,54 +137,6 @@ def quantile_thresholds(probabilities: NDArray[np.float32]) -> NDArray[np.float3
     """
     quantiles = np.quantile(probabilities, QUANTILE_LEVEL, axis=0, method="higher").astype(np.float32)
     return np.minimum(quantiles, np.nextafter(np.float32(1), np.float32(0)))
-
-
-def _view(
-    observations: NDArray[np.uint8],
-    unlabelled: NDArray[np.uint8],
-    config: EnsembleConfig,
-    seed: int,
-    origins: Origins | None,
-    unlabelled_origins: Origins | None,
-    *,
-    fitted: bool,
-) -> FullView | AgentView:
-    """What the members are to see; a localiser that learns is trained here, or where not ``fitted`` to be loaded."""
-    if config.view == "full":
-        if config.jitter:
-            raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
-        return FullView(observations.shape[1:])
-    montezuma_only(observations.shape[1:], "view=agent-crop")
-    needed(origins, POSITION, "view=agent-crop")
-    if len(unlabelled):
-        needed(unlabelled_origins, POSITION if config.localiser == "ram" else ACTIONS, f"localiser={config.localiser}")
-    if config.localiser == "ram":
-        localiser: Localiser = RamLocaliser(observations.shape[1:])
-    elif not fitted:
-        localiser = LearnedLocaliser(observations.shape[1:])
-    else:
-        localiser = _learned(observations, unlabelled, seed, origins or {}, unlabelled_origins or {})
-    return AgentView(observations.shape[1:], config.crop_height, config.crop_width, localiser)
-
-
-def _learned(
-    observations: NDArray[np.uint8],
-    unlabelled: NDArray[np.uint8],
-    seed: int,
-    origins: Origins,
-    unlabelled_origins: Origins,
-) -> LearnedLocaliser:
-    """A localiser from the labelled states in which the agent lives (dying it is elsewhere) and from unlabelled ones.
-
-    Of unlabelled states it sees the agent's actions, which the agent knows, and not its positions.
-    """
-    positions = positions_of(origins)
-    assert positions is not None
-    alive = np.flatnonzero(origins.get("dying", np.zeros(len(positions))) == 0)
-    none = np.zeros(0, dtype=np.int64)
-    actions = np.stack([unlabelled_origins.get(name, none) for name in ACTIONS], axis=1)
-    known = np.flatnonzero((actions >= 0).all(axis=1))
-    return fit_localiser(observations[alive], pixels_of(positions[alive]), unlabelled[known], actions[known], seed)
 
 
 def _ladders(config: EnsembleConfig, origins: Origins | None) -> NDArray[np.int64] | None:
@@ -239,18 +183,22 @@ def _fit_members(
         fused=True,
     )
     watch = _Watch(members, len(frozen) if diverse else 0, config, steps_before, on_step)
-    changes = rng_for(seed, "greys")
+    changes = [rng_for(seed, "changes", of) for of in ("labelled", "unlabelled")]  # methods differ in the second's use
+    torch.manual_seed(seed_for(seed, "layers"))
 
     def state() -> State:
         return {
             "optimiser": optimiser_snapshot(optimiser),
-            "changes": changes.bit_generator.state,
+            "changes": [rng.bit_generator.state for rng in changes],
+            "layers": global_state(states.device),
             "watch": watch.snapshot(),
         }
 
     if saved:
         restore_optimiser(optimiser, saved["optimiser"])
-        changes.bit_generator.state = saved["changes"]
+        for rng, kept in zip(changes, saved["changes"], strict=True):
+            rng.bit_generator.state = kept
+        restore_global(saved["layers"], states.device)
         watch.restore(saved["watch"])
     for labelled, unlabelled in islice(states.batches(config, seed), watch.done, None):
         if diverse:
@@ -258,10 +206,10 @@ def _fit_members(
             rows = torch.from_numpy(unlabelled - states.n_labelled).to(states.device)
             pair_losses = _pair_losses(objective, [other for _, other in both], [other[rows] for other in frozen])
         else:
-            both = states.forward(trained, labelled, changes=changes)
+            both = states.forward(trained, labelled, changes=changes[:1])
             pair_losses = torch.zeros(0, device=states.device)
             if config.unlabelled_bn and len(unlabelled):
-                states.count_in(trained, unlabelled, changes)
+                states.count_in(trained, unlabelled, changes[1])
         targets = states.targets(labelled)
         label_losses = torch.stack([functional.cross_entropy(own[0], targets, class_weights) for own in both])
         loss = label_losses.sum() + config.diversity_weight * pair_losses.sum()

@@ -9,8 +9,17 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.localisers import Localiser
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.localisers import (
+    LearnedLocaliser,
+    Localiser,
+    RamLocaliser,
+    fit_localiser,
+    montezuma_only,
+    pixels_of,
+)
 
+Origins = Mapping[str, NDArray[np.int64]]
 POSITION, ACTIONS = ("room", "x", "y"), ("action", "previous_action")  # names of origins
 CHUNK = 1024  # states at once: so many crops are gathered from whole images at a time
 
@@ -115,3 +124,51 @@ def needed(origins: Mapping[str, NDArray[np.int64]] | None, names: tuple[str, ..
         raise UserError(
             f"the data do not say {', '.join(missing)} of each state", why, "Collect data that do, or set it otherwise."
         )
+
+
+def view_of(
+    observations: NDArray[np.uint8],
+    unlabelled: NDArray[np.uint8],
+    config: EnsembleConfig,
+    seed: int,
+    origins: Origins | None,
+    unlabelled_origins: Origins | None,
+    *,
+    fitted: bool,
+) -> FullView | AgentView:
+    """What the members are to see; a localiser that learns is trained here, or where not ``fitted`` to be loaded."""
+    if config.view == "full":
+        if config.jitter:
+            raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
+        return FullView(observations.shape[1:])
+    montezuma_only(observations.shape[1:], "view=agent-crop")
+    needed(origins, POSITION, "view=agent-crop")
+    if len(unlabelled):
+        needed(unlabelled_origins, POSITION if config.localiser == "ram" else ACTIONS, f"localiser={config.localiser}")
+    if config.localiser == "ram":
+        localiser: Localiser = RamLocaliser(observations.shape[1:])
+    elif not fitted:
+        localiser = LearnedLocaliser(observations.shape[1:])
+    else:
+        localiser = _learned(observations, unlabelled, seed, origins or {}, unlabelled_origins or {})
+    return AgentView(observations.shape[1:], config.crop_height, config.crop_width, localiser)
+
+
+def _learned(
+    observations: NDArray[np.uint8],
+    unlabelled: NDArray[np.uint8],
+    seed: int,
+    origins: Origins,
+    unlabelled_origins: Origins,
+) -> LearnedLocaliser:
+    """A localiser from the labelled states in which the agent lives (dying it is elsewhere) and from unlabelled ones.
+
+    Of unlabelled states it sees the agent's actions, which the agent knows, and not its positions.
+    """
+    positions = positions_of(origins)
+    assert positions is not None
+    alive = np.flatnonzero(origins.get("dying", np.zeros(len(positions))) == 0)
+    none = np.zeros(0, dtype=np.int64)
+    actions = np.stack([unlabelled_origins.get(name, none) for name in ACTIONS], axis=1)
+    known = np.flatnonzero((actions >= 0).all(axis=1))
+    return fit_localiser(observations[alive], pixels_of(positions[alive]), unlabelled[known], actions[known], seed)

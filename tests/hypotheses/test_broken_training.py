@@ -11,12 +11,17 @@ import torch
 from test_views import CROP, montezuma_states
 
 from hypogoal.core.checkpoints import Checkpoints, State
-from hypogoal.hypotheses import training
+from hypogoal.hypotheses import views
 from hypogoal.hypotheses.localisers import fit_localiser
 from hypogoal.hypotheses.training import EnsembleConfig, fit
 from hypogoal.hypotheses.views import ACTIONS
 
 SHORT = dataclasses.replace(CROP, localiser="learned", steps=12, batch_size=16, diversity="dbat", diversity_weight=1e-2)
+
+
+def dropping(channels: int) -> tuple[list[torch.nn.Module], tuple[int, ...]]:
+    """A network with a layer that draws random numbers itself."""
+    return [torch.nn.Conv2d(channels, 4, 5, stride=4), torch.nn.ReLU(), torch.nn.Dropout()], (8,)
 
 
 class Broken(Exception):
@@ -44,12 +49,14 @@ class Breaking(Checkpoints):
         SHORT,
         dataclasses.replace(SHORT, schedule="sequential", augment="grey", threshold="unlabelled-q95"),
         dataclasses.replace(SHORT, localiser="ram", jitter=2),
+        dataclasses.replace(SHORT, view="full", network="test_broken_training:dropping"),
     ],
-    ids=["learned localiser", "sequential, grey, thresholds", "ram, jitter"],
+    ids=["learned localiser", "sequential, grey, thresholds", "ram, jitter", "dropout"],
 )
 def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G1: weights, BatchNorm, localiser and thresholds, reports; a finished one is not trained again."""
-    monkeypatch.setattr(training, "fit_localiser", partial(fit_localiser, steps=2))
+    monkeypatch.setenv("HYPOGOAL_TRUST", "test_broken_training:dropping")
+    monkeypatch.setattr(views, "fit_localiser", partial(fit_localiser, steps=2))
     observations, labels, origins = montezuma_states(60, seed=0)
     unlabelled, _, there = montezuma_states(40, seed=1)
     there |= {name: np.arange(40) % 18 for name in ACTIONS}

@@ -115,5 +115,8 @@ def test_only_what_repeats_is_tabled() -> None:
         nn.Conv2d(3, 3, 3, groups=3),
         nn.Conv2d(3, 3, (3, 1)),
         nn.Dropout(),
+        nn.BatchNorm2d(3, momentum=None),
+        nn.BatchNorm2d(3, affine=False),
+        nn.BatchNorm2d(3, track_running_stats=False),
     ):
-        assert patches.windows_of(nn.Sequential(layer)) is None
+        assert patches.windows_of(nn.Sequential(nn.Conv2d(3, 3, 3), layer)) is None

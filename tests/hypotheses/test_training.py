@@ -277,7 +277,7 @@ def test_all_of_a_state_is_mapped_alike() -> None:
     network = torch.nn.Sequential(torch.nn.Flatten())
     labels = np.arange(6) < 3
     states = TrainingStates(images, labels, images, network, torch.device("cpu"), grey=True)
-    mapped = states.forward([network], np.arange(6), changes=np.random.default_rng(1))[0][0].numpy()
+    mapped = states.forward([network], np.arange(6), changes=[np.random.default_rng(1)])[0][0].numpy()
     plain = states.forward([network], np.arange(6))[0][0].numpy()
     for shades, shown in zip(plain, mapped, strict=True):
         order = np.argsort(shades, kind="stable")
@@ -292,7 +292,7 @@ def test_windows_are_moved_at_random_within_their_margin() -> None:
     network = torch.nn.Sequential(torch.nn.Flatten())
     states = TrainingStates(images, np.arange(40) < 3, images, network, torch.device("cpu"), jitter=2)
     plain = states.forward([network], np.arange(40))[0][0].mul(255).round().view(40, 4, 5).numpy()
-    moved = states.forward([network], np.arange(40), changes=np.random.default_rng(0))[0][0]
+    moved = states.forward([network], np.arange(40), changes=[np.random.default_rng(0)])[0][0]
     moved = moved.mul(255).round().view(40, 4, 5).numpy()
     np.testing.assert_array_equal(plain, images[:, 2:6, 2:7, 0])
     corners = moved[:, 0, 0].astype(int)
@@ -310,6 +310,41 @@ def test_grey_maps_change_what_is_learned_from() -> None:
     plain = fit(observations, labels, unlabelled, dataclasses.replace(config, augment="none"), seed=0).state()
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not torch.equal(first["members.0.0.weight"], plain["members.0.0.weight"])
+
+
+def test_methods_see_the_same_labelled_states_changed_the_same_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decision 38: methods of one seed share what is random, whatever each does with unlabelled states."""
+    observations, labels, unlabelled = toy()
+    seen: list[list[torch.Tensor]] = []
+
+    def recorded(self: TrainingStates, states: np.ndarray, changes: np.random.Generator | None) -> torch.Tensor:
+        images = inputs(self, states, changes)
+        if states.max() < self.n_labelled and changes is not None:
+            seen[-1].append(images)
+        return images
+
+    inputs = TrainingStates._inputs
+    monkeypatch.setattr(TrainingStates, "_inputs", recorded)
+    for changes in ({}, {"diversity": "none"}, {"diversity": "none", "unlabelled_bn": False}):
+        seen.append([])
+        fit(observations, labels, unlabelled, dataclasses.replace(TOY, steps=3, augment="grey", **changes), seed=0)
+    assert [len(method) for method in seen] == [3, 3, 3]
+    assert all(torch.equal(one, other) for method in seen[1:] for one, other in zip(seen[0], method, strict=True))
+    assert not torch.equal(seen[0][0], seen[0][1])
+
+
+@pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
+def test_layers_that_draw_are_repeatable(schedule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5, G1: Dropout in a network of one's own: same seed, same bytes, whoever drew before."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "test_broken_training:dropping")
+    observations, labels, unlabelled = toy()
+    config = dataclasses.replace(TOY, steps=6, network="test_broken_training:dropping", schedule=schedule)
+    first = fit(observations, labels, unlabelled, config, seed=3).state()
+    torch.rand(7)
+    second = fit(observations, labels, unlabelled, config, seed=3).state()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    other = fit(observations, labels, unlabelled, config, seed=4).state()
+    assert not torch.equal(first["members.0.0.weight"], other["members.0.0.weight"])
 
 
 @pytest.mark.parametrize("balance", ["batch", "none"])

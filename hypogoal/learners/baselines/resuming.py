@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from hypogoal.core.checkpoints import optimiser_snapshot, restore_optimiser
+from hypogoal.core.seeding import global_state, restore_global
 from hypogoal.learners.baselines.engine_env import EngineEnv
 
 COUNTS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num", "_current_progress_remaining", "exploration_rate")
@@ -74,22 +74,19 @@ def _restore_replay(buffer: Any, snapshot: Mapping[str, Any]) -> None:
 def _generators(agent: BaseAlgorithm) -> dict[str, Any]:
     own = getattr(agent, "explore_rng", None)
     return {
-        "torch": torch.get_rng_state(),
+        "torch": global_state(agent.device),
         "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
         "python": random.getstate(),
         "actions": agent.action_space.np_random.bit_generator.state,
         "own": own.bit_generator.state if own is not None else None,
-        "cuda": torch.cuda.get_rng_state() if agent.device.type == "cuda" else None,
     }
 
 
 def _restore_generators(agent: BaseAlgorithm, snapshot: Mapping[str, Any]) -> None:
-    torch.set_rng_state(snapshot["torch"])
+    restore_global(snapshot["torch"], agent.device)
     np.random.set_state(snapshot["numpy"])  # noqa: NPY002
     version, numbers, gauss = snapshot["python"]
     random.setstate((version, tuple(numbers), gauss))
     agent.action_space.np_random.bit_generator.state = snapshot["actions"]
-    if snapshot.get("cuda") is not None:
-        torch.cuda.set_rng_state(snapshot["cuda"])
     if snapshot["own"] is not None:
         agent.explore_rng.bit_generator.state = snapshot["own"]  # type: ignore[attr-defined]
