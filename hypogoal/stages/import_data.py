@@ -12,9 +12,9 @@ from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_own
 from hypogoal.dataset import open_dataset, write_dataset
+from hypogoal.domains.base import IMPORTED
 from hypogoal.own_data import MAIN_FILE, collected_of, read_arrays, read_images, read_minari, write_arrays
 
-DOMAIN = "imported"  # of states whose domain is not said
 LABELS = "hypogoal.labels"  # entry points of label functions
 
 
@@ -26,7 +26,7 @@ def import_data(
     labels: Mapping[str, str] | None = None,
     key: str = "",
     share: float = 0.2,
-    domain: str = DOMAIN,
+    domain: str = IMPORTED,
     seed: int = 0,
     force: bool = False,
 ) -> dict[str, Any]:

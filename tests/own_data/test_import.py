@@ -58,6 +58,19 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     assert metrics["ensembles"][0]["sub_goals"][0]["balanced_accuracy"]["worst"] > 0.9
 
 
+def test_options_of_states_of_no_domain_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6, G2: what to do is said: which domain the states are of is told when they are imported."""
+    np.savez(tmp_path / "own.npz", **arrays())
+    data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
+    assert main(["import", str(tmp_path / "own.npz"), "--out", data, "-q"]) == 0
+    few = [word for pair in ("steps=2", "members=1") for word in ("--set", pair)]
+    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
+    capsys.readouterr()
+    assert main(["train-options", ensemble, "--out", str(tmp_path / "options"), "-q"]) == 2
+    told = capsys.readouterr().err
+    assert "which domain these imported states are of: imported. Import them again with --domain" in told
+
+
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
     """Spec B6: labels (N, G), a folder of .npy files, and the way back as .npz, names included."""
     labels = np.stack([np.arange(40) % 2, np.arange(40) % 3 == 0], axis=1)
