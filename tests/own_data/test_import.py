@@ -58,6 +58,26 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     assert metrics["ensembles"][0]["sub_goals"][0]["balanced_accuracy"]["worst"] > 0.9
 
 
+def test_images_too_small_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: when they are imported, not when they are trained on; the network that is named takes them."""
+    shrunk = {
+        name: values[:, ::2, ::2] for name, values in arrays().items() if name not in ("labels", "heldout_labels")
+    }
+    np.savez(tmp_path / "small.npz", **arrays(**shrunk))
+    data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
+    assert main(["import", str(tmp_path / "small.npz"), "--out", data, "-q"]) == 0
+    told = capsys.readouterr().err
+    assert "images too small for the network 'doorkey': observation shape (24, 24, 3). It takes 41x41 pixels" in told
+    few = [word for pair in ("steps=2", "members=1", "network=montezuma-crop") for word in ("--set", pair)]
+    assert "--set network=montezuma-crop" in told
+    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
+    assert main(["import", str(tmp_path / "small.npz"), "--out", str(tmp_path / "m.h5"), "--domain", "montezuma"]) == 0
+    assert "too small for the network 'montezuma'" in capsys.readouterr().err
+    np.savez(tmp_path / "own.npz", **arrays())
+    assert main(["import", str(tmp_path / "own.npz"), "--out", str(tmp_path / "large.h5")]) == 0
+    assert "too small" not in capsys.readouterr().err
+
+
 def test_options_of_states_of_no_domain_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec B6, G2: what to do is said: which domain the states are of is told when they are imported."""
     np.savez(tmp_path / "own.npz", **arrays())
