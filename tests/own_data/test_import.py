@@ -174,10 +174,14 @@ def test_unbalanced_classes_are_warned_of() -> None:
 
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unlabelled": None}, "no array 'unlabelled'"),
+    ({"unlabelled": None, "unlabeled": pictures(5)[0]}, "unknown array 'unlabeled': .* Did you mean 'unlabelled'"),
+    ({"held_out_labels": np.zeros(3)}, "unknown array 'held_out_labels': .* Did you mean 'heldout_labels'"),
+    ({"rewards": np.zeros(3)}, "unknown array 'rewards': .* Known are observations, labels, unlabelled"),
     ({"heldout_labels": None}, "held-out states need observations and labels"),
     ({"observations": pictures(40)[0] / 255}, r"are no bytes: float64.*255 \* x"),
     ({"observations": pictures(40)[0].astype(int) * 9}, "do not fit bytes"),
     ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"channels first.*transpose\(0, 2, 3, 1\)"),
+    ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"channels first: uint8 \(60, 12, 48, 48\)"),
     ({"observations": np.zeros((40, 9), np.uint8)}, "are no images"),
     ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "another shape than the labelled ones"),
     ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
@@ -201,6 +205,11 @@ def test_what_is_wrong_with_arrays_is_one_line(tmp_path: Path, changes: dict[str
     np.savez(tmp_path / "own.npz", **arrays(**changes))
     with pytest.raises(UserError, match=message):
         collected_of(read_arrays(tmp_path / "own.npz"), ())
+    if all(values.dtype != object for values in arrays(**changes).values()):  # which .npy would hold as a pickle
+        for name, values in arrays(**changes).items():
+            np.save(tmp_path / f"{name}.npy", values)
+        with pytest.raises(UserError, match=message):
+            collected_of(read_arrays(tmp_path), ())
 
 
 def test_damaged_arrays_are_one_line(tmp_path: Path) -> None:
