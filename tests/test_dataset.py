@@ -78,9 +78,12 @@ def test_missing_parts_and_other_files(tmp_path: Path) -> None:
         open_dataset(tmp_path / "text.h5")
 
 
-@pytest.mark.parametrize("first", ["import gymnasium, hypogoal", "import hypogoal, gymnasium; hypogoal.OptionEnv"])
+@pytest.mark.parametrize(
+    "first",
+    ["import gymnasium, hypogoal", "import hypogoal, gymnasium", "import hypogoal; from gymnasium import spaces"],
+)
 def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> None:
-    """Spec B1: the README's example works where nothing else was imported."""
-    code = f"{first}; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
+    """Spec B1: the README's example works where nothing else was imported, and in whichever order one imports."""
+    code = f"{first}; import gymnasium; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "(64, 64, 3)", done.stderr

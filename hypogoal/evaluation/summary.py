@@ -12,11 +12,13 @@ from rich.table import Table
 def summary_table(metrics: Mapping[str, Any]) -> Table | Group:
     """The headline numbers of a run, mean over seeds; at most 80 columns wide. See ``quantities.QUANTITIES``.
 
-    Of a run with ladders what its ensembles and its options came to, of one with agents, or neither, the agents'.
+    A table for each kind of thing that there is: ensembles, options on ladders, agents.
     """
     tables = []
     if metrics["rooms"]:
         tables.append(rooms_summary(metrics))
+    if metrics["hypotheses"]:
+        tables.append(hypotheses_summary(metrics))
     if metrics["distance"]["options"]:
         tables.append(distance_summary(metrics))
     if metrics["agents"] or not tables:
@@ -100,15 +102,20 @@ def _method(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def hypotheses_summary(metrics: Mapping[str, Any]) -> Table:
-    """Balanced accuracy of the best, mean and worst member on held-out layouts; at most 80 columns wide."""
-    table = Table(title="Balanced accuracy on held-out layouts", title_justify="left", width=79)
-    table.add_column("ensemble", ratio=1)
-    table.add_column("sub-goal", no_wrap=True)
+    """Balanced accuracy of the best, mean and worst member on held-out states; at most 80 columns wide."""
+    title = "Balanced accuracy on held-out states: best, mean and worst member"
+    table = Table(title=title, title_justify="left", width=79)
+    table.add_column("method", ratio=1, overflow="fold")
+    table.add_column("sub-goal", ratio=1, overflow="fold")
     for heading in ("best", "mean", "worst", "disagree"):
         table.add_column(heading, justify="right", no_wrap=True)
+    before = None
     for row in metrics["hypotheses"]:
+        if before not in (None, row["name"]):
+            table.add_section()
         numbers = [number(row[which]["mean"], 3) for which in ("best", "mean", "worst", "disagreement_heldout")]
-        table.add_row(row["name"], row["sub_goal"], *numbers)
+        table.add_row("" if row["name"] == before else row["name"], row["sub_goal"], *numbers)
+        before = row["name"]
     return table
 
 
