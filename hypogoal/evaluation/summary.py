@@ -68,10 +68,10 @@ def rooms_summary(metrics: Mapping[str, Any]) -> Table:
 
 
 def distance_summary(metrics: Mapping[str, Any]) -> Table:
-    """Figure 4: by ladder and N the best member's distance, a column per method; at most 80 columns wide."""
+    """Figure 4: by ladder and N the best member's distance and the mean one's, a column per method; at most 80 wide."""
     found = metrics["distance"]
     methods = list(dict.fromkeys(_method(row, found["over_ladders"]) for row in found["over_ladders"]))
-    title = "Distance from a true base where the best member's options stop"
+    title = "Distance from a true base where options stop: best member (mean member)"
     table = Table(title=title, title_justify="left", width=79)
     table.add_column("ladder", no_wrap=True)
     table.add_column("N", no_wrap=True)
@@ -88,11 +88,16 @@ def distance_summary(metrics: Mapping[str, Any]) -> Table:
 
     for ladder in dict.fromkeys(row["ladder"] for row in found["by_ladder"]):
         here = [row for row in found["by_ladder"] if row["ladder"] == ladder]
-        add(ladder, here, lambda row: number(row["best"]["mean"], 0))
+        add(ladder, here, _best_and_mean)
     table.add_section()
-    add("mean", found["over_ladders"], lambda row: number(row["best"]["mean"], 0))
-    add("at base", found["over_ladders"], lambda row: percent(row["reached_base"]["mean"]))
+    add("mean", found["over_ladders"], _best_and_mean)
+    add("at base, best", found["over_ladders"], lambda row: percent(row["reached_base"]["mean"]))
     return table
+
+
+def _best_and_mean(row: Mapping[str, Any]) -> str:
+    best, mean = (number(row[which]["mean"], 0) for which in ("best", "mean"))
+    return f"{best} ({mean})"
 
 
 def _method(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
