@@ -34,6 +34,7 @@ from hypogoal.core.hdf5 import (
     read_array,
     set_attribute,
 )
+from hypogoal.core.kinds import DATA
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
@@ -125,7 +126,7 @@ def write_dataset(
         UserError: see :func:`require_names`, or the file exists.
     """
     require_names(collected.sub_goals)
-    claim(path, force=force)
+    path = claim(path, kind=DATA, force=force)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:

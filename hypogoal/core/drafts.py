@@ -45,9 +45,25 @@ class Draft:
     command: list[str]
 
 
+def place_of(out: Path) -> Path:
+    """An output by a name of its own, also where it was called ``.`` or is a link: the work goes where that leads."""
+    return out.resolve() if out.is_symlink() or not out.name or ".." in out.parts else out
+
+
 def draft_folder(out: Path) -> Path:
     """Where the draft of an output lies."""
+    out = place_of(out)
     return out.with_name(f".{out.name}{PARTIAL}")
+
+
+def check_replaceable(out: Path, *, force: bool, resume: bool) -> None:
+    """Check that what is there, if anything, may be replaced: what is unfinished beside it was begun with ``force``.
+
+    Raises:
+        UserError: it may not.
+    """
+    if out.exists() and not force and not (resume and unfinished(out)):
+        raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
@@ -104,6 +120,7 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
     folder = draft_folder(out)
     with _locked(out):
         _settle(out)
+        check_replaceable(out, force=force, resume=resume)  # by now: another process may have made it since
         _check_unfinished(out, force=force, resume=resume)
         if resume and unfinished(out):
             begun = _begun(folder)
@@ -127,6 +144,7 @@ def put_in_place(made: Path, out: Path) -> None:
     """Rename what was made, a folder or a file, to ``out``; what stood there is moved aside first and removed last."""
     for path in [made, *made.rglob("*")]:
         sync(path)
+    out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if out.exists():
         out.rename(old)
@@ -137,6 +155,7 @@ def put_in_place(made: Path, out: Path) -> None:
 
 def _settle(out: Path) -> None:
     """Finish what a process that died in ``put_in_place`` had begun."""
+    out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if old.exists() and not out.exists():
         old.rename(out)
@@ -144,7 +163,7 @@ def _settle(out: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

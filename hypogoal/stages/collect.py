@@ -10,6 +10,7 @@ from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import draft, put_in_place
+from hypogoal.core.kinds import DATA
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.dataset import open_dataset, require_names, write_dataset
@@ -45,7 +46,7 @@ def collect(
         Numbers of states and positives per split and sub-goal.
     """
     require_names(domain.sub_goals)  # not after all the play, when the file is written
-    claim(out, force=force, resume=resume)
+    out = claim(out, kind=DATA, force=force, resume=resume)
     size = getattr(domain, "collected_bytes", lambda config: 0)(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
     about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}

@@ -66,7 +66,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
         UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
     """
     prepare()
-    claim(out, force=force)
+    claim(out, kind="evaluation", force=force)
     found = find(run)
     inputs = [artefact.whole().path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})

@@ -32,7 +32,7 @@ def report(run: Path, *, videos: int = 0, force: bool = False) -> Path:
 
     out = run / "report"
     found = read_evaluation(run)
-    claim(out, force=force)
+    claim(out, kind="report", force=force)
     material = Material(found.metrics, found.arrays)
     try:
         page = render(material, versions().get("hypogoal", "unknown"))
