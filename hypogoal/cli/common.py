@@ -9,6 +9,8 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperGroup
 
+from hypogoal.core.files import MOST_INTEGER
+
 T = TypeVar("T")
 
 
@@ -38,7 +40,10 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; see 'hypogoal config'."),
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything that is random.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=MOST_INTEGER, help="Seed of everything that is random.")]
+LayoutSeed = Annotated[
+    int | None, typer.Option("--layout-seed", min=0, max=MOST_INTEGER, help="The layout to learn on.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace what stands at --out.")]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with what was begun; keep a complete --out as it is; else begin.")

@@ -22,7 +22,7 @@ from hypogoal.core.drafts import check_free, check_replaceable, draft, place_of,
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.kinds import check_kind
-from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, read_manifest
+from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, check_writable, read_manifest
 
 PACKAGES = (
     "hypogoal",
@@ -194,6 +194,7 @@ def create_artefact(
         "seed": seed,
     }
     entries = [_input_entry(path, out) for path in inputs]
+    check_writable({**about, "inputs": entries, "files": {}}, out)
     identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
     with draft(out, identity, force=force, resume=resume) as work:
         yield work.files

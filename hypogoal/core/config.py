@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_text
+from hypogoal.core.files import MOST_INTEGER, read_text
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
@@ -195,6 +195,8 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
     for item in parsed if isinstance(parsed, tuple) else (parsed,):
         if isinstance(item, float) and not math.isfinite(item):
             raise UserError("value is not finite", where, "Give a finite number.")
+        if isinstance(item, int) and abs(item) > MOST_INTEGER:
+            raise UserError("value out of range", where, f"Integers go from -{MOST_INTEGER} to {MOST_INTEGER}.")
         if meta.get("choices") and item not in meta["choices"]:
             raise UserError("value not allowed", where, f"Choose one of {_allowed(meta).replace('|', ', ')}.")
         for bound, outside in (("low", lambda a, b: a < b), ("high", lambda a, b: a > b)):

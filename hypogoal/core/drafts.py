@@ -22,6 +22,7 @@ from typing import Any, TextIO
 
 from hypogoal.core.checkpoints import FOLDER, sync
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.files import parse_json
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -116,18 +117,21 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         UserError: another process works on ``out``; something unfinished is there that was begun otherwise, or of
             which it was not said what to do with it.
     """
-    identity = json.loads(json.dumps(identity))
     folder = draft_folder(out)
+    words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
+    fresh = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
+    fresh = parse_json(
+        json.dumps(fresh), out, "what is to be written down is", "Give names in UTF-8, and finite numbers."
+    )
     with _locked(out):
         _settle(out)
         check_replaceable(out, force=force, resume=resume)  # by now: another process may have made it since
         _check_unfinished(out, force=force, resume=resume)
         if resume and unfinished(out):
             begun = _begun(folder)
-            _check_same(begun["identity"], identity, out)
+            _check_same(begun["identity"], fresh["identity"], out)
         else:
-            words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
-            begun = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
+            begun = fresh
             _begin(folder, begun)
         try:
             yield Draft(folder / FILES, begun["command"])

@@ -1,7 +1,9 @@
 """Artefacts: complete or absent, and refused when they are not what is needed (Spec A8, G2)."""
 
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,6 +76,29 @@ def test_refusals(tmp_path: Path) -> None:
             case()
         assert "\n" not in str(caught.value)
     assert (tmp_path / "other" / "mine.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seed": 1 << 53}, "'seed'"),
+        ({"seed": -1}, "'seed'"),
+        ({"config": {"sub_goals": ["a", "a"]}}, "'sub_goals'"),
+        ({"config": {"layout_seed": (1 << 53) + 1}}, "'layout_seed'"),
+        ({"config": {"threshold": float("nan")}}, "not valid JSON"),
+        ({"inputs": [b"\xff.h5"]}, "not valid JSON"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_begun(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    """Spec A8, G2: a manifest is refused before the work for it, not by the next stage."""
+    out = tmp_path / "meta"
+    about: dict[str, Any] = {"kind": "meta", "config": {"steps": 3}, "seed": 0, **change}
+    about["inputs"] = [tmp_path / os.fsdecode(name) for name in about.get("inputs", ())]
+    for path in about["inputs"]:
+        path.write_text("states")
+    with pytest.raises(UserError, match=words) as caught, create_artefact(out, **about):
+        raise AssertionError("it worked")
+    assert "could not be read again" in str(caught.value) and not out.exists()
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -158,6 +158,14 @@ def test_a_death_between_two_renames_loses_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["meta"]
 
 
+def test_a_command_that_could_not_be_read_again_begins_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A8, G2: a manifest says the command, and is UTF-8."""
+    monkeypatch.setattr("sys.argv", ["hypogoal", os.fsdecode(b"\xff")])
+    with pytest.raises(UserError, match="not valid JSON"):
+        finish(tmp_path / "meta")
+    assert os.listdir(tmp_path) == []
+
+
 def test_what_another_process_finished_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     """Spec A6, G2: both saw nothing there; the later one is told before it works, not after."""
     out = tmp_path / "meta"
