@@ -16,7 +16,7 @@ import typer
 
 from hypogoal.cli import making, sweeping, showing, bringing  # isort: skip  # so --help has the stages first
 from hypogoal.cli.common import Interrupted, app
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import Complete, NumericalError, UserError
 
 __all__ = ["app", "bringing", "main", "making", "showing", "sweeping"]
 
@@ -52,6 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = app(args=given, standalone_mode=False, prog_name="hypogoal")
         return code if isinstance(code, int) else 0
+    except Complete as complete:
+        typer.echo(str(complete), err=True)
+        typer.echo(complete.path)
+        return 0
     except UserError as error:
         if debug:
             raise

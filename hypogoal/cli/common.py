@@ -92,29 +92,6 @@ def domain_of(artefact: Path, kind: str) -> str:
     return str(open_artefact(artefact, kind).config["domain"])
 
 
-def is_complete(out: Path, resume: bool, kind: str) -> bool:
-    """Whether ``--resume`` was given and ``out`` is complete; then the stage has nothing to do.
-
-    Raises:
-        UserError: it is something else than the stage makes.
-    """
-    from hypogoal.core.drafts import unfinished
-
-    if not resume or not out.exists() or unfinished(out):
-        return False
-    if kind == "data":
-        from hypogoal.dataset import open_dataset
-
-        open_dataset(out)
-    else:
-        from hypogoal.core.artefacts import open_artefact
-
-        open_artefact(out, kind)
-    typer.echo(f"{out} is complete already", err=True)
-    typer.echo(out)
-    return True
-
-
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
     """The numbers of states of a data file."""
     if quiet:

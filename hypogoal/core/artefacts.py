@@ -18,7 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import as_dict
-from hypogoal.core.drafts import check_free, check_replaceable, draft, place_of, put_in_place
+from hypogoal.core.drafts import (
+    check_complete,
+    check_free,
+    check_replaceable,
+    draft,
+    place_of,
+    put_in_place,
+    unfinished,
+)
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.kinds import check_kind
@@ -123,7 +131,7 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
         kind: what it is to be: that of an artefact, ``data`` or ``arrays``.
         inputs: what is read to make it.
         force: replace what is there.
-        resume: go on with what is unfinished.
+        resume: go on with what is unfinished; what is complete is left to ``create_artefact``.
 
     Raises:
         UserError: it is an input, or has one in it; it exists and ``force`` is false, or it exists and is of another
@@ -135,7 +143,8 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
         if path.resolve().is_relative_to(place):
             raise UserError(f"the output would replace an input, {path}", out, "Choose another --out.")
     if out.exists():
-        check_replaceable(out, force=force, resume=resume)
+        if not resume:  # of what is complete only the stage knows whether it was made as asked
+            check_replaceable(out, force=force)
         check_kind(out, kind)
     out = place_of(out)
     check_parent(out)
@@ -183,7 +192,9 @@ def create_artefact(
         ``out`` is as it was, and the folder is removed unless it has a checkpoint.
 
     Raises:
-        UserError: as of ``claim``, or what is unfinished was begun with another configuration, seed or inputs.
+        UserError: as of ``claim``, or what is there, unfinished or complete, was begun with another configuration,
+            seed or inputs.
+        Complete: with ``resume``, it was made with these.
     """
     inputs = [Path(path) for path in inputs]
     out = claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
@@ -196,6 +207,10 @@ def create_artefact(
     entries = [_input_entry(path, out) for path in inputs]
     check_writable({**about, "inputs": entries, "files": {}}, out)
     identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
+    if resume and out.exists() and not unfinished(out):
+        manifest = open_artefact(out, kind).manifest
+        hashes = [entry["sha256"] for entry in manifest["inputs"]]
+        raise check_complete({**manifest, "inputs": hashes}, identity, out)
     with draft(out, identity, force=force, resume=resume) as work:
         yield work.files
         files = {

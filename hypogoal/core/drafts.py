@@ -15,13 +15,13 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
 from hypogoal.core.checkpoints import FOLDER, sync
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.files import parse_json
 
 fcntl: Any  # on POSIX a module, elsewhere None
@@ -57,7 +57,7 @@ def draft_folder(out: Path) -> Path:
     return out.with_name(f".{out.name}{PARTIAL}")
 
 
-def check_replaceable(out: Path, *, force: bool, resume: bool) -> None:
+def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
     """Check that what is there, if anything, may be replaced: what is unfinished beside it was begun with ``force``.
 
     Raises:
@@ -129,7 +129,8 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         _check_unfinished(out, force=force, resume=resume)
         if resume and unfinished(out):
             begun = _begun(folder)
-            _check_same(begun["identity"], fresh["identity"], out)
+            do = "Resume it with what it was begun with, or give --force and no --resume to begin anew."
+            check_same(begun["identity"], fresh["identity"], out, "what is unfinished there was begun", do)
         else:
             begun = fresh
             _begin(folder, begun)
@@ -197,8 +198,19 @@ def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
         raise UserError("an unfinished one is there", out, "Give --resume to go on with it, or --force to begin anew.")
 
 
-def _check_same(before: dict[str, Any], now: dict[str, Any], out: Path) -> None:
-    """Refuse to go on with a draft that was begun otherwise, naming the first thing that differs."""
+def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str, do: str) -> None:
+    """Refuse to go on with what was made of something else, naming the first thing that differs.
+
+    Args:
+        before: what made it.
+        now: what is to make it.
+        out: the output.
+        what: what was done with the former, for the message ("what is there was made").
+        do: what to do about it.
+
+    Raises:
+        UserError: they differ.
+    """
     if before == now:
         return
     for key in {**before, **now}:
@@ -208,12 +220,35 @@ def _check_same(before: dict[str, Any], now: dict[str, Any], out: Path) -> None:
         if isinstance(old, dict) and isinstance(new, dict):
             key = next(name for name in {**old, **new} if old.get(name) != new.get(name))
             old, new = old.get(key), new.get(key)
-        what = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
-        raise UserError(
-            f"what is unfinished there was begun with {what}",
-            out,
-            "Resume it with what it was begun with, or give --force and no --resume to begin anew.",
-        )
+        other = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
+        raise UserError(f"{what} with {other}", out, do)
+
+
+def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
+    """What to raise where ``--resume`` finds its output complete.
+
+    Args:
+        before: ``config``, ``versions`` and whatever else made it, such as a manifest.
+        now: the same, of what is to be made. Settings that only one of the two has are those of another hypogoal; other
+            versions are said and no more, since nothing is gone on with.
+        out: the output.
+
+    Raises:
+        UserError: it was made of something else.
+    """
+    now = json.loads(json.dumps(now))
+    keys = [key for key in now if key not in ("config", "versions")]
+    settings = sorted(before["config"].keys() & now["config"].keys())
+    one, other = (
+        {"config": {key: about["config"][key] for key in settings}, **{key: about[key] for key in keys}}
+        for about in (before, now)
+    )
+    do = "Choose another --out, or give --force and no --resume."
+    check_same(one, other, out, "what is complete there was made", do)
+    versions = before.get("versions")
+    known = versions.items() if isinstance(versions, dict) else ()
+    others = [f"{name} {version}" for name, version in known if now["versions"].get(name) != version]
+    return Complete(out, f"made with {', '.join(others)}" if others else "")
 
 
 def _short(value: Any) -> str:

@@ -29,13 +29,13 @@ def check_kind(out: Path, kind: str) -> None:
         if not any(out.iterdir()):
             return
         if not (out / MANIFEST).is_file():
-            raise UserError("--force replaces only artefacts, and this folder has no manifest", out, AWAY)
+            raise UserError(f"what stands there is not of kind {kind!r}: a folder that has no manifest", out, AWAY)
         found = _manifest_kind(out)
         if found != kind:
-            what = f"of kind {found!r}" if found else "an artefact that cannot be read"
-            raise UserError(f"--force replaces only what is of kind {kind!r}, this is {what}", out, AWAY)
+            what = f"it is of kind {found!r}" if found else "its manifest cannot be read"
+            raise UserError(f"what stands there is not of kind {kind!r}: {what}", out, AWAY)
     elif not (out.is_file() and {DATA: _is_data, ARRAYS: _is_arrays}.get(kind, lambda path: False)(out)):
-        raise UserError(f"--force replaces only what is of kind {kind!r}, this file is not", out, AWAY)
+        raise UserError(f"what stands there is not of kind {kind!r}: another file", out, AWAY)
 
 
 def _manifest_kind(folder: Path) -> str:

@@ -120,7 +120,7 @@ def test_force_replaces_only_what_a_stage_makes_there(tmp_path: Path) -> None:
     cases = [(ensemble, "meta"), (unreadable, "meta"), (ensemble, "data"), (tmp_path / "other.h5", "data")]
     cases += [(tmp_path / name, kind) for name in texts for kind in ("meta", "data", "arrays")]
     for out, kind in cases:
-        with pytest.raises(UserError, match="--force replaces only what is of kind"):
+        with pytest.raises(UserError, match="what stands there is not of kind"):
             claim(out, kind=kind, force=True)
     assert contents(tmp_path) == before
     (meta / "manifest.json").write_text('{"format": 1, "kind": "meta"}')  # damaged, and to be made again

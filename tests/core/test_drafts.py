@@ -1,5 +1,6 @@
 """Spec G1, G2: what a stage works on is its own, is gone on with only by what began it, and is never lost."""
 
+import json
 import os
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.drafts import draft, draft_folder, unfinished
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import Complete, NumericalError, UserError
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "chooser": "ppo"}, "seed": 7}
 
@@ -99,6 +100,21 @@ def test_other_versions_do_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("hypogoal.core.artefacts.versions", lambda: {"torch": "9.9"})
     with pytest.raises(UserError, match=r"begun with (python|torch|hypogoal|numpy)="):
         finish(out, resume=True)
+
+
+def test_what_other_versions_completed_is_complete(tmp_path: Path) -> None:
+    """Spec G1: nothing is gone on with; settings that only one version has do not make it another one's."""
+    out = tmp_path / "meta"
+    finish(out)
+    path = out / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["versions"]["torch"] = "0.1"
+    manifest["config"] = {"steps": 3, "gone": 1}
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(Complete, match=r"complete already \(made with torch 0.1\)"):
+        finish(out, resume=True)
+    with pytest.raises(UserError, match="was made with steps=3, not 4"):
+        finish(out, config={"steps": 4}, resume=True)
 
 
 def test_what_is_unfinished_is_not_begun_anew_by_mistake(tmp_path: Path) -> None:
