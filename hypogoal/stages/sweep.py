@@ -17,7 +17,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
-from hypogoal.core.config import as_dict, parse_assignments, resolve
+from hypogoal.core.config import STAGES, as_dict, parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
@@ -58,7 +58,6 @@ CONFIGS = {
     "train-meta": "hypogoal.stages.train_meta:TrainMetaConfig",
     "train-baseline": "hypogoal.stages.train_baseline:BaselineConfig",
 }
-STAGES = ("collect", *CONFIGS, "run")
 AGAIN = "give the same command again to go on"
 
 
