@@ -31,7 +31,7 @@ from hypogoal.core.hdf5 import (
     walk,
 )
 from hypogoal.core.preflight import free_disk, human
-from hypogoal.dataset import ATTRIBUTES, open_dataset, write_observations
+from hypogoal.dataset import ATTRIBUTES, open_dataset, write_column, write_observations
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 END_AT = {0: 40, 1: 44, 2: 28, 3: 28}  # where a superblock of each version says how long the file is
@@ -178,7 +178,7 @@ def _write(
                 elif name == "observations":
                     write_observations(place, values)
                 else:
-                    place.create_dataset(name, data=values.astype(np.bool_) if name == "labels" else values)
+                    write_column(place, name, values.astype(np.bool_) if name == "labels" else values)
                 written.setdefault(id(values), place[name])
     with path.open("rb") as file:
         os.fsync(file.fileno())
