@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     except UserError as error:
         if debug:
             raise
-        return _fail(str(error), 2)
+        return _fail(with_notes(str(error), error), 2)
     except NumericalError as error:
         if debug:
             raise
@@ -68,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         message, code = _refused(error)
-        return _fail("; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message, code)
+        return _fail(with_notes(message, error), code)
     except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
@@ -101,6 +101,11 @@ def _refused(error: OSError) -> tuple[str, int]:
     if code in known:
         return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
     return f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1
+
+
+def with_notes(message: str, error: BaseException) -> str:
+    """A message, and what those whom its error passed had to add."""
+    return "; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message
 
 
 def notes_of(error: BaseException) -> list[str]:

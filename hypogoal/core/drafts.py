@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from hypogoal.core.checkpoints import FOLDER, sync
-from hypogoal.core.errors import Complete, NumericalError, UserError
+from hypogoal.core.errors import Complete, Killed, NumericalError, UserError
 from hypogoal.core.files import parse_json
 
 fcntl: Any  # on POSIX a module, elsewhere None
@@ -139,7 +139,7 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         except BaseException as error:
             if not unfinished(out):
                 shutil.rmtree(folder, ignore_errors=True)
-            elif isinstance(error, KeyboardInterrupt | NumericalError):
+            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed):
                 error.add_note(f"the last checkpoint is kept: {GO_ON}")
             raise
         shutil.rmtree(folder, ignore_errors=True)

@@ -19,6 +19,10 @@ class UserError(Exception):
         super().__init__(printable(text))
 
 
+class Killed(UserError):
+    """A process of a stage was killed from outside, which no stage can catch."""
+
+
 class Complete(UserError):
     """What is to be gone on with is complete, made as asked: the command line says so and exits with code 0.
 
