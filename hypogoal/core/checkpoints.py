@@ -171,7 +171,7 @@ def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
     value = 0
     for place, values in sorted(parts.items()):
         value = zlib.crc32(f"{place} {values.dtype} {values.shape}".encode(), value)
-        value = zlib.crc32(values.reshape(-1).view(np.uint8), value)
+        value = zlib.crc32(values.reshape(-1).view(np.uint8).data, value)
     return np.array([value], np.uint32)
 
 
