@@ -106,6 +106,13 @@ def test_show_and_verify(made: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert "whole" in capsys.readouterr().out
 
 
+def test_pictures_do_not_spoil_json(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A6: what a machine is to read is JSON and nothing else."""
+    assert main(["show", str(made / "data.h5"), "--json", "--pictures", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["kind"] == "data" and str(tmp_path) in said.err
+
+
 def test_verify_finds_damage(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G2."""
     copy = tmp_path / "ensemble"
@@ -239,6 +246,8 @@ def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         ),
         (["evaluate", str(tmp_path / "nothing")], "nothing"),
         (["report", str(tmp_path / "nothing")], "nothing"),
+        (["report", str(made), "--format", "pdf"], "--format is for --figures"),
+        (["report", str(made), "--figures", out, "--videos", "2"], "--videos is for the page"),
         (["config", "bake"], "no such stage"),
         (["train-meta"], "--help"),
         (["frobnicate"], "--help"),

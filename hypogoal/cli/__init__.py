@@ -98,9 +98,16 @@ def _refused(error: OSError) -> tuple[str, int]:
     told = re.search(r"errno = (\d+)", str(error))
     code = error.errno or (int(told[1]) if told else 0)
     where = f": {error.filename}" if error.filename else ""
+    if code in (errno.EACCES, errno.EPERM) and error.filename and not _may_read(error.filename):
+        return f"{os.strerror(code)}{where}. Ask for permission to read it.", 2
     if code in known:
         return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
     return f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1
+
+
+def _may_read(name: str | bytes) -> bool:
+    """Whether the system refused something else: what is there can be read, or nothing is there yet."""
+    return os.access(name, os.R_OK) or not os.path.lexists(name)
 
 
 def with_notes(message: str, error: BaseException) -> str:

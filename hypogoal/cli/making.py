@@ -191,7 +191,9 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Instead of the page: the paper's figures, with captions, into this folder.")
     ] = None,
-    format_: Annotated[str, typer.Option("--format", help="Of --figures: svg, pdf or png.")] = "svg",
+    format_: Annotated[
+        str | None, typer.Option("--format", help="Of --figures: svg (where it is not said), pdf or png.")
+    ] = None,
     videos: Annotated[
         int, typer.Option(min=0, help="Also so many episodes of the policy over options, as RUN/report/videos/*.gif.")
     ] = 0,
@@ -200,17 +202,22 @@ def report(
     quiet: Quiet = False,
 ) -> None:
     """Draw RUN/report/index.html: one file, readable offline."""
-    from hypogoal.core.errors import Complete
+    from hypogoal.core.errors import Complete, UserError
     from hypogoal.stages.report import draw_figures
     from hypogoal.stages.report import report as stage
 
+    if figures is None and format_ is not None:
+        raise UserError("--format is for --figures", format_, "Give --figures DIR too, or leave it out.")
+    if figures is not None and (videos or resume):
+        what = "--videos" if videos else "--resume"
+        raise UserError(f"{what} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
         try:
             typer.echo(stage(run, videos=videos, force=force, resume=resume))
         except Complete as complete:
             raise Complete(run / "report" / "index.html", complete.note) from None
         return
-    written, missing = draw_figures(run, figures, format_, force=force)
+    written, missing = draw_figures(run, figures, format_ or "svg", force=force)
     for line in missing:
         typer.echo(line, err=True)
     for path in written:

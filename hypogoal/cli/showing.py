@@ -25,7 +25,7 @@ def show(
     echo(about, as_json, lines(about))
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
-            typer.echo(sheet)
+            typer.echo(sheet, err=as_json)
 
 
 @app.command()

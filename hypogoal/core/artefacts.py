@@ -28,7 +28,7 @@ from hypogoal.core.drafts import (
     unfinished,
 )
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import inside
+from hypogoal.core.files import MAX_NAME_BYTES, inside
 from hypogoal.core.kinds import check_kind
 from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, check_writable, read_manifest
 
@@ -134,11 +134,13 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
         resume: go on with what is unfinished; what is complete is left to ``create_artefact``.
 
     Raises:
-        UserError: it is an input, or has one in it; it exists and ``force`` is false, or it exists and is of another
-            kind; another process writes it; something unfinished is there and neither ``force`` nor ``resume`` says
-            what to do with it.
+        UserError: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
+            exists and is of another kind; another process writes it; something unfinished is there and neither
+            ``force`` nor ``resume`` says what to do with it.
     """
     place = out.resolve()
+    if len(os.fsencode(place.name)) > MAX_NAME_BYTES:  # the draft's name is longer
+        raise UserError(f"the output's name is longer than {MAX_NAME_BYTES} bytes", out, "Choose a shorter one.")
     for path in inputs:
         if path.resolve().is_relative_to(place):
             raise UserError(f"the output would replace an input, {path}", out, "Choose another --out.")

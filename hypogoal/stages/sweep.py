@@ -117,6 +117,8 @@ def plan(
     if name not in EXPERIMENTS:
         known = ", ".join([*EXPERIMENTS, *FIGURES])
         raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
+    if own_preset not in (None, preset or own_preset):
+        raise UserError(f"{experiment} has its own preset", preset, f"For another, give {name} with --preset.")
     chosen = assignments + ([f"seeds={seeds}"] if seeds else [])
     return _named_plan(name, out, preset or own_preset, chosen, device, _short(out, wanted=short))
 

@@ -203,5 +203,6 @@ def test_claim_makes_nothing_and_finds_a_file_in_the_way(tmp_path: Path) -> None
     assert claim(tmp_path / "a" / "b" / "c", kind="meta") == tmp_path / "a" / "b" / "c"
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("x")
-    with pytest.raises(UserError, match="in the way"):
-        claim(tmp_path / "file" / "out", kind="meta")
+    for name, words in (("file/out", "in the way"), (f"{'x' * 240}.h5", "longer than 200 bytes")):
+        with pytest.raises(UserError, match=words):
+            claim(tmp_path / name, kind="data")

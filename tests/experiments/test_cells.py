@@ -220,6 +220,9 @@ def test_the_papers_figures_are_experiments() -> None:
     assert figure == plan("doorkey", OUT, preset="figure6").cells
     assert plan("figure3", OUT).cells == plan("montezuma-ladders", OUT, preset="figure3").cells
     assert plan("figure4", OUT).cells == plan("montezuma-ladders", OUT, preset="figure4").cells
+    assert figure == plan("figure6", OUT, preset="figure6").cells
+    with pytest.raises(UserError, match=r"figure6 has its own preset: demo. For another, give doorkey with --preset"):
+        plan("figure6", OUT, preset="demo")
     ten = plan("figure6", OUT, seeds="0", assignments=["paired=false", "layout_seeds=210-219"]).cells
     agents = [cell for cell in ten if cell.stage == "train-meta" and dict(cell.axes)["agent"] == "meta"]
     assert [dict(cell.axes)["layout_seed"] for cell in agents] == [*range(210, 220)]
