@@ -128,7 +128,7 @@ def write_dataset(
     """
     require_names(collected.sub_goals)
     path = claim(path, kind=DATA, force=force)
-    parse_json(json.dumps([domain, dict(config)]), path, "what is to be written down is", "Give names in UTF-8.")
+    parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:

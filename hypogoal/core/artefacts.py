@@ -143,7 +143,7 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
         raise UserError(f"the output's name is longer than {MAX_NAME_BYTES} bytes", out, "Choose a shorter one.")
     for path in inputs:
         if path.resolve().is_relative_to(place):
-            raise UserError(f"the output would replace an input, {path}", out, "Choose another --out.")
+            raise UserError("the output would replace an input", path, "Choose another --out.")
     if out.exists():
         if not resume:  # of what is complete only the stage knows whether it was made as asked
             check_replaceable(out, force=force)

@@ -121,7 +121,7 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
     words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
     fresh = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
     fresh = parse_json(
-        json.dumps(fresh), out, "what is to be written down is", "Give names in UTF-8, and finite numbers."
+        json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
     )
     with _locked(out):
         _settle(out)

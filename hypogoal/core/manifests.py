@@ -33,9 +33,9 @@ def check_writable(manifest: dict[str, Any], out: Path) -> None:
     """
     do = "Choose another value, or a name in UTF-8."
     try:
-        _checked(parse_json(json.dumps(manifest), out, "what is to be written down is", do), out)
+        _checked(parse_json(json.dumps(manifest), out, "the manifest would be", do), out)
     except UserError as error:
-        raise UserError(f"this could not be read again: {error.what}", out, do) from None
+        raise UserError(f"this could not be read again ({error.what})", out, do) from None
 
 
 def _checked(manifest: Any, path: Path) -> dict[str, Any]:

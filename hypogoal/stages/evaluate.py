@@ -66,7 +66,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False,
         UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
     """
     prepare()
-    claim(out, kind="evaluation", force=force, resume=resume)
+    out = claim(out, kind="evaluation", force=force, resume=resume)
     found = find(run)
     inputs = [artefact.whole().path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})

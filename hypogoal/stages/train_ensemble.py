@@ -79,7 +79,7 @@ def train_ensemble(
         if sub_goal not in dataset.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
-    claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
+    out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
     about = as_dict(config) | {
         "sub_goals": list(sub_goals),
         "observation_shape": list(dataset.observation_shape),

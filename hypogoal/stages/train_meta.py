@@ -77,7 +77,7 @@ def train_meta(
     if trained:
         _check_fit(trained, source, config)
     inputs = [ensemble, options] if options else [ensemble]
-    claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
+    out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
