@@ -154,7 +154,9 @@ class Checkpoints:
                 raise ValueError
             state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
         except (SafetensorError, KeyError, ValueError, RecursionError):
-            raise UserError("the checkpoint is damaged", self.path, "Give --force to begin anew.") from None
+            raise UserError(
+                "the checkpoint is damaged, or of an earlier version", self.path, "Give --force to begin anew."
+            ) from None
         return state
 
 
