@@ -12,7 +12,11 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+
     from hypogoal.api import OptionEnv, load_ensemble, load_options
+    from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium_domain import GymnasiumDomain
     from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 
@@ -23,12 +27,14 @@ _LAZY = {
     "OptionEnv": "hypogoal.api",
     "SubgoalReward": "hypogoal.api",
     "SubgoalTermination": "hypogoal.api",
+    "UserError": "hypogoal.core.errors",
 }
 __all__ = [
     "GymnasiumDomain",
     "OptionEnv",
     "SubgoalReward",
     "SubgoalTermination",
+    "UserError",
     "__version__",
     "load_ensemble",
     "load_options",
@@ -46,7 +52,7 @@ def __getattr__(name: str) -> Any:
 def register() -> None:
     """Register hypogoal's environments with Gymnasium; calling it again does nothing.
 
-    Done by ``import hypogoal`` where Gymnasium is imported already, else by the first use of hypogoal's interface.
+    Done by ``import hypogoal`` where Gymnasium is imported already, else as soon as it is.
     """
     from hypogoal.domains.doorkey_registration import register as register_doorkey
     from hypogoal.domains.montezuma_registration import register as register_montezuma
@@ -55,5 +61,33 @@ def register() -> None:
     register_montezuma()
 
 
+class _AfterGymnasium:
+    """Registers the environments when Gymnasium is imported.
+
+    A finder of modules, since Gymnasium (1.0 and later) looks for no entry points of packages that have environments,
+    and is too slow to be imported by ``import hypogoal``.
+    """
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        """Gymnasium as the other finders find it; once it is loaded, the environments are registered."""
+        if name != "gymnasium":
+            return None
+        import importlib.util
+
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.loader is not None:
+            load = spec.loader.exec_module
+
+            def load_and_register(module: ModuleType) -> None:
+                load(module)
+                register()
+
+            spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
+        return spec
+
+
 if "gymnasium" in sys.modules:
     register()
+else:
+    sys.meta_path.insert(0, _AfterGymnasium())

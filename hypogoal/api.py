@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.tensors import load_tensors
+from hypogoal.core.artefacts import MANIFEST, open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import AGAIN, load_tensors
 from hypogoal.domains.doorkey_registration import register
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
-from hypogoal.options.env import OptionEnv, Options, make_policies
+from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
-from hypogoal.options.initiation import narrowing
+from hypogoal.options.initiation import Narrowed
+from hypogoal.options.policies import make_policies
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 
@@ -70,5 +72,8 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     initiation = None
     if INITIATION in artefact.manifest["files"]:
         learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
-        initiation = narrowing(learned, shape, len(goals) * members, config["initiation_threshold"])
-    return Options(goals, members, ensembles, policies, config["option_timeout"], initiation)
+        initiation = Narrowed(learned, shape, len(goals) * members, config["initiation_threshold"])
+    masked = config["mask_reached"]
+    if not isinstance(masked, bool):
+        raise UserError("the manifest's setting 'mask_reached' is malformed", artefact.path / MANIFEST, AGAIN)
+    return Options(goals, members, ensembles, policies, config["option_timeout"], initiation, masked)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hypogoal.core.artefacts import MANIFEST, open_artefact
 from hypogoal.core.errors import UserError, printable
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.table import Table
+
+EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
 
 def describe_path(path: Path) -> dict[str, Any]:
@@ -34,6 +40,50 @@ def _describe_part(path: Path) -> dict[str, Any]:
     artefact = open_artefact(path)
     keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
     return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
+
+
+def numbers_of(path: Path) -> Mapping[str, Any] | None:
+    """What ``metrics.json`` holds of an evaluation, or of a run's own; None where there is none.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    from hypogoal.evaluation.evaluated import read_numbers
+
+    for folder in (path, path / EVALUATION):
+        if (folder / MANIFEST).is_file():
+            artefact = open_artefact(folder)
+            return read_numbers(artefact) if artefact.kind == EVALUATION else None
+    return None
+
+
+def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
+    """The headline numbers of an evaluation as tables.
+
+    Args:
+        numbers: what :func:`numbers_of` found.
+        path: where, for the message.
+
+    Raises:
+        UserError: they are not what ``evaluate`` writes.
+    """
+    from hypogoal.evaluation.summary import summary_table
+
+    try:
+        return summary_table(_plain(numbers))
+    except (LookupError, TypeError, ValueError, AttributeError):
+        raise UserError("the evaluation is damaged", path, "Evaluate the run again.") from None
+
+
+def _plain(value: Any) -> Any:
+    """The same, with texts that a table shows as they are: without control characters, brackets no markup."""
+    from rich.markup import escape
+
+    if isinstance(value, str):
+        return escape(printable(value))
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list) else value
 
 
 def lines(about: dict[str, Any]) -> list[str]:

@@ -95,9 +95,12 @@ def test_a_changed_byte_is_found(tmp_path: Path, name: str) -> None:
     assert name in " ".join(faults_of(path))
 
 
-@pytest.mark.parametrize("first", ["import gymnasium, hypogoal", "import hypogoal, gymnasium; hypogoal.OptionEnv"])
+@pytest.mark.parametrize(
+    "first",
+    ["import gymnasium, hypogoal", "import hypogoal, gymnasium", "import hypogoal; from gymnasium import spaces"],
+)
 def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> None:
-    """Spec B1: the README's example works where nothing else was imported."""
-    code = f"{first}; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
+    """Spec B1: the README's example works where nothing else was imported, and in whichever order one imports."""
+    code = f"{first}; import gymnasium; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "(64, 64, 3)", done.stderr

@@ -3,8 +3,10 @@
 import io
 import json
 import os
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -118,6 +120,17 @@ def test_watch_from_the_command_line(run, capsys, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"no metrics\.jsonl"):
         read_progress(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii", "utf-8"])
+def test_a_pipe_may_take_fewer_signs(run, encoding):
+    """Spec A6: what an encoding does not have, the curve's blocks among it, is a question mark and no error."""
+    command = [sys.executable, "-m", "hypogoal", "watch", str(run), "--once"]
+    environment = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
+    done = subprocess.run(command, env=environment, capture_output=True, check=False, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stderr
+    told = done.stdout.decode(encoding)
+    assert "complete" in told and ("█" in told) == (encoding == "utf-8") and "Error" not in done.stderr.decode(encoding)
 
 
 def test_a_run_is_finished_when_it_says_so(tmp_path):

@@ -46,6 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
     if arguments is None:
         signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
+        _print_anything()
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
@@ -118,6 +119,13 @@ def with_notes(message: str, error: BaseException) -> str:
 def notes_of(error: BaseException) -> list[str]:
     """What those whom an error passed had to add, each once."""
     return list(dict.fromkeys(getattr(error, "__notes__", [])))
+
+
+def _print_anything() -> None:
+    """Signs that a pipe or terminal does not take (cp1252 has no block of a curve) become '?' and end nothing."""
+    for stream in (sys.stdout, sys.stderr):
+        if getattr(stream, "errors", "") == "strict" and hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
 
 
 def _stop(signum: int, _frame: object) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hypogoal.cli.common import AsJson, app, echo
+from hypogoal.cli.common import AsJson, app, echo, print_table
 
 
 @app.command()
@@ -18,11 +18,17 @@ def show(
         Path | None, typer.Option(help="Of a data file: draw its states with their labels into this folder.")
     ] = None,
 ) -> None:
-    """What is this: kind, configuration, inputs, numbers."""
-    from hypogoal.inspection import describe_path, lines, write_contact_sheets
+    """What is this: kind, configuration, inputs; of data the counts, of an evaluation or its run the numbers."""
+    from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
 
     about = describe_path(path)
-    echo(about, as_json, lines(about))
+    if not as_json:
+        echo(about, False, lines(about))
+    numbers = numbers_of(path)
+    if as_json:
+        echo(about if numbers is None else {**about, "metrics": numbers}, True, [])
+    elif numbers is not None:
+        print_table(summary_of(numbers, path))
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
             typer.echo(sheet, err=as_json)

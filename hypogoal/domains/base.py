@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -17,6 +18,13 @@ BUILT_IN = {
     "montezuma": "hypogoal.domains.montezuma:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
+IMPORTED = "imported"  # what states are of where 'hypogoal import' was not told
+CONFIGS = {  # of the stages that train: their settings, some of which a domain may have other defaults for
+    "train-ensemble": "hypogoal.stages.train_ensemble:TrainEnsembleConfig",
+    "train-options": "hypogoal.stages.train_options:TrainOptionsConfig",
+    "train-meta": "hypogoal.stages.train_meta:TrainMetaConfig",
+    "train-baseline": "hypogoal.stages.train_baseline:BaselineConfig",
+}
 
 
 class Step(NamedTuple):
@@ -110,8 +118,14 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
     Raises:
         UserError: no such domain, code that the user did not allow, or the object is not a domain.
     """
-    with own_code.given(*([name] if given else [])):
-        domain = own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
+    try:
+        with own_code.given(*([name] if given else [])):
+            domain = own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
+    except UserError:
+        if name != IMPORTED:
+            raise
+        do = f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file."
+        raise UserError("nobody said which domain these imported states are of", name, do) from None
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
     return domain
@@ -129,6 +143,13 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
         return load_domain(name, given=given)
     except UserError:
         return None
+
+
+def stage_config(stage: str) -> type:
+    """The settings of one of the stages in ``CONFIGS``."""
+    module, _, name = CONFIGS[stage].partition(":")
+    found: type = getattr(importlib.import_module(module), name)
+    return found
 
 
 def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str, Any]:

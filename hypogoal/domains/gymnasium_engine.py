@@ -39,12 +39,17 @@ def make_checked(make: MakeEnv) -> gymnasium.Env:
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
         do = "Wrap it so that it gives images, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
         raise UserError("observations must be images, uint8 (H, W, C) or (H, W)", space, do)
-    if len(space.shape) == 3 and space.shape[0] in (1, 3, 4) and space.shape[2] > MOST_CHANNELS:
+    if channels_first(space.shape):
         do = "Wrap it in gymnasium.wrappers.TransformObservation with x.transpose(1, 2, 0)."
         raise UserError("observations have their channels, or stacked frames, first", space.shape, do)
     if not isinstance(actions, spaces.Discrete) or actions.start != 0:
         raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
     return env
+
+
+def channels_first(shape: tuple[int, ...]) -> bool:
+    """Whether a shape is (C, H, W) rather than (H, W, C): few rows, and more channels than any image has."""
+    return len(shape) == 3 and shape[0] <= MOST_CHANNELS < shape[2]
 
 
 def shape_of(env: gymnasium.Env) -> tuple[int, ...]:

@@ -50,6 +50,15 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     return Evaluated(source, metrics, _arrays(source.path / "arrays.h5", start))
 
 
+def read_numbers(source: Artefact) -> Mapping[str, Any]:
+    """``metrics.json`` of an evaluation artefact.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    return _metrics(source.whole().path / "metrics.json")
+
+
 def _since(run: Path, source: Artefact) -> list[str]:
     """A line for each artefact of the run that the evaluation does not know: it was made, or made again, since."""
     known = {entry["sha256"] for entry in source.manifest["inputs"]}

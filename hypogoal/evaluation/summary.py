@@ -12,11 +12,13 @@ from rich.table import Table
 def summary_table(metrics: Mapping[str, Any]) -> Table | Group:
     """The headline numbers of a run, mean over seeds; at most 80 columns wide. See ``quantities.QUANTITIES``.
 
-    Of a run with ladders what its ensembles and its options came to, of one with agents, or neither, the agents'.
+    A table for each kind of thing that there is: ensembles, options on ladders, agents.
     """
     tables = []
     if metrics["rooms"]:
         tables.append(rooms_summary(metrics))
+    if metrics["hypotheses"]:
+        tables.append(hypotheses_summary(metrics))
     if metrics["distance"]["options"]:
         tables.append(distance_summary(metrics))
     if metrics["agents"] or not tables:
@@ -66,10 +68,10 @@ def rooms_summary(metrics: Mapping[str, Any]) -> Table:
 
 
 def distance_summary(metrics: Mapping[str, Any]) -> Table:
-    """Figure 4: by ladder and N the best member's distance, a column per method; at most 80 columns wide."""
+    """Figure 4: by ladder and N the best member's distance and the mean one's, a column per method; at most 80 wide."""
     found = metrics["distance"]
     methods = list(dict.fromkeys(_method(row, found["over_ladders"]) for row in found["over_ladders"]))
-    title = "Distance from a true base where the best member's options stop"
+    title = "Distance from a true base where options stop: best member (mean member)"
     table = Table(title=title, title_justify="left", width=79)
     table.add_column("ladder", no_wrap=True)
     table.add_column("N", no_wrap=True)
@@ -86,11 +88,16 @@ def distance_summary(metrics: Mapping[str, Any]) -> Table:
 
     for ladder in dict.fromkeys(row["ladder"] for row in found["by_ladder"]):
         here = [row for row in found["by_ladder"] if row["ladder"] == ladder]
-        add(ladder, here, lambda row: number(row["best"]["mean"], 0))
+        add(ladder, here, _best_and_mean)
     table.add_section()
-    add("mean", found["over_ladders"], lambda row: number(row["best"]["mean"], 0))
-    add("at base", found["over_ladders"], lambda row: percent(row["reached_base"]["mean"]))
+    add("mean", found["over_ladders"], _best_and_mean)
+    add("at base, best", found["over_ladders"], lambda row: percent(row["reached_base"]["mean"]))
     return table
+
+
+def _best_and_mean(row: Mapping[str, Any]) -> str:
+    best, mean = (number(row[which]["mean"], 0) for which in ("best", "mean"))
+    return f"{best} ({mean})"
 
 
 def _method(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
@@ -100,15 +107,20 @@ def _method(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def hypotheses_summary(metrics: Mapping[str, Any]) -> Table:
-    """Balanced accuracy of the best, mean and worst member on held-out layouts; at most 80 columns wide."""
-    table = Table(title="Balanced accuracy on held-out layouts", title_justify="left", width=79)
-    table.add_column("ensemble", ratio=1)
-    table.add_column("sub-goal", no_wrap=True)
+    """Balanced accuracy of the best, mean and worst member on held-out states; at most 80 columns wide."""
+    title = "Balanced accuracy on held-out states: best, mean and worst member"
+    table = Table(title=title, title_justify="left", width=79)
+    table.add_column("method", ratio=1, overflow="fold")
+    table.add_column("sub-goal", ratio=1, overflow="fold")
     for heading in ("best", "mean", "worst", "disagree"):
         table.add_column(heading, justify="right", no_wrap=True)
+    before = None
     for row in metrics["hypotheses"]:
+        if before not in (None, row["name"]):
+            table.add_section()
         numbers = [number(row[which]["mean"], 3) for which in ("best", "mean", "worst", "disagreement_heldout")]
-        table.add_row(row["name"], row["sub_goal"], *numbers)
+        table.add_row("" if row["name"] == before else row["name"], row["sub_goal"], *numbers)
+        before = row["name"]
     return table
 
 

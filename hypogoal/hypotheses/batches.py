@@ -129,6 +129,8 @@ class TrainingStates:
 
     def unlabelled_logits(self, networks: Sequence[nn.Sequential]) -> list[Tensor]:
         """Each trained network's logits (M, 2) of all unlabelled states, in evaluation mode."""
+        if not networks:
+            return []
         every = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
         for network in networks:
             network.eval()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,6 +78,7 @@ class Ensemble(nn.Module):
 
     def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
         """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`."""
+        observations = _as_array(observations)
         self._check(observations, positions)
         return np.ascontiguousarray(self.view.see(observations, positions))  # flipped pictures are no tensors
 
@@ -93,7 +95,7 @@ class Ensemble(nn.Module):
         """Every member's probability that the sub-goal is reached.
 
         Args:
-            observations: uint8 (N, H, W, C).
+            observations: uint8 (N, H, W, C), or a list of N (H, W, C).
             positions: int64 (N, 3) of room, x, y; only where ``needs_positions``.
 
         Returns:
@@ -180,3 +182,11 @@ class Ensemble(nn.Module):
             found = "none" if positions is None else f"{positions.dtype} {positions.shape}"
             hint = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
             raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", found, hint)
+
+
+def _as_array(observations: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(observations)
+    except ValueError:  # of different shapes
+        what = "these are not observations that the ensemble knows"
+        raise UserError(what, "they differ in shape", "Give uint8 (N, H, W, C).") from None

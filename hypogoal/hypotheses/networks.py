@@ -11,6 +11,7 @@ public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdi
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from itertools import pairwise
 from typing import TypeAlias
@@ -24,6 +25,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import load_own
 
 CLASSES = 2
+MOST_PIXELS = 1024  # of a side, up to which it is looked for how large an image must be
 ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
 
 
@@ -137,16 +139,49 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
         layers, hidden = parts_of(channels)
         if any(isinstance(part, _BatchNorm) for layer in layers for part in layer.modules() if part is not layer):
             raise UserError("BatchNorm inside another layer", name, "Make it a layer of its own.")
-        try:
-            with torch.no_grad():
-                features = nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
-        except RuntimeError:
-            raise UserError(f"images too small for the network {name!r}", where, "Give larger ones.") from None
+        features = _features(layers, channels, height, width)
+        if features is None:
+            side = smallest_side(layers, channels)
+            if side is None:
+                what = f"the network {name!r} takes no images of {channels} channels"
+                raise UserError(what, where, "Its layers must take (N, channels, height, width).")
+            raise UserError(f"images too small for the network {name!r}", where, _way_out(side, observation_shape))
         layers.append(nn.Flatten())
         for inputs, outputs in pairwise((features.numel(), *hidden)):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         layers.append(nn.Linear(hidden[-1], CLASSES))
     return nn.Sequential(*layers).train()
+
+
+def _features(layers: list[nn.Module], channels: int, height: int, width: int) -> Tensor | None:
+    """What a convolutional part makes of an image; None where the image is too small for it."""
+    try:
+        with torch.no_grad():
+            return nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
+    except RuntimeError:
+        return None
+
+
+def smallest_side(layers: list[nn.Module], channels: int) -> int | None:
+    """The side, in pixels, of the smallest square image that a convolutional part takes; None where it takes none."""
+    takes = 1
+    while _features(layers, channels, takes, takes) is None:
+        takes *= 2
+        if takes > MOST_PIXELS:
+            return None
+    return bisect_left(range(takes), True, lo=1, key=lambda side: _features(layers, channels, side, side) is not None)
+
+
+def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
+    """What to do with images smaller than ``side`` pixels, which networks take them as they are among it."""
+    height, width, channels = observation_shape
+    others = [
+        name for name, make in NETWORKS.items() if _features(make(channels)[0], channels, height, width) is not None
+    ]
+    ways = ["give larger ones", *(f"--set network={name}" for name in others)]
+    return (
+        f"It takes {side}x{side} pixels: {', '.join(ways)}, or a network of your own (--set network=module:function)."
+    )
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat, TypeAlias
+import operator
+from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -14,6 +15,7 @@ from hypogoal.domains.gymnasium_engine import as_image, with_channels
 from hypogoal.hypotheses.ensemble import Ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
+By: TypeAlias = str | SupportsIndex
 RULES = ("any", "vote", "all", "mean")
 
 
@@ -30,21 +32,31 @@ def require_observations(env: Env, shape: tuple[int, ...]) -> None:
         raise UserError("the environment's observations are not those that these members know", found, do)
 
 
+def as_number(value: Any) -> int | None:
+    """An integer of Python's or of any array library's; None where it is something else, a truth value among it."""
+    if isinstance(value, bool | np.bool_):
+        return None
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
+
+
 class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """What both wrappers share: whether the sub-goal holds in an observation."""
 
-    def __init__(self, env: Env, ensemble: Ensemble, by: str | int, **arguments: Any):
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, ensemble=ensemble, by=by, **arguments)
+    def __init__(self, env: Env, ensemble: Ensemble, by: By, **arguments: Any):
+        asked = by if isinstance(by, str) else as_number(by)
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, ensemble=ensemble, by=asked, **arguments)
         gymnasium.Wrapper.__init__(self, env)
         require_observations(env, ensemble.observation_shape)
         if ensemble.needs_positions:
             do = "Train it with localiser=learned."
             raise UserError("the ensemble needs the agent's positions (localiser=ram)", None, do)
-        number = isinstance(by, int) and not isinstance(by, bool) and 0 <= by < len(ensemble)
-        if by not in RULES and not number:
+        if asked not in RULES and asked not in range(len(ensemble)):
             do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
             raise UserError("who is to say that the sub-goal holds?", f"by={by!r}", do)
-        self.ensemble, self.by = ensemble, by
+        self.ensemble, self.by = ensemble, asked
 
     def holds(self, observation: NDArray[np.uint8]) -> bool:
         """Whether the sub-goal holds in an observation (H, W, C), or (H, W), by the members asked."""
@@ -52,9 +64,9 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self.by == "mean":
             return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
         verdicts = self.ensemble.verdicts(observation[None])[0]
-        if isinstance(self.by, int):
-            return bool(verdicts[self.by])
-        return bool({"any": verdicts.any(), "all": verdicts.all(), "vote": verdicts.mean() > 0.5}[self.by])
+        if isinstance(self.by, str):
+            return bool({"any": verdicts.any(), "all": verdicts.all(), "vote": verdicts.mean() > 0.5}[self.by])
+        return bool(verdicts[self.by])
 
 
 class SubgoalReward(_Subgoal):
@@ -73,7 +85,7 @@ class SubgoalReward(_Subgoal):
     ``info["subgoal"]`` says whether the sub-goal holds.
     """
 
-    def __init__(self, env: Env, ensemble: Ensemble, by: str | int = "vote", *, scale: float = 1.0, add: bool = False):
+    def __init__(self, env: Env, ensemble: Ensemble, by: By = "vote", *, scale: float = 1.0, add: bool = False):
         super().__init__(env, ensemble, by, scale=scale, add=add)
         self.scale, self.add = scale, add
 
@@ -94,7 +106,7 @@ class SubgoalTermination(_Subgoal):
     ``info["subgoal"]`` says whether the sub-goal holds.
     """
 
-    def __init__(self, env: Env, ensemble: Ensemble, by: str | int = "vote"):
+    def __init__(self, env: Env, ensemble: Ensemble, by: By = "vote"):
         super().__init__(env, ensemble, by)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:

@@ -178,14 +178,18 @@ def play(
 
 
 def layout_facts(engine: Any, config: PlayConfig, seed: int) -> dict[str, Any]:
-    """Spec F5: how hard the layout is: its shortest path and how often random play reaches the goal."""
+    """Spec F5: how hard the layout is: its shortest path and how often random play reaches the goal.
+
+    Where the engine cannot tell them they are None, and no episode of random play was played.
+    """
     rng = rng_for(seed, "random-play")
     episodes = config.random_episodes
-    playable = episodes and hasattr(engine, "random_success")
+    if not hasattr(engine, "random_success"):
+        episodes = 0
     return {
         **({"start": config.start} if config.start else {}),
         "layout_seed": config.layout_seed,
         "shortest_path": engine.shortest_path() if hasattr(engine, "shortest_path") else None,
-        "random_success": engine.random_success(episodes, rng) if playable else None,
+        "random_success": engine.random_success(episodes, rng) if episodes else None,
         "random_episodes": episodes,
     }

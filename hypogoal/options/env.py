@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
-from torch import Tensor
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.tensors import load_fitting
 from hypogoal.domains.gymnasium_engine import as_image
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.wrappers import require_observations
+from hypogoal.hypotheses.wrappers import as_number, require_observations
 from hypogoal.options.execution import offered_options
-from hypogoal.options.exploration import actions_of
 from hypogoal.options.initiation import Narrowing
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork
-
-# A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
-Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
+from hypogoal.options.policies import Policies
 
 
 @dataclass(frozen=True)
@@ -38,6 +31,9 @@ class Options:
         policies: starts an option's greedy policy.
         timeout: steps after which an option ends.
         initiation: holds options back where they rarely reach their sub-goals (D7); None, it holds none back.
+        mask_reached: options are not offered where their sub-goals hold already, as they were trained (D6).
+
+    It can be sent to another process.
     """
 
     sub_goals: tuple[str, ...]
@@ -46,6 +42,7 @@ class Options:
     policies: Policies
     timeout: int
     initiation: Narrowing | None = None
+    mask_reached: bool = True
 
     @property
     def count(self) -> int:
@@ -62,84 +59,15 @@ class Options:
 
     def offered(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Spec D6, D7: which options may start in an observation (*obs): bool (G*K,)."""
-        offered: NDArray[np.bool_] = offered_options(self.verdicts(observation)[None], mask_reached=True)[0]
+        offered: NDArray[np.bool_] = np.ones(self.count, dtype=np.bool_)
+        if self.mask_reached:
+            offered = offered_options(self.verdicts(observation)[None], mask_reached=True)[0]
         return offered if self.initiation is None else self.initiation(observation, offered)
 
     def holds(self, option: int, observation: NDArray[np.uint8]) -> bool:
         """Whether one option's own sub-goal holds in an observation (*obs)."""
         ensemble = self.ensembles[option // self.members]
         return bool(ensemble.verdicts(observation[None])[0, option % self.members])
-
-
-def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any]) -> Policies:
-    """Greedy policies from an options artefact's weights.
-
-    Args:
-        config: its manifest's configuration.
-        weights: the tensors of ``options.safetensors``.
-        about: the ensemble manifest's configuration.
-    """
-    if config["termination"] == "oracle":
-        raise UserError(
-            "these options end at the true sub-goals, which only the domain's engine can see",
-            "termination=oracle",
-            "Load options that were trained with learned members.",
-        )
-    shape = tuple(about["observation_shape"])
-    options = len(config["sub_goals"]) * config["members"]
-    last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"
-    outputs = len(weights[last]) // (options if config["network"] == "light" else 1) if last in weights else 0
-    actions = actions_of(weights, outputs)
-    if not outputs or actions.shape != (outputs,):
-        raise UserError("the weights do not fit the manifest", f"{options} options", "Make the artefact again.")
-    make = _light_policies if config["network"] == "light" else _paper_policies
-    return make(weights, shape, options, actions)
-
-
-def _light_policies(
-    weights: dict[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]
-) -> Policies:
-    own = {name[7:]: value for name, value in weights.items() if name.startswith("online.")}
-    network = load_fitting(lambda: LightQNetwork(shape, options, len(actions)), own, "options.safetensors")
-
-    def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
-        @torch.no_grad()
-        def act(observation: NDArray[np.uint8]) -> int:
-            image = torch.from_numpy(np.ascontiguousarray(observation[None]))
-            return int(actions[int(network(image)[0, option].argmax())])
-
-        return act
-
-    return start
-
-
-def _paper_policies(
-    weights: dict[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]
-) -> Policies:
-    networks: dict[int, PaperQNetwork] = {}
-
-    def network_of(option: int) -> PaperQNetwork:
-        if option not in networks:
-            prefix = f"{option}."
-            own = {name[len(prefix) :]: value for name, value in weights.items() if name.startswith(prefix)}
-            made = load_fitting(lambda: PaperQNetwork(shape, len(actions)), own, "options.safetensors")
-            networks[option] = made.eval()
-        return networks[option]
-
-    def start(option: int) -> Callable[[NDArray[np.uint8]], int]:
-        network = network_of(option)
-        hidden: Tensor | None = None
-
-        @torch.no_grad()
-        def act(observation: NDArray[np.uint8]) -> int:
-            nonlocal hidden
-            image = torch.from_numpy(np.ascontiguousarray(observation[None]))
-            values, hidden = network(network.embed(image)[:, None], hidden)
-            return int(actions[int(values[0, 0].argmax())])
-
-        return act
-
-    return start
 
 
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -192,8 +120,14 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self.options.offered(self._current())
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Run option ``action`` to its end."""
-        option = int(action)
+        """Run option ``action`` to its end.
+
+        Raises:
+            UserError: there is no such option, or the environment was not reset.
+        """
+        option = as_number(action)
+        if option is None or not 0 <= option < self.options.count:
+            raise UserError("no such option", repr(action), f"They are 0 to {self.options.count - 1}.")
         act = self.options.policies(option)
         total, duration, reached, ended = 0.0, 0, False, False
         image, observation = self._current(), None

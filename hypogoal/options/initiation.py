@@ -46,7 +46,7 @@ def _narrowed(
     return narrowed
 
 
-def narrowing(state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float) -> Narrowing:
+class Narrowed:
     """What an artefact's initiation sets leave of the options offered in an observation; all, where that is none.
 
     Args:
@@ -55,24 +55,22 @@ def narrowing(state: Mapping[str, Tensor], shape: tuple[int, ...], options: int,
         options: O.
         threshold: an option is held back where its chance is below this.
 
-    Returns:
-        From an observation (*shape) and what is offered in it, bool (O,), a part of the latter.
-
     Raises:
         UserError: the tensors are not of so many options on such observations.
     """
-    own = {name[len(PREFIX) :]: value for name, value in state.items() if name.startswith(PREFIX)}
-    network = load_fitting(lambda: LightQNetwork(shape, options, actions=1), own, NAME)
-    others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
-    check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
-    executions = state["executions"].numpy()
+
+    def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float):
+        own = {name[len(PREFIX) :]: value for name, value in state.items() if name.startswith(PREFIX)}
+        self.network = load_fitting(lambda: LightQNetwork(shape, options, actions=1), own, NAME)
+        others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
+        check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
+        self.executions, self.threshold = state["executions"].numpy(), threshold
 
     @torch.no_grad()
-    def narrow(observation: NDArray[np.uint8], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        chances = network(torch.from_numpy(observation[None]))[:, :, 0].sigmoid().numpy()
-        return _narrowed(offered[None], chances, executions, threshold)[0]
-
-    return narrow
+    def __call__(self, observation: NDArray[np.uint8], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Of what is offered in an observation (*shape), bool (O,), a part."""
+        chances = self.network(torch.from_numpy(observation[None]))[:, :, 0].sigmoid().numpy()
+        return _narrowed(offered[None], chances, self.executions, self.threshold)[0]
 
 
 class Initiation:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +30,9 @@ def read_arrays(path: Path) -> Parts:
         path: a ``.npz`` file, or a folder of ``.npy`` files.
 
     Raises:
-        UserError: missing, damaged, larger than memory, or holding Python objects (which would be code).
+        UserError: missing, damaged, of other names, larger than memory, or holding Python objects, which would be code.
     """
-    arrays = _folder(path) if path.is_dir() else _file(path)
+    arrays = _folder(path) if path.is_dir() else _file(path, others=False)
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
         do = f"Give arrays called {', '.join(NEEDED)}, and {' and '.join(OPTIONAL)} where there are some."
@@ -84,7 +86,8 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def _file(path: Path) -> dict[str, NDArray[Any]]:
+def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that have known names; ``others``: it may hold more."""
     require_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.")
     try:
         with zipfile.ZipFile(path) as archive:
@@ -94,6 +97,8 @@ def _file(path: Path) -> dict[str, NDArray[Any]]:
     _require_memory(size, path)
     try:
         with np.load(path, allow_pickle=False) as archive:
+            if not others:
+                _require_known(archive.files, path)
             return {name: archive[name] for name in archive.files if name in KNOWN}
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, MemoryError) as error:
         raise _damaged(path, error) from None
@@ -101,6 +106,7 @@ def _file(path: Path) -> dict[str, NDArray[Any]]:
 
 def _folder(path: Path) -> dict[str, NDArray[Any]]:
     arrays = {}
+    _require_known(sorted(file.stem for file in path.glob("*.npy")), path)
     files = {name: path / f"{name}.npy" for name in KNOWN}
     found = {name: file for name, file in files.items() if file.is_file()}
     _require_memory(sum(file.stat().st_size for file in found.values()), path)
@@ -110,6 +116,19 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
         except (ValueError, OSError, EOFError, MemoryError) as error:
             raise _damaged(file, error) from None
     return arrays
+
+
+def _require_known(names: Iterable[str], path: Path) -> None:
+    """A misspelt array is not left out in silence: held-out states would be missed by nobody.
+
+    Raises:
+        UserError: there is another name than those of ``KNOWN``.
+    """
+    for name in names:
+        if name not in KNOWN:
+            near = difflib.get_close_matches(name, KNOWN, n=1)
+            do = f"Did you mean {near[0]!r}?" if near else f"Known are {', '.join(KNOWN)}; leave it out."
+            raise UserError(f"unknown array {name!r}", path, do)
 
 
 def _require_memory(size: int, path: Path) -> None:

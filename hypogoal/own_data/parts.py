@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, digest, leave_out, require_names
+from hypogoal.domains.gymnasium_engine import channels_first
 
 FEW = 10  # states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
@@ -139,7 +140,7 @@ def as_images(values: NDArray[Any], what: str, shape: tuple[int, ...] | None = N
         values = values[..., None]
     if values.ndim != 4 or 0 in values.shape[1:]:
         raise UserError(f"{what} are no images", found, "Give (N, height, width, channels) or (N, height, width).")
-    if values.shape[1] in (1, 3, 4) and values.shape[3] > 16:
+    if channels_first(values.shape[1:]):
         raise UserError(f"{what} have their channels first", found, "Give x.transpose(0, 2, 3, 1).")
     if not len(values):
         raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")

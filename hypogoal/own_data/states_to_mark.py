@@ -28,6 +28,8 @@ GRID_KEYS = {
 
 DIRECTIONS = {"UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s")}
 FIRE = ("space",)
+FALLBACK = tuple("0123456789bcfghijkotvxyz")
+"""Keys of actions without one by their name: their number, from 10 on a letter that nothing above has, nor marking."""
 
 
 class Source(Protocol):
@@ -161,7 +163,7 @@ def action_names(env: gymnasium.Env) -> tuple[str, ...]:
 
 
 def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
-    """The action that a key stands for: by name as MiniGrid's, by the keys held together as Atari's, or by number."""
+    """The action that a key stands for: by name as MiniGrid's, by the keys held together as Atari's, else by number."""
     if "NOOP" in names:
         down = {key, *held}
         parts = [name for name, keys in DIRECTIONS.items() if down & set(keys)]
@@ -169,17 +171,19 @@ def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
         level = next((name for name in parts if name in ("RIGHT", "LEFT")), "")
         name = vertical + level + ("FIRE" if down & set(FIRE) else "")
         return names.index(name) if name in names else None
-    for index, name in enumerate(names):
-        if key in GRID_KEYS.get(name, ()) or key == name:
-            return index
-    return None
+    return next((index for index, keys in enumerate(keys_of(names)) if key in keys), None)
+
+
+def keys_of(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Which keys play each action: those of its name, else one of ``FALLBACK``; none where there are more actions."""
+    return [GRID_KEYS.get(name) or FALLBACK[index : index + 1] for index, name in enumerate(names)]
 
 
 def action_help(names: Sequence[str]) -> tuple[str, ...]:
     """Which keys play which actions, in lines."""
     if "NOOP" in names:
         return ("arrows or w a s d, space: move, fire; together, too",)
-    told = [f"{' or '.join(GRID_KEYS[name]) if name in GRID_KEYS else name}: {name}" for name in names]
+    told = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
     return tuple(", ".join(told[first : first + 3]) for first in range(0, len(told), 3))
 
 

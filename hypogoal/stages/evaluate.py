@@ -267,15 +267,17 @@ def missing(
 ) -> list[str]:
     """One line for everything of section F that this run has no artefacts for.
 
-    A run with ladders is asked for what Figures 3 to 5 need, one with agents or with neither for Figure 6's.
+    A run with ladders is asked for what Figures 3 to 5 need, one with agents for those that Figure 6 has beside them.
     """
     lines = [] if found.ensembles else ["no ensemble"]
     lines += [f"no truth of {goal} in its domain, to match members with" for goal in _unknown_goals(selection)]
     lines += [f"no executions.csv in {found.name(artefact)}: its domain tells no distance" for artefact in found.silent]
     if rooms or found.ladders:
         lines += missing_ladders(rooms, distance["options"])
-    if names or not (rooms or found.ladders):
+    if names:
         lines += missing_agents(names)
+    elif not (rooms or found.ladders):
+        lines.append("no agents")  # nor anything to compare: which ones Figure 6 has, the report says
     return lines + _unfinished_cells(found.run)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ def export_episodes(
 
     Args:
         meta: the artefact that ``train-meta`` wrote.
-        out: the dataset's folder; its name, such as ``solved-v0``, is the dataset's id.
+        out: the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
         episodes: how many.
         seed: of the draws of options.
         force: replace an empty folder at ``out``; any other has to be moved away.
@@ -61,9 +62,17 @@ def export_episodes(
     try:
         with Progress("export", total=episodes, quiet=quiet) as progress:
             steps = write_minari(
-                made, told(progress), name=out.name, actions=loop.engine.n_actions, description=described
+                made, told(progress), name=dataset_id(out), actions=loop.engine.n_actions, description=described
             )
         put_in_place(made, out)
     finally:
         shutil.rmtree(made, ignore_errors=True)
     return steps
+
+
+def dataset_id(out: Path) -> str:
+    """By which id minari finds a dataset's folder: ``namespace/name-v0`` below where it looks, else ``name-v0``."""
+    told = os.environ.get("MINARI_DATASETS_PATH")
+    root = Path(os.path.expanduser("~"), ".minari", "datasets") if told is None else Path(told)
+    inside = out.resolve().is_relative_to(root.resolve())
+    return out.resolve().relative_to(root.resolve()).as_posix() if inside else out.name

@@ -7,15 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core import own_code
 from hypogoal.core.artefacts import claim
 from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.kinds import ARRAYS, DATA
 from hypogoal.core.own_code import load_own
+from hypogoal.core.seeding import torch_generator
 from hypogoal.dataset import open_dataset, write_dataset
+from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data import MAIN_FILE, collected_of, read_arrays, read_images, read_minari, write_arrays
 
-DOMAIN = "imported"  # of states whose domain is not said
 LABELS = "hypogoal.labels"  # entry points of label functions
 
 
@@ -27,7 +29,7 @@ def import_data(
     labels: Mapping[str, str] | None = None,
     key: str = "",
     share: float = 0.2,
-    domain: str = DOMAIN,
+    domain: str = IMPORTED,
     seed: int = 0,
     force: bool = False,
 ) -> dict[str, Any]:
@@ -62,11 +64,26 @@ def import_data(
     else:
         parts = read_arrays(source)
     collected, warned = collected_of(parts, sub_goals, share=share, seed=seed)
+    warned += _too_small(domain, collected.observation_shape)
     for line in warned:
         print(f"hypogoal: {line}", file=sys.stderr)
     config = {"source": source.name, **({"labels": dict(labels)} if labels else {})}
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()
+
+
+def _too_small(domain: str, shape: tuple[int, ...]) -> list[str]:
+    """What ``train-ensemble`` will say of such images, unless it is given another network."""
+    from hypogoal.hypotheses.config import EnsembleConfig
+    from hypogoal.hypotheses.networks import build_network
+
+    name = defaults_of(domain, "train-ensemble", given=True).get("network", EnsembleConfig().network)
+    try:
+        with own_code.given(name):  # by the domain, which the user gave
+            build_network(name, shape, torch_generator(0, "import"))
+    except UserError as error:
+        return [str(error)]
+    return []
 
 
 def export_data(data: Path, out: Path, *, force: bool = False) -> None:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import sys
 from collections import Counter
@@ -22,7 +21,7 @@ from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.workers import cores
-from hypogoal.domains.base import defaults_of, load_domain
+from hypogoal.domains.base import CONFIGS, defaults_of, load_domain, stage_config
 from hypogoal.experiments import doorkey, montezuma_ladders
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
@@ -52,12 +51,6 @@ FIGURES = {  # of the paper: the experiment and its preset
     "figure4": ("montezuma-ladders", "figure4"),
     "figure6": ("doorkey", "figure6"),
 }
-CONFIGS = {
-    "train-ensemble": "hypogoal.stages.train_ensemble:TrainEnsembleConfig",
-    "train-options": "hypogoal.stages.train_options:TrainOptionsConfig",
-    "train-meta": "hypogoal.stages.train_meta:TrainMetaConfig",
-    "train-baseline": "hypogoal.stages.train_baseline:BaselineConfig",
-}
 AGAIN = "give the same command again to go on"
 
 
@@ -76,8 +69,7 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
         raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
     if stage not in CONFIGS:
         raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}.")
-    module, _, name = CONFIGS[stage].partition(":")
-    return getattr(importlib.import_module(module), name)
+    return stage_config(stage)
 
 
 def plan(

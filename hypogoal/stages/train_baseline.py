@@ -102,11 +102,12 @@ def train_baseline(
             writer.writerow(("step", "length", "reward", "terminated"))
             writer.writerows(env.episodes)
         save_tensors(folder / "policy.safetensors", weights(agent))
+        random_success = _random_success(engine, config, seed)
         facts = {
             "layout_seed": config.layout_seed,
             "shortest_path": engine.shortest_path() if hasattr(engine, "shortest_path") else None,
-            "random_success": _random_success(engine, config, seed),
-            "random_episodes": config.random_episodes,
+            "random_success": random_success,
+            "random_episodes": 0 if random_success is None else config.random_episodes,
         }
         (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")
     last = env.episodes[-100:]

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import resolve
+from hypogoal.core.config import from_values, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import Collected, States, require_names
-from hypogoal.domains.base import Domain, Engine, Step
+from hypogoal.domains.base import CONFIGS, Domain, Engine, Step, stage_config
 from hypogoal.testing.verdict import Broken, Test, Verdict, run
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
@@ -39,6 +41,8 @@ class _Contract:
 
     def tests(self) -> Iterator[Test]:
         yield "names", self.names
+        if getattr(self.domain, "defaults", None):
+            yield "defaults", self.defaults
         if hasattr(self.domain, "make"):
             yield "gymnasium", self.gymnasium
         for test in (self.engine, self.images, self.steps, self.labels, self.determinism, self.going_on):
@@ -55,6 +59,21 @@ class _Contract:
         if self.config is None:
             self.config = resolve(self.domain.config_class, stage="collect")
         return ", ".join(goals)
+
+    def defaults(self) -> str:
+        """Of each stage settings that it has, with values that it takes."""
+        known: dict[str, Callable[[], type]] = {
+            "collect": lambda: self.domain.config_class,
+            **{one: partial(stage_config, one) for one in CONFIGS},
+        }
+        given: Mapping[str, Mapping[str, Any]] = self.domain.defaults  # type: ignore[attr-defined]
+        for stage, values in given.items():
+            near = difflib.get_close_matches(str(stage), known, n=1)
+            do = f"Did you mean {near[0]!r}?" if near else f"The stages are {', '.join(known)}."
+            _is(stage in known, f"defaults are of {stage!r}, which is no stage", do)
+            _is(isinstance(values, Mapping), f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
+            from_values(known[stage](), values, stage)
+        return ", ".join(f"{stage} {len(values)}" for stage, values in given.items())
 
     def gymnasium(self) -> str:
         """Gymnasium's own checker."""

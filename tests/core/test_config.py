@@ -147,9 +147,17 @@ def test_the_paper_preset_has_the_papers_tables() -> None:
     )
     assert (meta.meta_network, meta.head) == ("paper", "gaussian")
     run = resolve(config_class_of("run"), stage="run", preset="paper")
-    assert len(run.layout_seeds) == 10 and not run.pretrain
+    assert not run.pretrain and run.paired
+    assert len(set(run.layout_seeds)) == len(set(run.seeds)) == 10, "ten agents, each with an ensemble of its own"
     collect = resolve(config_class_of("collect"), stage="collect", preset="paper")
     assert collect.door_label == "in-front" and collect.regime == "fixed"
+
+
+def test_the_paper_preset_has_the_papers_ladders() -> None:
+    """Spec D4, F1, F3: Figures 3 and 4 for every number of labelled ladder groups, ten seeds."""
+    run = resolve(config_class_of("run", "montezuma"), stage="run", preset="paper", domain="montezuma")
+    assert run.groups == run.option_groups == tuple(range(1, 8))
+    assert len(set(run.seeds)) == 10 and run.ladders
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -25,7 +25,7 @@ from hypogoal.domains.doorkey import (
     register,
 )
 from hypogoal.domains.doorkey_env import layout_of
-from hypogoal.domains.doorkey_states import DROP, FORWARD, LEFT, PICKUP, TOGGLE
+from hypogoal.domains.doorkey_states import DROP, FORWARD, LEFT, PICKUP, TOGGLE, DoorKeyStates
 
 SAME_GRID = (90, 103)  # layout seeds whose grids are the same
 
@@ -239,6 +239,16 @@ def test_shuffled_collection() -> None:
     assert known < 0.5
     wall = first.labelled.observations[:, :8]  # the top row of cells
     assert (wall == wall[0]).all()
+
+
+def test_heldout_states_look_like_none_to_learn_from() -> None:
+    """Spec B3: with its keys picked up layout 1001 looks like layout 1 or 2 in some of its states."""
+    data = collected(heldout_first=1001, heldout_layouts=1)
+    known = {image.tobytes() for states in (data.labelled, data.unlabelled) for image in states.observations}
+    assert not known & {image.tobytes() for image in data.heldout.observations}
+    everything = DoorKeyStates(layout_of(1001))
+    assert 0 < len(data.heldout.labels) < len(everything.reachable())
+    assert all(len(values) == len(data.heldout.labels) for values in data.heldout.origins.values())
 
 
 def test_held_out_layouts_are_new() -> None:

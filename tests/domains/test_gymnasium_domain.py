@@ -16,7 +16,7 @@ from hypogoal.core.progress import Progress
 from hypogoal.dataset import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
-from hypogoal.domains.gymnasium_engine import GymnasiumEngine
+from hypogoal.domains.gymnasium_engine import GymnasiumEngine, channels_first
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 
@@ -200,3 +200,20 @@ def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     assert load_domain("domain_lying_here:DOMAIN", given=True) is DOMAIN
+
+
+@pytest.mark.parametrize(
+    ("shape", "first"),
+    [
+        ((3, 48, 48), True),
+        ((12, 48, 48), True),
+        ((16, 84, 84), True),
+        ((48, 48, 12), False),
+        ((16, 64, 16), False),
+        ((20, 84, 84), False),
+        ((3, 48), False),
+    ],
+)
+def test_channels_first_are_known_by_their_shape(shape: tuple[int, ...], first: bool) -> None:
+    """Spec B6: of any number of channels, stacks of colour frames too, and never an image that is only low."""
+    assert channels_first(shape) == first

@@ -39,7 +39,9 @@ def test_an_own_domain_goes_through_the_stages(tmp_path: Path) -> None:
     few = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
     assert main(["train-options", str(run / "ensemble"), "--out", str(run / "options"), *few]) == 0
     assert main(["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), *few]) == 0
-    assert json.loads((run / "meta" / "layout.json").read_text())["shortest_path"] is None
+    for stage in ("options", "meta"):
+        facts = json.loads((run / stage / "layout.json").read_text())
+        assert (facts["shortest_path"], facts["random_success"], facts["random_episodes"]) == (None, None, 0)
     assert (run / "meta" / "episodes.csv").read_text().count("\n") > 10
 
 
@@ -58,7 +60,7 @@ def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
     few = [word for pair in ("steps=128", "max_episode_steps=20") for word in ("--set", pair)]
     assert main([*train, *few]) == 0
     facts = json.loads((tmp_path / agent / "layout.json").read_text(encoding="utf-8"))
-    assert facts["shortest_path"] is None and facts["random_success"] is None
+    assert (facts["shortest_path"], facts["random_success"], facts["random_episodes"]) == (None, None, 0)
     assert json.loads((tmp_path / agent / "manifest.json").read_text())["config"]["domain"] == "own_domain:ODD"
 
 

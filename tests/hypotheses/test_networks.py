@@ -9,7 +9,15 @@ import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.networks import ENTRY_POINTS, NETWORKS, as_input, build_network, folded, reordered
+from hypogoal.hypotheses.networks import (
+    ENTRY_POINTS,
+    NETWORKS,
+    as_input,
+    build_network,
+    folded,
+    reordered,
+    smallest_side,
+)
 
 SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "montezuma-crop": (24, 32, 4)}
 
@@ -65,6 +73,33 @@ def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     assert network_of(name, shape).eval()(torch.zeros(1, 1, smallest, smallest + 9)).shape == (1, 2)
     with pytest.raises(UserError, match=rf"too small for the network '{name}': observation shape \({smallest - 1},"):
         network_of(name, (smallest - 1, smallest, 1))
+    with pytest.raises(UserError, match=rf"It takes {smallest}x{smallest} pixels: give larger ones"):
+        network_of(name, (smallest - 1, smallest, 1))
+    page = (Path(__file__).parents[2] / "docs" / "own-domain.md").read_text(encoding="utf-8")
+    assert f"{smallest}x{smallest}" in page
+
+
+def test_images_too_small_are_told_where_to_go() -> None:
+    """Spec C5, G2: the networks that take them as they are, and one's own always."""
+    told = []
+    for side in (40, 30, 12):
+        with pytest.raises(UserError) as caught:
+            network_of("doorkey", (side, side, 3))
+        told.append(caught.value.do)
+    begin = "It takes 41x41 pixels: give larger ones,"
+    own = "or a network of your own (--set network=module:function)."
+    assert told == [
+        f"{begin} --set network=montezuma, --set network=montezuma-crop, {own}",
+        f"{begin} --set network=montezuma-crop, {own}",
+        f"{begin} {own}",
+    ]
+
+
+@pytest.mark.parametrize(("layers", "side"), [([nn.Conv2d(2, 1, 7)], 7), ([nn.Conv2d(2, 1, 3, padding=1)], 1)])
+def test_the_smallest_image_is_found(layers: list[nn.Module], side: int) -> None:
+    """Spec C5, G2: worked by hand; of layers for other channels there is none."""
+    assert smallest_side(layers, 2) == side
+    assert smallest_side(layers, 3) is None
 
 
 def test_wrong_names_and_shapes_are_one_clear_line() -> None:
@@ -81,13 +116,15 @@ def test_another_package_adds_its_own_network(monkeypatch: pytest.MonkeyPatch, t
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 1.0\n")
     (folder / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\ntiny = own_network:tiny\nbad = own_network:nothing\n")
-    code = "from torch import nn\ndef tiny(channels):\n    return [nn.Conv2d(channels, 2, 3)], (5,)\n"
+    code = "from torch import nn\ndef tiny(channels):\n    return [nn.Conv2d(1, 2, 3)], (5,)\n"
     (tmp_path / "own_network.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     layers = list(network_of("tiny", (8, 8, 1)))
     assert [layer.in_features for layer in layers if isinstance(layer, nn.Linear)] == [2 * 6 * 6, 5]
     with pytest.raises(UserError, match="cannot be loaded"):
         network_of("bad", (8, 8, 1))
+    with pytest.raises(UserError, match="the network 'tiny' takes no images of 3 channels"):
+        network_of("tiny", (8, 8, 3))
 
 
 def test_weights_come_from_the_generator_alone() -> None:

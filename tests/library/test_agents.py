@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from corridor_env import LENGTH, CorridorEnv, Flipped, Grey
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
@@ -23,6 +27,8 @@ from hypogoal.core.artefacts import find_artefacts
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.env import Options
+from hypogoal.options.initiation import Narrowed
+from hypogoal.options.networks import LightQNetwork
 
 TESTS = Path(__file__).parents[1]
 MEMBERS = 2
@@ -107,6 +113,46 @@ def test_options_are_held_back_by_what_was_learned_of_them(run: Path, options: O
     assert env.action_masks().tolist() == [False, True, False, False]
 
 
+def test_options_are_masked_as_they_were_trained(run: Path, options: Options) -> None:
+    """Spec D6: with mask_reached=false options are offered where their sub-goals hold, to other agents too."""
+    shutil.copytree(run / "options", run / "unmasked")
+    manifest = json.loads((run / "unmasked" / "manifest.json").read_text(encoding="utf-8"))
+
+    def unmasked(value: Any) -> Options:
+        manifest["config"]["mask_reached"] = value
+        (run / "unmasked" / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+        return hypogoal.load_options(run / "unmasked")
+
+    for known, masks in ((options, [False, False, True, True]), (unmasked(False), [True] * 4)):
+        env = hypogoal.OptionEnv(corridor(), known)
+        env.reset(seed=0)
+        env.step(0)  # to the left end, where the sub-goal of the first two holds
+        assert env.action_masks().tolist() == masks
+    with pytest.raises(hypogoal.UserError, match="setting 'mask_reached' is malformed"):
+        unmasked("false")
+
+
+def test_options_go_to_another_process(run: Path, options: Options) -> None:
+    """Spec E1: with their ensembles and initiation sets; what arrives says and does the same."""
+    learned = Narrowed(
+        {f"network.{name}": value for name, value in LightQNetwork((48, 48, 3), 4, 1).state_dict().items()}
+        | {"executions": torch.full((4,), 1_000)},
+        (48, 48, 3),
+        4,
+        0.5,
+    )
+    for known in (options, replace(options, initiation=learned)):
+        sent = pickle.loads(pickle.dumps(known))  # noqa: S301 - our own
+        env = corridor()
+        observation, _ = env.reset(seed=0)
+        for action in (0, 0, 1, 1, 1, 1, 1):
+            assert sent.offered(observation).tolist() == known.offered(observation).tolist()
+            assert [sent.policies(one)(observation) for one in range(4)] == [
+                known.policies(one)(observation) for one in range(4)
+            ]
+            observation, *_ = env.step(action)
+
+
 def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) -> None:
     """Spec E1: Gymnasium's checker, whose warnings are errors here, but for the one that says: wrapped."""
     wrapped = [
@@ -175,7 +221,7 @@ def test_options_in_a_vector_of_environments(options: Options) -> None:
     envs.close()
 
 
-@pytest.mark.parametrize("by", ["any", "vote", "all", "mean", 0, 1])
+@pytest.mark.parametrize("by", ["any", "vote", "all", "mean", 0, 1, np.int64(1), np.array(0), torch.tensor(1)])
 def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) -> None:
     """Spec D1: reward 1 where the classifier fires, else 0; with ``add`` the environment's own too."""
     env = hypogoal.SubgoalReward(corridor(), ensemble, by)
@@ -201,9 +247,29 @@ def test_mistakes_are_one_line(options: Options, ensemble: Ensemble) -> None:
     for make in (lambda: hypogoal.OptionEnv(other, options), lambda: hypogoal.SubgoalReward(other, ensemble)):
         with pytest.raises(UserError, match=r"not those that these members know: uint8 \(24, 24, 3\)"):
             make()
-    for by in ("most", 2, -1, True):
+    for by in ("most", 2, -1, True, np.True_, 1.0, np.int64(2), None):
         with pytest.raises(UserError, match="Choose one of any, vote, all, mean, or a member, 0 to 1"):
             hypogoal.SubgoalTermination(CorridorEnv(), ensemble, by)
+    env = hypogoal.OptionEnv(corridor(), options)
+    with pytest.raises(UserError, match="was not reset"):
+        env.step(0)
+    env.reset(seed=0)
+    for action in (-1, options.count, 0.5, np.array([0, 1])):
+        with pytest.raises(UserError, match=r"no such option: .*They are 0 to 3"):
+            env.step(action)
+    assert env.step(np.int64(0))[4]["duration"] == 2
+
+
+def test_observations_may_be_listed(ensemble: Ensemble) -> None:
+    """The contract of the Python interface: as arrays or as a list of them; of different shapes they are refused."""
+    observation, _ = corridor().reset(seed=0)
+    both = np.stack([observation, observation[::-1]])
+    np.testing.assert_array_equal(ensemble.predict(list(both)), ensemble.predict(both))
+    np.testing.assert_array_equal(ensemble.verdicts(list(both)), ensemble.verdicts(both))
+    for odd in ([observation, observation[:9]], [], [1.0], "no"):
+        with pytest.raises(UserError, match="not observations that the ensemble knows"):
+            ensemble.predict(odd)
+    assert hypogoal.UserError is UserError
 
 
 def _first_choice(agent: MaskablePPO, env: hypogoal.OptionEnv) -> int:

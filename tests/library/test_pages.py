@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import sys
 from pathlib import Path
 
+import own_domain
 import pytest
 from keyboard import label
 from test_docs import blocks, commands
@@ -77,8 +79,10 @@ def test_the_page_of_own_data(demo: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert open_dataset(tmp_path / "at-the-door.h5").counts()["heldout"]["at-the-door"] == {"states": 2, "positives": 1}
 
 
-def test_the_page_of_own_domains_shows_a_test_that_runs() -> None:
-    """docs/own-domain.md: the test for one's own test-suite."""
+def test_the_page_of_own_domains_shows_a_test_that_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/own-domain.md: the test for one's own test-suite, of a smaller domain than the page's."""
+    monkeypatch.delenv("HYPOGOAL_TRUST", raising=False)
+    monkeypatch.setitem(sys.modules, "unlock_pickup", own_domain)
     space: dict[str, object] = {}
     exec(compile(blocks(ROOT / "docs" / "own-domain.md", "python")[1], "own-domain.md", "exec"), space)
     space["test_my_domain"]()  # type: ignore[operator]

@@ -12,7 +12,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
-from hypogoal.options.initiation import FEWEST, Initiation, narrowing
+from hypogoal.options.initiation import FEWEST, Initiation, Narrowed
 from hypogoal.options.recording import Recorder
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
 
@@ -94,7 +94,7 @@ def test_an_artefacts_initiation_sets_hold_back_the_same() -> None:
     for _ in range(600):
         loop.step()
     own = loop.initiation
-    narrow = narrowing(own.state(), loop.engine.observation_shape, 2, 0.5)
+    narrow = Narrowed(own.state(), loop.engine.observation_shape, 2, 0.5)
     ids = np.arange(LENGTH)
     offered = np.ones((LENGTH, 2), dtype=np.bool_)
     offered[0, 0] = offered[-1, 1] = False
@@ -103,6 +103,6 @@ def test_an_artefacts_initiation_sets_hold_back_the_same() -> None:
     np.testing.assert_array_equal(found, expected)
     assert not np.array_equal(expected, offered) and expected.any(1).all()
     with pytest.raises(UserError, match=r"initiation\.safetensors"):
-        narrowing(own.state(), loop.engine.observation_shape, 3, 0.5)
+        Narrowed(own.state(), loop.engine.observation_shape, 3, 0.5)
     with pytest.raises(UserError, match=r"initiation\.safetensors"):
-        narrowing({**own.state(), "executions": torch.zeros(3)}, loop.engine.observation_shape, 2, 0.5)
+        Narrowed({**own.state(), "executions": torch.zeros(3)}, loop.engine.observation_shape, 2, 0.5)

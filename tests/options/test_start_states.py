@@ -15,11 +15,11 @@ from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.env import make_policies
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
 from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels
+from hypogoal.options.policies import make_policies
 from hypogoal.options.recording import EXECUTION_COLUMNS, EXECUTIONS_KEPT, Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.running import MemberVerdicts, running_verdicts

@@ -58,6 +58,39 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     assert metrics["ensembles"][0]["sub_goals"][0]["balanced_accuracy"]["worst"] > 0.9
 
 
+def test_images_too_small_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: when they are imported, not when they are trained on; the network that is named takes them."""
+    shrunk = {
+        name: values[:, ::2, ::2] for name, values in arrays().items() if name not in ("labels", "heldout_labels")
+    }
+    np.savez(tmp_path / "small.npz", **arrays(**shrunk))
+    data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
+    assert main(["import", str(tmp_path / "small.npz"), "--out", data, "-q"]) == 0
+    told = capsys.readouterr().err
+    assert "images too small for the network 'doorkey': observation shape (24, 24, 3). It takes 41x41 pixels" in told
+    few = [word for pair in ("steps=2", "members=1", "network=montezuma-crop") for word in ("--set", pair)]
+    assert "--set network=montezuma-crop" in told
+    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
+    assert main(["import", str(tmp_path / "small.npz"), "--out", str(tmp_path / "m.h5"), "--domain", "montezuma"]) == 0
+    assert "too small for the network 'montezuma'" in capsys.readouterr().err
+    np.savez(tmp_path / "own.npz", **arrays())
+    assert main(["import", str(tmp_path / "own.npz"), "--out", str(tmp_path / "large.h5")]) == 0
+    assert "too small" not in capsys.readouterr().err
+
+
+def test_options_of_states_of_no_domain_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6, G2: what to do is said: which domain the states are of is told when they are imported."""
+    np.savez(tmp_path / "own.npz", **arrays())
+    data, ensemble = str(tmp_path / "data.h5"), str(tmp_path / "ensemble")
+    assert main(["import", str(tmp_path / "own.npz"), "--out", data, "-q"]) == 0
+    few = [word for pair in ("steps=2", "members=1") for word in ("--set", pair)]
+    assert main(["train-ensemble", data, "--out", ensemble, "-q", *few]) == 0
+    capsys.readouterr()
+    assert main(["train-options", ensemble, "--out", str(tmp_path / "options"), "-q"]) == 2
+    told = capsys.readouterr().err
+    assert "which domain these imported states are of: imported. Import them again with --domain" in told
+
+
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
     """Spec B6: labels (N, G), a folder of .npy files, and the way back as .npz, names included."""
     labels = np.stack([np.arange(40) % 2, np.arange(40) % 3 == 0], axis=1)
@@ -141,10 +174,14 @@ def test_unbalanced_classes_are_warned_of() -> None:
 
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unlabelled": None}, "no array 'unlabelled'"),
+    ({"unlabelled": None, "unlabeled": pictures(5)[0]}, "unknown array 'unlabeled': .* Did you mean 'unlabelled'"),
+    ({"held_out_labels": np.zeros(3)}, "unknown array 'held_out_labels': .* Did you mean 'heldout_labels'"),
+    ({"rewards": np.zeros(3)}, "unknown array 'rewards': .* Known are observations, labels, unlabelled"),
     ({"heldout_labels": None}, "held-out states need observations and labels"),
     ({"observations": pictures(40)[0] / 255}, r"are no bytes: float64.*255 \* x"),
     ({"observations": pictures(40)[0].astype(int) * 9}, "do not fit bytes"),
     ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"channels first.*transpose\(0, 2, 3, 1\)"),
+    ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"channels first: uint8 \(60, 12, 48, 48\)"),
     ({"observations": np.zeros((40, 9), np.uint8)}, "are no images"),
     ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "another shape than the labelled ones"),
     ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
@@ -168,6 +205,11 @@ def test_what_is_wrong_with_arrays_is_one_line(tmp_path: Path, changes: dict[str
     np.savez(tmp_path / "own.npz", **arrays(**changes))
     with pytest.raises(UserError, match=message):
         collected_of(read_arrays(tmp_path / "own.npz"), ())
+    if all(values.dtype != object for values in arrays(**changes).values()):  # which .npy would hold as a pickle
+        for name, values in arrays(**changes).items():
+            np.save(tmp_path / f"{name}.npy", values)
+        with pytest.raises(UserError, match=message):
+            collected_of(read_arrays(tmp_path), ())
 
 
 def test_damaged_arrays_are_one_line(tmp_path: Path) -> None:

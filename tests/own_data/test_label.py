@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pygame
 import pytest
 from keyboard import label
 
@@ -20,7 +21,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.own_data import Marks, read_images
 from hypogoal.own_data.marking import as_rgb
-from hypogoal.own_data.states_to_mark import action_names, action_of
+from hypogoal.own_data.states_to_mark import GRID_KEYS, action_help, action_names, action_of
 from hypogoal.stages.label import environment_of
 
 
@@ -136,6 +137,27 @@ def test_keys_are_actions() -> None:
     assert action_of(atari, "x", nothing) is None
     numbers = ("0", "1", "2")
     assert action_of(numbers, "2", nothing) == 2 and action_of(numbers, "3", nothing) is None
+
+
+def test_every_key_that_is_offered_plays_its_action() -> None:
+    """Spec B6: names without a key go by their number, from 10 on by a letter; none of these is a key that marks."""
+    nothing: frozenset[str] = frozenset()
+    some = ("left", "right", "forward", "attack")
+    assert action_help(some) == ("left or a: left, right or d: right, up or w: forward", "3: attack")
+    assert action_of(some, "3", nothing) == 3 and action_of(some, "attack", nothing) is None
+    twelve = tuple(map(str, range(12)))
+    assert [action_of(twelve, key, nothing) for key in ("9", "b", "c", "f")] == [9, 10, 11, None]
+    names = (*GRID_KEYS, *map(str, range(26)))
+    told = [one.partition(": ")[::2] for line in action_help(names) for one in line.split(", ")]
+    assert [name for _, name in told] == list(names)
+    offered = [(key, name) for keys, name in told if keys != "no key" for key in keys.split(" or ")]
+    every = {key for key, _ in offered}
+    assert len(every) == len(offered) and not every & {"p", "n", "u", "m", "r", "l", "backspace", "escape"}
+    pygame.display.init()
+    for key, name in offered:
+        assert action_of(names, key, nothing) == names.index(name)
+        assert pygame.key.key_code(key), "pygame knows no such key"
+    pygame.quit()
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from benchmarks.kills import STAGES, needed
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.own_data import read_minari
+from hypogoal.stages.export_episodes import dataset_id
 
 LAYOUT = 100
 EPISODES = 3
@@ -84,6 +85,22 @@ def test_exported_episodes_are_imported(agent: Path, there: Path) -> None:
     assert main(["export", str(agent), "--out", str(there / "toy-v1"), "--episodes", str(EPISODES), "-q"]) == 0
     episodes = minari.load_dataset("toy-v1").iterate_episodes()
     assert states_in(there / "toy-v1") == sorted(seen.tobytes() for one in episodes for seen in one.observations)
+
+
+@pytest.mark.parametrize("place", ["keys/deep/toy-v0", "toy-v0"])
+def test_a_dataset_is_called_by_where_it_lies(
+    agent: Path, there: Path, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec B6: in a namespace its id begins with that, whichever way its place is written; outside it is its name."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(agent), "--out", f"minari/{place}", "--episodes", "1", "-q"]) == 0
+    dataset = minari.load_dataset(place)
+    assert dataset.id == dataset.spec.dataset_id == place
+    assert place in minari.list_local_datasets()
+    assert dataset_id(tmp_path / "elsewhere" / "toy-v0") == "toy-v0"
+    monkeypatch.delenv("MINARI_DATASETS_PATH")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert dataset_id(tmp_path / ".minari" / "datasets" / place) == place
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
@@ -19,6 +20,7 @@ from hypogoal.evaluation.found import find
 from hypogoal.evaluation.summary import hypotheses_summary
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import write_plan
+from hypogoal.inspection import summary_of
 from hypogoal.stages.collect import collect
 from hypogoal.stages.evaluate import evaluate, missing, summary_table
 from hypogoal.stages.report import draw_figures, report
@@ -196,6 +198,44 @@ def test_an_ensemble_alone_can_be_evaluated(run, tmp_path):
     assert "train-baseline" in report(tmp_path).read_text(encoding="utf-8")
 
 
+def test_hypotheses_alone_are_told_in_the_terminal(run, tmp_path, capsys, monkeypatch):
+    """Spec A5, A8, F1: a table of members, none of agents that nobody trained; 'show' tells it again, damage too."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for name in ("ensemble", "ensemble-none"):
+        shutil.copytree(run / name, tmp_path / name)
+    shutil.copy(run / "data.h5", tmp_path / "data.h5")
+    assert main(["evaluate", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    metrics = json.loads((tmp_path / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    row = next(row for row in metrics["hypotheses"] if row["sub_goal"] == "open-red-door")
+    numbers = [f"{row[which]['mean']:.3f}" for which in ("best", "mean", "worst")]
+    (line,) = (line for line in told.splitlines() if "open-red-door" in line)
+    assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
+    assert "dbat, K=2" in told and "no diversity, K=2" in told and max(map(len, told.splitlines())) <= 80
+    assert metrics["missing"] == ["no agents"] and "PPO" not in told and "last 100" not in told
+    for path in (tmp_path, tmp_path / "evaluation"):
+        assert main(["show", str(path)]) == 0
+        assert line in capsys.readouterr().out.splitlines()
+    assert main(["show", str(tmp_path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["metrics"] == metrics
+    (tmp_path / "evaluation" / "metrics.json").write_text("{}", encoding="utf-8")
+    assert main(["show", str(tmp_path)]) == 2
+    assert "metrics.json" in capsys.readouterr().err
+
+
+def test_numbers_of_a_stranger_are_shown_as_they_are():
+    """Spec G2: a terminal obeys nothing that stands in an evaluation, and one of another shape is told."""
+    row = {"name": "[red]x[/blue]\x1b[31m", "sub_goal": "y"}
+    row |= {which: {"mean": 0.5} for which in ("best", "mean", "worst", "disagreement_heldout")}
+    numbers = {"rooms": [], "hypotheses": [row], "distance": {"options": []}, "agents": [], "missing": []}
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(summary_of(numbers, "here"))
+    text = console.export_text()
+    assert "[red]x[/blue]?" in text and "\x1b" not in text
+    with pytest.raises(UserError, match="the evaluation is damaged: here"):
+        summary_of(numbers | {"hypotheses": [{"name": 3}]}, "here")
+
+
 def test_tables_fit_a_terminal(metrics):
     """Spec A5: the summary is readable at 80 columns."""
     for table in (summary_table(metrics), hypotheses_summary(metrics)):
@@ -306,8 +346,6 @@ def test_the_papers_figures_as_files(run, metrics, tmp_path):
 
 def test_figures_on_request_from_the_command_line(run, metrics, tmp_path, capsys):
     """Spec F7, G2: files on stdout, what is missing on stderr; an unknown format is one line."""
-    from hypogoal.cli import main
-
     assert main(["report", str(run), "--figures", str(tmp_path / "a"), "--format", "jpeg"]) == 2
     assert "Choose one of svg, pdf, png" in capsys.readouterr().err
     assert not (tmp_path / "a").exists()

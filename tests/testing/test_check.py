@@ -141,6 +141,33 @@ def test_each_broken_promise_is_named(domain: CorridorDomain, name: str, message
         require(check_domain(domain))
 
 
+DEFAULTS: list[tuple[dict[str, Any], str]] = [
+    ({"train-ensemble": {"memberz": 4}}, "train-ensemble has no setting: memberz. Did you mean 'members'?"),
+    ({"train_ensemble": {"members": 4}}, "defaults are of 'train_ensemble', which is no stage. Did you mean"),
+    ({"train-meta": {"steps": 0}}, "value out of range: steps=0 in train-meta"),
+    ({"collect": {"copiez": 2}}, "collect has no setting: copiez"),
+    ({"train-options": 7}, "defaults of train-options are 7"),
+]
+
+
+@pytest.mark.parametrize(("defaults", "message"), DEFAULTS)
+def test_defaults_that_no_stage_takes_are_named(defaults: dict[str, Any], message: str) -> None:
+    """Spec B6: of a misspelt stage nothing would ever be heard, of a misspelt setting only when the stage is run."""
+    domain = CorridorDomain()
+    domain.defaults = {"train-ensemble": {"members": 4}, **defaults}  # type: ignore[attr-defined]
+    fault = first_fault(check_domain(domain))
+    assert fault.name == "defaults" and message in fault.text
+
+
+def test_defaults_that_stages_take_pass() -> None:
+    """Spec B6."""
+    domain = CorridorDomain()
+    domain.defaults = {"train-ensemble": {"members": 4}, "collect": {"copies": 2}, "train-baseline": {}}  # type: ignore[attr-defined]
+    verdicts = list(check_domain(domain))
+    require(verdicts)
+    assert verdicts[1].text == "train-ensemble 1, collect 1, train-baseline 0"
+
+
 def test_broken_names() -> None:
     """Spec G2: names of sub-goals become names of files."""
     domain = CorridorDomain()

@@ -1,0 +1,117 @@
+"""What options do, out of an artefact's weights: greedy policies that start anew with each execution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_fitting
+from hypogoal.options.exploration import actions_of
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork
+
+# A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
+Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
+
+
+def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any]) -> Policies:
+    """Greedy policies from an options artefact's weights.
+
+    Args:
+        config: its manifest's configuration.
+        weights: the tensors of ``options.safetensors``.
+        about: the ensemble manifest's configuration.
+    """
+    if config["termination"] == "oracle":
+        raise UserError(
+            "these options end at the true sub-goals, which only the domain's engine can see",
+            "termination=oracle",
+            "Load options that were trained with learned members.",
+        )
+    shape = tuple(about["observation_shape"])
+    options = len(config["sub_goals"]) * config["members"]
+    last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"
+    outputs = len(weights[last]) // (options if config["network"] == "light" else 1) if last in weights else 0
+    actions = actions_of(weights, outputs)
+    if not outputs or actions.shape != (outputs,):
+        raise UserError("the weights do not fit the manifest", f"{options} options", "Make the artefact again.")
+    make = LightPolicies if config["network"] == "light" else PaperPolicies
+    return make(weights, shape, options, actions)
+
+
+class LightPolicies:
+    """Policies of options that share one network (Spec D8).
+
+    Args:
+        weights: see :func:`make_policies`.
+        shape: of an observation.
+        options: O.
+        actions: the primitive actions among which the network chooses.
+    """
+
+    def __init__(self, weights: Mapping[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]):
+        own = {name[7:]: value for name, value in weights.items() if name.startswith("online.")}
+        self.network = load_fitting(lambda: LightQNetwork(shape, options, len(actions)), own, "options.safetensors")
+        self.actions = actions
+
+    def __call__(self, option: int) -> Callable[[NDArray[np.uint8]], int]:
+        """Start an execution."""
+        return partial(self._act, option)
+
+    @torch.no_grad()
+    def _act(self, option: int, observation: NDArray[np.uint8]) -> int:
+        values = self.network(_as_batch(observation))[0, option]
+        return int(self.actions[int(values.argmax())])
+
+
+class PaperPolicies:
+    """Policies of options that have a network each (Spec D2, D8), which is made when it is first played.
+
+    Args:
+        weights, shape, options, actions: see :class:`LightPolicies`.
+    """
+
+    def __init__(self, weights: Mapping[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]):
+        self.weights, self.shape, self.actions = dict(weights), shape, actions
+        self._networks: dict[int, PaperQNetwork] = {}
+
+    def network(self, option: int) -> PaperQNetwork:
+        """An option's network."""
+        if option not in self._networks:
+            prefix = f"{option}."
+            own = {name[len(prefix) :]: value for name, value in self.weights.items() if name.startswith(prefix)}
+            made = load_fitting(lambda: PaperQNetwork(self.shape, len(self.actions)), own, "options.safetensors")
+            self._networks[option] = made.eval()
+        return self._networks[option]
+
+    def __call__(self, option: int) -> Callable[[NDArray[np.uint8]], int]:
+        """Start an execution."""
+        return _Execution(self.network(option), self.actions)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the networks, which are the weights again."""
+        return {**self.__dict__, "_networks": {}}
+
+
+class _Execution:
+    """One execution of an option whose network remembers it from its first step on."""
+
+    def __init__(self, network: PaperQNetwork, actions: NDArray[np.int64]):
+        self.network, self.actions = network, actions
+        self.hidden: Tensor | None = None
+
+    @torch.no_grad()
+    def __call__(self, observation: NDArray[np.uint8]) -> int:
+        """The action in an observation."""
+        values, self.hidden = self.network(self.network.embed(_as_batch(observation))[:, None], self.hidden)
+        return int(self.actions[int(values[0, 0].argmax())])
+
+
+def _as_batch(observation: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(observation[None]))
