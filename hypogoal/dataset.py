@@ -34,6 +34,7 @@ from hypogoal.core.hdf5 import (
     read_array,
     set_attribute,
 )
+from hypogoal.core.kinds import DATA
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
@@ -42,6 +43,7 @@ ATTRIBUTES = (
 )  # fmt: skip
 AGAIN, REPAIR = "Collect it again.", "hypogoal verify --repair"
 NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
+COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
 
 
@@ -125,7 +127,8 @@ def write_dataset(
         UserError: see :func:`require_names`, or the file exists.
     """
     require_names(collected.sub_goals)
-    claim(path, force=force)
+    path = claim(path, kind=DATA, force=force)
+    parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
@@ -161,7 +164,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
             group["observations"] = first["observations"]
             if "origin" in first:
                 group["origin"] = first["origin"]
-        group.create_dataset("labels", data=states.labels[:, index].astype(np.bool_))
+        write_column(group, "labels", states.labels[:, index].astype(np.bool_))
 
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
@@ -173,9 +176,18 @@ def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
     group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
 
 
+def write_column(group: Any, name: str, values: NDArray[Any]) -> None:
+    """One value for each state, with checksums: unlike compressed states, a label that was flipped is still a label."""
+    if not len(values):
+        group.create_dataset(name, data=values)  # no chunk is as small as that
+        return
+    chunk = (min(COLUMN_CHUNK, len(values)), *values.shape[1:])
+    group.create_dataset(name, data=values, chunks=chunk, fletcher32=True)
+
+
 def _write_origins(group: Any, origins: Mapping[str, NDArray[np.int64]]) -> None:
     for name, values in origins.items():
-        group.create_dataset(f"origin/{name}", data=values)
+        write_column(group, f"origin/{name}", values)
 
 
 class Dataset:

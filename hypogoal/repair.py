@@ -19,9 +19,19 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, require_file
-from hypogoal.core.hdf5 import Foreign, attribute, check_dataset, create_hdf5, find, read_array, set_attribute, walk
+from hypogoal.core.hdf5 import (
+    Busy,
+    Foreign,
+    attribute,
+    check_dataset,
+    create_hdf5,
+    find,
+    read_array,
+    set_attribute,
+    walk,
+)
 from hypogoal.core.preflight import free_disk, human
-from hypogoal.dataset import ATTRIBUTES, open_dataset, write_observations
+from hypogoal.dataset import ATTRIBUTES, open_dataset, write_column, write_observations
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 END_AT = {0: 40, 1: 44, 2: 28, 3: 28}  # where a superblock of each version says how long the file is
@@ -43,15 +53,17 @@ def repair(path: Path) -> Repaired:
 
     Raises:
         UserError: the file is whole, is no HDF5, its beginning is damaged, or no labelled group in it is whole.
+        Busy: another program writes it, or it may not be read.
     """
     size = require_file(path, "the data file is", "Give a data file.")
+    opens = _opens(path)
     if free_disk(path) < size:
         raise UserError(f"not enough disk: {human(size)} needed, {human(free_disk(path))} free", path, "Free some.")
     about, parts = _whole_parts(path, size)
     sub_goals = [name for name in about["sub_goals"] if f"labelled/{name}" in parts]
     if not sub_goals:
         raise UserError("no labelled group is whole, nothing can be saved", path, "Collect it again.")
-    if all(name in parts for name in _expected(about["sub_goals"])) and _opens(path):
+    if all(name in parts for name in _expected(about["sub_goals"])) and opens:
         raise UserError("nothing to repair, every group is whole", path, "See 'hypogoal verify'.")
     lost = [name for name in _expected(about["sub_goals"]) if name not in parts]
     kept = [name for name in parts if name == "unlabelled" or name.partition("/")[2] in sub_goals]
@@ -97,6 +109,8 @@ def _whole_parts(path: Path, size: int) -> tuple[dict[str, Any], dict[str, Part]
 def _opens(path: Path) -> bool:
     try:
         open_dataset(path)
+    except Busy:  # nothing is known to be wrong with it
+        raise
     except UserError:
         return False
     return True
@@ -164,7 +178,7 @@ def _write(
                 elif name == "observations":
                     write_observations(place, values)
                 else:
-                    place.create_dataset(name, data=values.astype(np.bool_) if name == "labels" else values)
+                    write_column(place, name, values.astype(np.bool_) if name == "labels" else values)
                 written.setdefault(id(values), place[name])
     with path.open("rb") as file:
         os.fsync(file.fileno())

@@ -21,6 +21,7 @@ from hypogoal.core.boards import Boards
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import MOST_INTEGER, plain_name
 
 LOG = "metrics.jsonl"
 SHARES = ("success", "reached")  # of episodes or executions, drawn from 0 to 1
@@ -29,6 +30,7 @@ BARS = "▁▂▃▄▅▆▇█"
 NAME, CURVE = 28, 13  # columns of characters
 SECONDS = 2.0  # between two looks
 WIDTH = 80
+LARGEST = 1e300  # of what is drawn
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def _read(log: Path, run: Path) -> Progressing:
     goal = str(last.get("sub_goal", ""))
     own = [line for line in lines if line.get("sub_goal", "") == goal]
     watched = next((key for key in WATCHED if key in last), "")
-    series = tuple(float(line[watched]) for line in own if isinstance(line.get(watched), int | float))
+    series = tuple(float(line[watched]) for line in own if _is_number(line.get(watched)))
     whole = draft is None and (place / MANIFEST).is_file()
     try:
         seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
@@ -141,7 +143,7 @@ def _read(log: Path, run: Path) -> Progressing:
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
-    """The lines of a log; one that is only half written yet is left out."""
+    """The lines of a log that say a step; one that is only half written yet, or damaged, is left out."""
     try:
         text = log.read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -150,11 +152,20 @@ def _lines(log: Path) -> list[dict[str, Any]]:
     for line in text.splitlines():
         try:
             value = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
-        if isinstance(value, dict):
+        if isinstance(value, dict) and _is_step(value.get("step")) and plain_name(value.get("sub_goal", "none")):
             found.append(value)
     return found
+
+
+def _is_step(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= MOST_INTEGER
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it can be drawn; of the largest floats, sums and spans are no numbers."""
+    return type(value) in (int, float) and -LARGEST < value < LARGEST
 
 
 def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
@@ -190,7 +201,7 @@ def _ago(seconds: float) -> str:
 
 def curve(values: Sequence[float], bounds: tuple[float, float] | None = None, width: int = CURVE) -> str:
     """Values as blocks of characters, each the mean of an equal part; from their least to their greatest."""
-    known = [value for value in values if value == value]
+    known = [value for value in values if _is_number(value)]
     count = min(width, len(known))
     if count == 0:
         return ""

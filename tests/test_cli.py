@@ -106,6 +106,13 @@ def test_show_and_verify(made: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert "whole" in capsys.readouterr().out
 
 
+def test_pictures_do_not_spoil_json(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A6: what a machine is to read is JSON and nothing else."""
+    assert main(["show", str(made / "data.h5"), "--json", "--pictures", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["kind"] == "data" and str(tmp_path) in said.err
+
+
 def test_verify_finds_damage(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G2."""
     copy = tmp_path / "ensemble"
@@ -137,14 +144,37 @@ def test_python_interface(made: Path) -> None:
                 env.reset()
 
 
-def test_resume_keeps_what_is_complete(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec A6."""
-    before = (made / "ensemble" / "manifest.json").read_bytes()
-    assert main(["train-ensemble", str(made / "data.h5"), "--out", str(made / "ensemble"), "--resume"]) == 0
-    assert (made / "ensemble" / "manifest.json").read_bytes() == before
-    assert capsys.readouterr().out.strip().endswith("ensemble")
-    line = one_line(capsys, ["train-meta", str(made / "ensemble"), "--out", str(made / "options"), "--resume"])
-    assert "'options' artefact, but meta is needed" in line
+def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec A6, G1: what was made with the same settings, seed and inputs; else it is one line."""
+    made = Path(shutil.copytree(made, tmp_path / "run"))
+    assert main(["evaluate", str(made), "-q"]) == main(["report", str(made), "-q"]) == 0
+    capsys.readouterr()
+    data, ensemble, meta = (str(made / name) for name in ("data.h5", "ensemble", "meta"))
+    collect = ["collect", "doorkey", "--out", data, *SMALL, "--resume", "-q"]
+    train = ["train-ensemble", data, "--out", ensemble, "--set", "steps=4", "--set", "workers=1", "--resume", "-q"]
+    evaluate, report = ["evaluate", str(made), "--resume", "-q"], ["report", str(made), "--resume", "-q"]
+    files = [path for path in sorted(made.rglob("*")) if path.is_file()]
+    before = [path.read_bytes() for path in files]
+    outs = (data, ensemble, str(made / "evaluation"), str(made / "report" / "index.html"))
+    for arguments, out in zip((collect, train, evaluate, report), outs, strict=True):
+        assert main(arguments) == 0
+        said = capsys.readouterr()
+        assert said.out == f"{out}\n" and f"{out} is complete already" in said.err
+    made_with = "what is complete there was made with"
+    cases = [
+        ([*collect, "--seed", "1"], f"{made_with} seed=0, not 1"),
+        ([*train, "--diversity", "none"], f"{made_with} diversity=dbat, not none"),
+        ([*train, "--seed", "3"], f"{made_with} seed=0, not 3"),
+        ([*train, "--unlabelled", data], f"{made_with} other inputs"),
+        ([train[0], str(made / "none.h5"), *train[2:]], "no such data file"),
+        (["train-meta", ensemble, "--out", str(made / "options"), "--resume"], "not of kind 'meta': it is of kind"),
+        (["train-baseline", "montezuma", "--out", meta, "--resume"], "not of kind 'baseline'"),
+        ([*report, "--videos", "1"], f"{made_with} videos=0, not 1"),
+    ]
+    for arguments, words in cases:
+        assert words in one_line(capsys, arguments)
+    assert [path for path in sorted(made.rglob("*")) if path.is_file()] == files
+    assert [path.read_bytes() for path in files] == before
 
 
 def test_same_seed_same_bytes(made: Path, tmp_path: Path) -> None:
@@ -183,7 +213,18 @@ def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["train-meta", ensemble, "--options", ensemble, "--out", out], "but options is needed"),
         (["train-ensemble", data, "--out", ensemble], "exists already"),
         (["collect", "doorkey", "--out", data], "exists already"),
+        (["train-ensemble", data, "--out", data, "--force"], "would replace an input"),
+        (["train-meta", ensemble, "--out", ensemble, "--force"], "would replace an input"),
+        (["export", data, "--out", data, "--force"], "as .npz"),
+        (["collect", "doorkey", "--out", ensemble, "--force"], "not of kind 'data'"),
+        (["evaluate", ensemble, "--out", ensemble, "--force"], "not of kind 'evaluation'"),
         (["train-ensemble", data, "--out", out, "--set", "sub_goals=fly"], "unknown sub-goal: fly"),
+        (["train-ensemble", data, "--out", out, "--set", "sub_goals=go-to-goal,go-to-goal"], "a sub-goal twice"),
+        (["train-ensemble", data, "--out", out, "--seed", "9007199254740992"], "--seed"),
+        (["collect", "doorkey", "--out", out, "--seed", "36893488147419103232"], "--seed"),
+        (["train-meta", ensemble, "--out", out, "--layout-seed", "9007199254740993"], "--layout-seed"),
+        (["train-meta", ensemble, "--out", out, "--set", "layout_seed=9007199254740993"], "out of range"),
+        (["run", "doorkey", "--out", out, "--set", "seeds=1,9007199254740992"], "out of range"),
         (["collect", "chess", "--out", out], "unknown domain: chess"),
         (["collect", "nosuchmodule:DOMAIN", "--out", out], "cannot be loaded"),
         (["run", "doorkey", "--out", out, "--preset", "turbo"], "unknown preset: turbo"),
@@ -205,6 +246,8 @@ def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         ),
         (["evaluate", str(tmp_path / "nothing")], "nothing"),
         (["report", str(tmp_path / "nothing")], "nothing"),
+        (["report", str(made), "--format", "pdf"], "--format is for --figures"),
+        (["report", str(made), "--figures", out, "--videos", "2"], "--videos is for the page"),
         (["config", "bake"], "no such stage"),
         (["train-meta"], "--help"),
         (["frobnicate"], "--help"),

@@ -12,6 +12,7 @@ import pytest
 from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import set_attribute
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
+from hypogoal.verification import faults_of
 
 
 def write(path: Path) -> Path:
@@ -76,6 +77,22 @@ def test_missing_parts_and_other_files(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("hello")
     with pytest.raises(UserError, match="truncated or not HDF5"):
         open_dataset(tmp_path / "text.h5")
+
+
+@pytest.mark.parametrize("name", ["labelled/two/labels", "labelled/one/origin/layout_seed", "heldout/one/observations"])
+def test_a_changed_byte_is_found(tmp_path: Path, name: str) -> None:
+    """Spec A8, G2: a label or origin, too, though any byte may stand there; files without checksums are read."""
+    path = write(tmp_path / "data.h5")
+    with h5py.File(path, "r+") as file:
+        plain = file["unlabelled/origin/layout_seed"][()]
+        del file["unlabelled/origin/layout_seed"]
+        file["unlabelled/origin/layout_seed"] = plain  # as of an earlier version
+        chunk = file[name].id.get_chunk_info(0)
+    assert faults_of(path) == []
+    whole = path.read_bytes()
+    place = chunk.byte_offset + chunk.size // 2
+    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    assert name in " ".join(faults_of(path))
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,12 @@
 """Faults on the way: numbers that are none, disks that are full, folders that may not be written (Spec G2, G3)."""
 
+import errno
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -183,6 +185,28 @@ def test_folders_that_may_not_be_written(tmp_path: Path, capsys: pytest.CaptureF
         assert "no permission to write" in capsys.readouterr().err
     finally:
         tmp_path.chmod(0o755)
+
+
+def test_what_may_not_be_read_is_no_matter_of_the_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G2: the advice is for the file that the system refused."""
+    path = tmp_path / "sealed"
+    path.write_text("x")
+
+    def sealed(*arguments: Any, **options: Any) -> None:
+        monkeypatch.setattr("os.access", lambda name, mode: False)
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr("hypogoal.verification.faults_of", sealed)
+    assert main(["verify", str(path)]) == 2
+    line = capsys.readouterr().err
+    assert f"Permission denied: {path}. Ask for permission to read it." in line and "--out" not in line
+    path.unlink()
+    monkeypatch.undo()
+    monkeypatch.setattr("hypogoal.verification.faults_of", sealed)
+    assert main(["verify", str(path)]) == 2
+    assert "--out" in capsys.readouterr().err
 
 
 def test_nothing_depends_on_the_clock() -> None:

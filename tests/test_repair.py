@@ -44,6 +44,19 @@ def test_a_cut_off_file_keeps_its_whole_groups(tmp_path: Path) -> None:
     assert sorted(file.name for file in tmp_path.iterdir()) == ["data.h5", "data.h5.damaged"]
 
 
+def test_a_file_that_is_open_elsewhere_is_not_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: nothing is known to be wrong with it, so nothing is repaired or moved."""
+    fcntl = pytest.importorskip("fcntl")
+    path = write(tmp_path / "data.h5", states=4)
+    with path.open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)  # as HDF5 does for who writes
+        for arguments in (["show"], ["verify", "--repair"]):
+            assert main([*arguments, str(path)]) == 2
+            line = capsys.readouterr().err
+            assert "is open in another program" in line and "--repair" not in line
+    assert [file.name for file in tmp_path.iterdir()] == ["data.h5"] and main(["verify", str(path)]) == 0
+
+
 def test_every_cut_is_repaired_or_refused(tmp_path: Path) -> None:
     """Spec G2: wherever the file ends, what is saved is what was there, and the original stays."""
     whole = write(tmp_path / "whole.h5", states=12)

@@ -50,6 +50,25 @@ def test_what_is_being_made_comes_first(run):
     assert ensemble.series == (0.1, 0.05)
 
 
+@pytest.mark.parametrize("boards", [False, True])
+def test_a_damaged_log_is_read_as_far_as_it_goes(tmp_path, boards):
+    """Spec A6, G2: steps that are none, numbers that cannot be drawn, names that lead out of the folder."""
+    lines = [{"step": step, "loss": 2.0} for step in ("x", None, float("nan"), 1e999, True, -1, 10**400)]
+    lines += [{"step": 1, "loss": 2.0, "sub_goal": name} for name in ("../../out", 3, ["a"])]
+    lines += [{"step": 2, "loss": loss} for loss in (float("inf"), float("nan"), 10**400, 1e308, "x", None, [1], True)]
+    lines += [{"step": 3, "loss": 1.5}, {"step": 4, "loss": 0.5}]
+    texts = [json.dumps(line) for line in lines]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").write_text("\n".join(["[" * 100_000, "3", *texts]))
+    rows = read_progress(tmp_path / "run")
+    assert [(row.step, row.series) for row in rows] == [(4, (1.5, 0.5))]
+    assert view(rows).row_count == 1
+    if boards:
+        pytest.importorskip("tensorboard")
+        mirror(rows, Boards(tmp_path / "boards"))
+        assert {path.name for path in tmp_path.iterdir()} == {"run", "boards"}
+
+
 def test_the_view_fits_80_columns(run):
     """Spec A6: with ages, steps, the last value and a curve; long names lose their beginning."""
     log = next(run.glob("meta/.*/files/metrics.jsonl"))
@@ -83,6 +102,11 @@ def test_curves_by_hand():
     assert curve([3, 3, 3]) == BARS[0] * 3
     assert curve([float("nan")]) == ""
     assert curve([1, 1, 3, 3], width=2) == BARS[0] + BARS[7]
+
+
+def test_curves_of_what_cannot_be_drawn():
+    """Spec G2: what is no number is left out."""
+    assert curve([float("inf"), 1.0, float("nan"), 2.0, 1e308]) == curve([1.0, 2.0])
 
 
 def test_watch_from_the_command_line(run, capsys, tmp_path):

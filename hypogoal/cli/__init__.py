@@ -16,7 +16,7 @@ import typer
 
 from hypogoal.cli import making, sweeping, showing, bringing  # isort: skip  # so --help has the stages first
 from hypogoal.cli.common import Interrupted, app
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import Complete, NumericalError, UserError
 
 __all__ = ["app", "bringing", "main", "making", "showing", "sweeping"]
 
@@ -53,10 +53,14 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = app(args=given, standalone_mode=False, prog_name="hypogoal")
         return code if isinstance(code, int) else 0
+    except Complete as complete:
+        typer.echo(str(complete), err=True)
+        typer.echo(complete.path)
+        return 0
     except UserError as error:
         if debug:
             raise
-        return _fail(str(error), 2)
+        return _fail(with_notes(str(error), error), 2)
     except NumericalError as error:
         if debug:
             raise
@@ -65,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         message, code = _refused(error)
-        return _fail("; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message, code)
+        return _fail(with_notes(message, error), code)
     except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
@@ -95,9 +99,21 @@ def _refused(error: OSError) -> tuple[str, int]:
     told = re.search(r"errno = (\d+)", str(error))
     code = error.errno or (int(told[1]) if told else 0)
     where = f": {error.filename}" if error.filename else ""
+    if code in (errno.EACCES, errno.EPERM) and error.filename and not _may_read(error.filename):
+        return f"{os.strerror(code)}{where}. Ask for permission to read it.", 2
     if code in known:
         return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
     return f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1
+
+
+def _may_read(name: str | bytes) -> bool:
+    """Whether the system refused something else: what is there can be read, or nothing is there yet."""
+    return os.access(name, os.R_OK) or not os.path.lexists(name)
+
+
+def with_notes(message: str, error: BaseException) -> str:
+    """A message, and what those whom its error passed had to add."""
+    return "; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message
 
 
 def notes_of(error: BaseException) -> list[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
+from hypogoal.core.files import MOST_INTEGER
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
@@ -60,7 +61,7 @@ def export(
     source: Annotated[Path, typer.Argument(help="A data file, or the folder of a meta artefact.")],
     out: Annotated[Path, typer.Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
     episodes: Annotated[int, typer.Option(min=1, help="Of the agent, where it is one.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Of the agent's draws of options.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="Of the agent's draws of options.")] = 0,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -91,7 +92,7 @@ def label(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
-    layout_seed: Annotated[int, typer.Option(min=0, help="The layout that is played first.")] = 0,
+    layout_seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="The layout that is played first.")] = 0,
     arg: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="Of the environment, such as --arg start=2-6.")
     ] = None,
@@ -144,7 +145,7 @@ def check(
     network: Annotated[str | None, typer.Option(help="A member network: a name or module:function.")] = None,
     set_: Set = None,
     seed: Seed = 0,
-    layout_seed: Annotated[int, typer.Option(min=0, help="The layout that is played.")] = 0,
+    layout_seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
 ) -> None:
     """Check that an own domain, diversity objective or network keeps to its contract; exit code 2 when not.
 

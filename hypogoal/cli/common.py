@@ -9,6 +9,8 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperGroup
 
+from hypogoal.core.files import MOST_INTEGER
+
 T = TypeVar("T")
 
 
@@ -38,7 +40,10 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; see 'hypogoal config'."),
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything that is random.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=MOST_INTEGER, help="Seed of everything that is random.")]
+LayoutSeed = Annotated[
+    int | None, typer.Option("--layout-seed", min=0, max=MOST_INTEGER, help="The layout to learn on.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace what stands at --out.")]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with what was begun; keep a complete --out as it is; else begin.")
@@ -85,29 +90,6 @@ def domain_of(artefact: Path, kind: str) -> str:
     from hypogoal.core.artefacts import open_artefact
 
     return str(open_artefact(artefact, kind).config["domain"])
-
-
-def is_complete(out: Path, resume: bool, kind: str) -> bool:
-    """Whether ``--resume`` was given and ``out`` is complete; then the stage has nothing to do.
-
-    Raises:
-        UserError: it is something else than the stage makes.
-    """
-    from hypogoal.core.drafts import unfinished
-
-    if not resume or not out.exists() or unfinished(out):
-        return False
-    if kind == "data":
-        from hypogoal.dataset import open_dataset
-
-        open_dataset(out)
-    else:
-        from hypogoal.core.artefacts import open_artefact
-
-        open_artefact(out, kind)
-    typer.echo(f"{out} is complete already", err=True)
-    typer.echo(out)
-    return True
 
 
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:

@@ -10,6 +10,7 @@ import typer
 from hypogoal.cli.common import (
     Device,
     Force,
+    LayoutSeed,
     Out,
     Preset,
     Quiet,
@@ -18,7 +19,6 @@ from hypogoal.cli.common import (
     Set,
     app,
     domain_of,
-    is_complete,
     print_counts,
     print_outcome,
     print_table,
@@ -41,8 +41,6 @@ def collect(
     from hypogoal.domains.base import load_domain
     from hypogoal.stages.collect import collect as stage
 
-    if is_complete(out, resume, "data"):
-        return
     found = load_domain(domain, given=True)
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
     counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
@@ -77,8 +75,6 @@ def train_ensemble(
     from hypogoal.stages.train_ensemble import TrainEnsembleConfig
     from hypogoal.stages.train_ensemble import train_ensemble as stage
 
-    if is_complete(out, resume, "ensemble"):
-        return
     given = {"diversity": diversity, "members": members}
     domain = domain_of(data, "data")
     config = resolve_for(domain, TrainEnsembleConfig, "train-ensemble", preset, set_, given)
@@ -96,7 +92,7 @@ def train_ensemble(
 def train_options(
     ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
     out: Out,
-    layout_seed: Annotated[int | None, typer.Option(min=0, help="The layout to learn on.")] = None,
+    layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
     seed: Seed = 0,
@@ -109,8 +105,6 @@ def train_options(
     from hypogoal.stages.train_options import TrainOptionsConfig
     from hypogoal.stages.train_options import train_options as stage
 
-    if is_complete(out, resume, "options"):
-        return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainOptionsConfig, "train-options", preset, set_, given)
     print_outcome(
@@ -124,7 +118,7 @@ def train_meta(
     ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
     out: Out,
     options: Annotated[Path | None, typer.Option(help="Continue the options of 'train-options'.")] = None,
-    layout_seed: Annotated[int | None, typer.Option(min=0, help="The layout to learn on.")] = None,
+    layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
     seed: Seed = 0,
@@ -137,8 +131,6 @@ def train_meta(
     from hypogoal.stages.train_meta import TrainMetaConfig
     from hypogoal.stages.train_meta import train_meta as stage
 
-    if is_complete(out, resume, "meta"):
-        return
     given = {"layout_seed": layout_seed}
     config = resolve_for(domain_of(ensemble, "ensemble"), TrainMetaConfig, "train-meta", preset, set_, given)
     print_outcome(
@@ -155,7 +147,7 @@ def train_baseline(
     domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
     out: Out,
     agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
-    layout_seed: Annotated[int | None, typer.Option(min=0, help="The layout to learn on.")] = None,
+    layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
     seed: Seed = 0,
@@ -168,8 +160,6 @@ def train_baseline(
     from hypogoal.stages.train_baseline import BaselineConfig
     from hypogoal.stages.train_baseline import train_baseline as stage
 
-    if is_complete(out, resume, "baseline"):
-        return
     given = {"agent": agent, "layout_seed": layout_seed}
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given, own=True)
     print_outcome(stage(domain, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet)
@@ -189,9 +179,7 @@ def evaluate(
     from hypogoal.stages.evaluate import summary_table
 
     out = out or run / "evaluation"
-    if is_complete(out, resume, "evaluation"):
-        return
-    metrics = stage(run, out, force=force, quiet=quiet)
+    metrics = stage(run, out, force=force, resume=resume, quiet=quiet)
     if not quiet:
         print_table(summary_table(metrics))
     typer.echo(out)
@@ -203,7 +191,9 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Instead of the page: the paper's figures, with captions, into this folder.")
     ] = None,
-    format_: Annotated[str, typer.Option("--format", help="Of --figures: svg, pdf or png.")] = "svg",
+    format_: Annotated[
+        str | None, typer.Option("--format", help="Of --figures: svg (where it is not said), pdf or png.")
+    ] = None,
     videos: Annotated[
         int, typer.Option(min=0, help="Also so many episodes of the policy over options, as RUN/report/videos/*.gif.")
     ] = 0,
@@ -212,15 +202,22 @@ def report(
     quiet: Quiet = False,
 ) -> None:
     """Draw RUN/report/index.html: one file, readable offline."""
+    from hypogoal.core.errors import Complete, UserError
     from hypogoal.stages.report import draw_figures
     from hypogoal.stages.report import report as stage
 
+    if figures is None and format_ is not None:
+        raise UserError("--format is for --figures", format_, "Give --figures DIR too, or leave it out.")
+    if figures is not None and (videos or resume):
+        what = "--videos" if videos else "--resume"
+        raise UserError(f"{what} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
-        if is_complete(run / "report", resume, "report"):
-            return
-        typer.echo(stage(run, videos=videos, force=force))
+        try:
+            typer.echo(stage(run, videos=videos, force=force, resume=resume))
+        except Complete as complete:
+            raise Complete(run / "report" / "index.html", complete.note) from None
         return
-    written, missing = draw_figures(run, figures, format_, force=force)
+    written, missing = draw_figures(run, figures, format_ or "svg", force=force)
     for line in missing:
         typer.echo(line, err=True)
     for path in written:

@@ -31,7 +31,7 @@ def show(
         print_table(summary_of(numbers, path))
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
-            typer.echo(sheet)
+            typer.echo(sheet, err=as_json)
 
 
 @app.command()

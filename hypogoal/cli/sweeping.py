@@ -30,11 +30,12 @@ def run(
     import json
 
     from hypogoal.core.compute import prepare
+    from hypogoal.core.drafts import place_of
     from hypogoal.stages.evaluate import summary_table
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
-    out = _folder(out)
+    out = place_of(out)
     planned = plan(experiment, out, preset=preset, assignments=set_ or (), device=device, short=True)
     if dry_run:
         _list(planned)
@@ -90,7 +91,9 @@ def sweep(
 
     --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
     """
-    out = _folder(out)
+    from hypogoal.core.drafts import place_of
+
+    out = place_of(out)
     if cell is not None:
         from hypogoal.experiments.engines.element import run_element
 
@@ -134,11 +137,6 @@ def sweep(
     for job in stage.submit(planned, out, options, quiet=quiet, confirm=ask):
         typer.echo(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
     typer.echo(out)
-
-
-def _folder(out: Path) -> Path:
-    """The folder by a name of its own, also where it was called ``.``: what belongs to it is named after it."""
-    return out if out.name and ".." not in out.parts else out.resolve()
 
 
 def _list(planned: Any) -> None:

@@ -11,17 +11,26 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import as_dict
-from hypogoal.core.drafts import check_free, draft, put_in_place, unfinished
+from hypogoal.core.drafts import (
+    check_complete,
+    check_free,
+    check_replaceable,
+    draft,
+    place_of,
+    put_in_place,
+    unfinished,
+)
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import inside
-from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, read_manifest
+from hypogoal.core.files import MAX_NAME_BYTES, inside
+from hypogoal.core.kinds import check_kind
+from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, check_writable, read_manifest
 
 PACKAGES = (
     "hypogoal",
@@ -114,19 +123,32 @@ def versions() -> dict[str, str]:
     return found
 
 
-def claim(out: Path, *, force: bool = False, resume: bool = False) -> Path:
+def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
     """Check, before any work is done, that ``out`` may be written; nothing is made yet.
 
+    Args:
+        out: the output.
+        kind: what it is to be: that of an artefact, ``data`` or ``arrays``.
+        inputs: what is read to make it.
+        force: replace what is there.
+        resume: go on with what is unfinished; what is complete is left to ``create_artefact``.
+
     Raises:
-        UserError: it exists and ``force`` is false, or it exists and is not ours to replace, or another process writes
-            it, or something unfinished is there and neither ``force`` nor ``resume`` says what to do with it.
+        UserError: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
+            exists and is of another kind; another process writes it; something unfinished is there and neither
+            ``force`` nor ``resume`` says what to do with it.
     """
+    place = out.resolve()
+    if len(os.fsencode(place.name)) > MAX_NAME_BYTES:  # the draft's name is longer
+        raise UserError(f"the output's name is longer than {MAX_NAME_BYTES} bytes", out, "Choose a shorter one.")
+    for path in inputs:
+        if path.resolve().is_relative_to(place):
+            raise UserError("the output would replace an input", path, "Choose another --out.")
     if out.exists():
-        ours = (out / MANIFEST).is_file() or (out.is_dir() and not any(out.iterdir()))
-        if not force and not (resume and unfinished(out)):  # what is unfinished was begun with --force
-            raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
-        if not ours and out.is_dir():
-            raise UserError("--force replaces only artefacts, and this folder has no manifest", out, "Move it away.")
+        if not resume:  # of what is complete only the stage knows whether it was made as asked
+            check_replaceable(out, force=force)
+        check_kind(out, kind)
+    out = place_of(out)
     check_parent(out)
     check_free(out, force=force, resume=resume)
     return out
@@ -172,17 +194,25 @@ def create_artefact(
         ``out`` is as it was, and the folder is removed unless it has a checkpoint.
 
     Raises:
-        UserError: as of ``claim``, or what is unfinished was begun with another configuration, seed or inputs.
+        UserError: as of ``claim``, or what is there, unfinished or complete, was begun with another configuration,
+            seed or inputs.
+        Complete: with ``resume``, it was made with these.
     """
-    claim(out, force=force, resume=resume)
+    inputs = [Path(path) for path in inputs]
+    out = claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
     about = {
         "kind": kind,
         "format": FORMAT_VERSION,
         "config": config if isinstance(config, dict) else as_dict(config),
         "seed": seed,
     }
-    entries = [_input_entry(Path(path), out) for path in inputs]
+    entries = [_input_entry(path, out) for path in inputs]
+    check_writable({**about, "inputs": entries, "files": {}}, out)
     identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
+    if resume and out.exists() and not unfinished(out):
+        manifest = open_artefact(out, kind).manifest
+        hashes = [entry["sha256"] for entry in manifest["inputs"]]
+        raise check_complete({**manifest, "inputs": hashes}, identity, out)
     with draft(out, identity, force=force, resume=resume) as work:
         yield work.files
         files = {

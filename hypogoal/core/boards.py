@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ class Boards:
             values = [
                 self._summary.Value(tag=key, simple_value=float(value))
                 for key, value in line.items()
-                if key != "step" and isinstance(value, int | float)
+                if key != "step" and isinstance(value, int | float) and not abs(value) > sys.float_info.max
             ]
             summary = self._summary(value=values)
             self._writers[place].add_event(self._event(wall_time=now, step=step, summary=summary))

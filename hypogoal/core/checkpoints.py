@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -31,7 +32,7 @@ FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART = "json"
+JSON_PART, SUM_PART = "json", "crc32"
 ARRAY, TENSOR = "$array", "$tensor"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -125,7 +126,8 @@ class Checkpoints:
         fresh = self.path.with_suffix(".new")
         try:
             self.path.parent.mkdir(exist_ok=True)
-            save_file({**arrays, **tensors, JSON_PART: text}, fresh)
+            parts = {**arrays, **tensors, JSON_PART: text}
+            save_file({**parts, SUM_PART: _checksum(parts)}, fresh)
             sync(fresh)
             fresh.replace(self.path)
             sync(self.path.parent)
@@ -148,9 +150,13 @@ class Checkpoints:
             return None
         try:
             arrays = load_file(self.path)
+            if not np.array_equal(arrays.pop(SUM_PART), _checksum(arrays)):
+                raise ValueError
             state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
         except (SafetensorError, KeyError, ValueError, RecursionError):
-            raise UserError("the checkpoint is damaged", self.path, "Give --force to begin anew.") from None
+            raise UserError(
+                "the checkpoint is damaged, or of an earlier version", self.path, "Give --force to begin anew."
+            ) from None
         return state
 
 
@@ -160,6 +166,15 @@ class _Parts(dict[str, NDArray[Any]]):
     def add(self, place: str, values: NDArray[Any]) -> str:
         self[place] = values if values.flags.c_contiguous else values.copy(order="C")
         return place
+
+
+def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
+    """The CRC-32 of all that is saved: a byte that a disk changed would be other weights, and not be noticed."""
+    value = 0
+    for place, values in sorted(parts.items()):
+        value = zlib.crc32(f"{place} {values.dtype} {values.shape}".encode(), value)
+        value = zlib.crc32(values.reshape(-1).view(np.uint8).data, value)
+    return np.array([value], np.uint32)
 
 
 def _taken_apart(value: Any, place: str, arrays: _Parts, tensors: _Parts) -> Any:

@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_text
+from hypogoal.core.files import MOST_INTEGER, read_text
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
 MAX_RANGE = 10_000  # integers that one range may stand for
+STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "run")  # tables of presets
 DOMAIN = "doorkey"  # whose presets and defaults hold where no domain is said
 
 
@@ -60,7 +61,7 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str,
         domain: whose presets are meant; those of a domain that has none are DoorKey's.
 
     Raises:
-        UserError: unknown preset, unreadable file or not TOML.
+        UserError: unknown preset, unreadable file, not TOML, or with what belongs to no stage.
     """
     if name is None:
         return {}
@@ -79,6 +80,10 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str,
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"the preset is not valid TOML ({str(error)[:200]})", name, "Mend the file.") from None
+    for key in table:
+        if key not in (*STAGES, stage):
+            do = f"{_meant(key, STAGES)}A preset has tables for {', '.join(STAGES)}."
+            raise UserError("no such table in a preset", f"{key} in {name}", do)
     values = table.get(stage, {})
     if not isinstance(values, dict):
         raise UserError(f"[{stage}] must be a table", name, "Write it as [stage] with key = value lines.")
@@ -146,11 +151,15 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str) ->
     checked: dict[str, Any] = {}
     for key, value in values.items():
         if key not in fields:
-            near = difflib.get_close_matches(key, fields, n=1)
-            hint = f"Did you mean {near[0]!r}? " if near else ""
-            raise UserError(f"{stage} has no setting", key, f"{hint}See 'hypogoal config {stage}'.")
+            raise UserError(f"{stage} has no setting", key, f"{_meant(key, fields)}See 'hypogoal config {stage}'.")
         checked[key] = _checked(fields[key], kinds[key], value, stage)
     return config_class(**checked)
+
+
+def _meant(word: str, known: Iterable[str]) -> str:
+    """A question for whoever wrote ``word`` and may have meant a known one; else empty."""
+    near = difflib.get_close_matches(word, [*known], n=1)
+    return f"Did you mean {near[0]!r}? " if near else ""
 
 
 def as_dict(config: Any) -> dict[str, Any]:
@@ -195,6 +204,8 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
     for item in parsed if isinstance(parsed, tuple) else (parsed,):
         if isinstance(item, float) and not math.isfinite(item):
             raise UserError("value is not finite", where, "Give a finite number.")
+        if isinstance(item, int) and abs(item) > MOST_INTEGER:
+            raise UserError("value out of range", where, f"Integers go from -{MOST_INTEGER} to {MOST_INTEGER}.")
         if meta.get("choices") and item not in meta["choices"]:
             raise UserError("value not allowed", where, f"Choose one of {_allowed(meta).replace('|', ', ')}.")
         for bound, outside in (("low", lambda a, b: a < b), ("high", lambda a, b: a > b)):

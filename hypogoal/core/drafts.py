@@ -15,13 +15,14 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
 from hypogoal.core.checkpoints import FOLDER, sync
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import Complete, Killed, NumericalError, UserError
+from hypogoal.core.files import parse_json
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -45,9 +46,25 @@ class Draft:
     command: list[str]
 
 
+def place_of(out: Path) -> Path:
+    """An output by a name of its own, also where it was called ``.`` or is a link: the work goes where that leads."""
+    return out.resolve() if out.is_symlink() or not out.name or ".." in out.parts else out
+
+
 def draft_folder(out: Path) -> Path:
     """Where the draft of an output lies."""
+    out = place_of(out)
     return out.with_name(f".{out.name}{PARTIAL}")
+
+
+def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
+    """Check that what is there, if anything, may be replaced: what is unfinished beside it was begun with ``force``.
+
+    Raises:
+        UserError: it may not.
+    """
+    if out.exists() and not force and not (resume and unfinished(out)):
+        raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
@@ -100,24 +117,29 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         UserError: another process works on ``out``; something unfinished is there that was begun otherwise, or of
             which it was not said what to do with it.
     """
-    identity = json.loads(json.dumps(identity))
     folder = draft_folder(out)
+    words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
+    fresh = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
+    fresh = parse_json(
+        json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
+    )
     with _locked(out):
         _settle(out)
+        check_replaceable(out, force=force, resume=resume)  # by now: another process may have made it since
         _check_unfinished(out, force=force, resume=resume)
         if resume and unfinished(out):
             begun = _begun(folder)
-            _check_same(begun["identity"], identity, out)
+            do = "Resume it with what it was begun with, or give --force and no --resume to begin anew."
+            check_same(begun["identity"], fresh["identity"], out, "what is unfinished there was begun", do)
         else:
-            words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
-            begun = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
+            begun = fresh
             _begin(folder, begun)
         try:
             yield Draft(folder / FILES, begun["command"])
         except BaseException as error:
             if not unfinished(out):
                 shutil.rmtree(folder, ignore_errors=True)
-            elif isinstance(error, KeyboardInterrupt | NumericalError):
+            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed):
                 error.add_note(f"the last checkpoint is kept: {GO_ON}")
             raise
         shutil.rmtree(folder, ignore_errors=True)
@@ -127,6 +149,7 @@ def put_in_place(made: Path, out: Path) -> None:
     """Rename what was made, a folder or a file, to ``out``; what stood there is moved aside first and removed last."""
     for path in [made, *made.rglob("*")]:
         sync(path)
+    out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if out.exists():
         out.rename(old)
@@ -137,6 +160,7 @@ def put_in_place(made: Path, out: Path) -> None:
 
 def _settle(out: Path) -> None:
     """Finish what a process that died in ``put_in_place`` had begun."""
+    out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if old.exists() and not out.exists():
         old.rename(out)
@@ -144,7 +168,7 @@ def _settle(out: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
@@ -174,8 +198,19 @@ def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
         raise UserError("an unfinished one is there", out, "Give --resume to go on with it, or --force to begin anew.")
 
 
-def _check_same(before: dict[str, Any], now: dict[str, Any], out: Path) -> None:
-    """Refuse to go on with a draft that was begun otherwise, naming the first thing that differs."""
+def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str, do: str) -> None:
+    """Refuse to go on with what was made of something else, naming the first thing that differs.
+
+    Args:
+        before: what made it.
+        now: what is to make it.
+        out: the output.
+        what: what was done with the former, for the message ("what is there was made").
+        do: what to do about it.
+
+    Raises:
+        UserError: they differ.
+    """
     if before == now:
         return
     for key in {**before, **now}:
@@ -185,12 +220,35 @@ def _check_same(before: dict[str, Any], now: dict[str, Any], out: Path) -> None:
         if isinstance(old, dict) and isinstance(new, dict):
             key = next(name for name in {**old, **new} if old.get(name) != new.get(name))
             old, new = old.get(key), new.get(key)
-        what = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
-        raise UserError(
-            f"what is unfinished there was begun with {what}",
-            out,
-            "Resume it with what it was begun with, or give --force and no --resume to begin anew.",
-        )
+        other = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
+        raise UserError(f"{what} with {other}", out, do)
+
+
+def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
+    """What to raise where ``--resume`` finds its output complete.
+
+    Args:
+        before: ``config``, ``versions`` and whatever else made it, such as a manifest.
+        now: the same, of what is to be made. Settings that only one of the two has are those of another hypogoal; other
+            versions are said and no more, since nothing is gone on with.
+        out: the output.
+
+    Raises:
+        UserError: it was made of something else.
+    """
+    now = json.loads(json.dumps(now))
+    keys = [key for key in now if key not in ("config", "versions")]
+    settings = sorted(before["config"].keys() & now["config"].keys())
+    one, other = (
+        {"config": {key: about["config"][key] for key in settings}, **{key: about[key] for key in keys}}
+        for about in (before, now)
+    )
+    do = "Choose another --out, or give --force and no --resume."
+    check_same(one, other, out, "what is complete there was made", do)
+    versions = before.get("versions")
+    known = versions.items() if isinstance(versions, dict) else ()
+    others = [f"{name} {version}" for name, version in known if now["versions"].get(name) != version]
+    return Complete(out, f"made with {', '.join(others)}" if others else "")
 
 
 def _short(value: Any) -> str:

@@ -19,6 +19,23 @@ class UserError(Exception):
         super().__init__(printable(text))
 
 
+class Killed(UserError):
+    """A process of a stage was killed from outside, which no stage can catch."""
+
+
+class Complete(UserError):
+    """What is to be gone on with is complete, made as asked: the command line says so and exits with code 0.
+
+    Args:
+        path: what the command would have made.
+        note: what else there is to say of it.
+    """
+
+    def __init__(self, path: object, note: str = ""):
+        super().__init__(f"{path} is complete already" + (f" ({note})" if note else ""))
+        self.path, self.note = path, note
+
+
 def printable(text: str) -> str:
     """A text that may quote a stranger's file: a terminal must not obey it, nor fail to print it."""
     return "".join(sign if sign.isprintable() else "?" for sign in text)

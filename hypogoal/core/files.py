@@ -15,6 +15,7 @@ from hypogoal.core.errors import UserError
 MAX_TEXT_BYTES = 64 * 2**20
 MAX_JSON_DEPTH = 32
 MAX_NAME_BYTES = 200
+MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
 
 
 def require_file(path: Path, what: str, do: str) -> int:

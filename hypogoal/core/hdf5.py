@@ -7,6 +7,7 @@ plugins) and declare terabytes in a kilobyte. None of it is needed here, and all
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections.abc import Iterator
 from math import prod
 from pathlib import Path
@@ -26,18 +27,27 @@ MAX_ATTRIBUTE_BYTES = 8 * 2**20
 MAX_ENTRIES = 100_000  # of a group
 
 
+class Busy(UserError):
+    """A file that may be whole, and cannot be read now."""
+
+
 def open_hdf5(path: Path, what: str, do: str) -> Any:
-    """An HDF5 file opened for reading.
+    """An HDF5 file opened for reading, locked where the file system can.
 
     Raises:
         UserError: missing, no regular file, truncated or not HDF5.
+        Busy: another program has it open to write, or it may not be read.
     """
     import h5py
 
     require_file(path, f"{what} is", do)
     try:
-        return h5py.File(path, "r")
-    except (OSError, ValueError, RuntimeError, KeyError):
+        return h5py.File(path, "r", locking="best-effort")
+    except (OSError, ValueError, RuntimeError, KeyError) as error:
+        if "unable to lock" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
+            raise Busy(f"{what} is open in another program", path, "Close it there first.") from None
+        if isinstance(error, PermissionError):
+            raise Busy(f"{what} may not be read (permission denied)", path, "Ask for permission.") from None
         raise UserError(f"{what} is truncated or not HDF5", path, do) from None
 
 

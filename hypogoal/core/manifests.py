@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, read_json
+from hypogoal.core.files import MOST_INTEGER, parse_json, plain_name, read_json
 
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
@@ -21,7 +22,23 @@ def read_manifest(path: Path) -> dict[str, Any]:
     Raises:
         UserError: not JSON, of a newer format, or a key or setting is missing or malformed.
     """
-    manifest: Any = read_json(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
+    return _checked(read_json(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES), path)
+
+
+def check_writable(manifest: dict[str, Any], out: Path) -> None:
+    """Check, before anything is made, that the manifest which it will have could be read again.
+
+    Raises:
+        UserError: a setting, a number or a name is one that :func:`read_manifest` refuses.
+    """
+    do = "Choose another value, or a name in UTF-8."
+    try:
+        _checked(parse_json(json.dumps(manifest), out, "the manifest would be", do), out)
+    except UserError as error:
+        raise UserError(f"this could not be read again ({error.what})", out, do) from None
+
+
+def _checked(manifest: Any, path: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict):
         raise UserError("the manifest is not a JSON object", path, AGAIN)
     if type(manifest.get("format")) is int and manifest["format"] > FORMAT_VERSION:
@@ -44,7 +61,7 @@ def _text(value: Any) -> bool:
 
 
 def _count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 1 << 53
+    return type(value) is int and 0 <= value <= MOST_INTEGER
 
 
 def _list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:

@@ -9,7 +9,10 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
+
+from hypogoal.core.errors import Killed
 
 T = TypeVar("T")
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
@@ -41,6 +44,9 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         tasks: what to run; more than one at once, they and their results go from process to process.
         workers: processes.
         done: told the number and the result of each task as soon as it is there.
+
+    Raises:
+        Killed: one of the processes was.
     """
     if min(workers, len(tasks)) <= 1:
         for number, task in enumerate(tasks):
@@ -54,6 +60,9 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         futures = {pool.submit(_guarded, task): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
+    except BrokenProcessPool:
+        do = f"Have fewer at once: --set workers=1, or {CORES}=1 in the environment."
+        raise Killed("a process was killed by the system, most likely for want of memory", None, do) from None
     except BaseException:
         for process in set(multiprocessing.active_children()) - before:
             process.terminate()

@@ -9,7 +9,8 @@ from typing import Any
 from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
-from hypogoal.core.drafts import draft, put_in_place
+from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
+from hypogoal.core.kinds import DATA
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
 from hypogoal.dataset import open_dataset, require_names, write_dataset
@@ -45,10 +46,14 @@ def collect(
         Numbers of states and positives per split and sub-goal.
     """
     require_names(domain.sub_goals)  # not after all the play, when the file is written
-    claim(out, force=force, resume=resume)
+    out = claim(out, kind=DATA, force=force, resume=resume)
+    about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
+    if resume and out.exists() and not unfinished(out):
+        found = open_dataset(out)
+        before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
+        raise check_complete(before, about, out)
     size = getattr(domain, "collected_bytes", lambda config: 0)(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
-    about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
         kept = {"kept": partial(checkpoints_of, work.files)} if getattr(domain, "resumes", False) else {}
         with Progress(f"collect {about['domain']}", total=1, quiet=quiet) as progress:

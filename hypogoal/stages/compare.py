@@ -32,7 +32,7 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
     from hypogoal.evaluation.page import Material, draw_page
     from hypogoal.evaluation.page.compared import compared_sections
 
-    claim(out, force=force)
+    claim(out, kind="comparison", inputs=runs, force=force)
     if len({run.resolve() for run in runs}) < max(2, len(runs)):
         where = " ".join(map(str, runs))
         raise UserError("a comparison takes two different runs or more", where, "Name each run once.")

@@ -51,13 +51,13 @@ SETTINGS = {"window": WINDOW, "solved": SOLVED, "gamma": GAMMA, "threshold": THR
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
 
 
-def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) -> dict[str, Any]:
+def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
     """Compute every number of the report and write the artefact ``out``: ``metrics.json`` and ``arrays.h5``.
 
     Args:
         run: a folder with ensemble, options, meta and baseline artefacts, any of them.
         out: the artefact to write.
-        force, quiet: as for every stage.
+        force, resume, quiet: as for every stage.
 
     Returns:
         What ``metrics.json`` holds, see ``evaluation/quantities.py``.
@@ -66,7 +66,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
         UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
     """
     prepare()
-    claim(out, force=force)
+    out = claim(out, kind="evaluation", force=force, resume=resume)
     found = find(run)
     inputs = [artefact.whole().path for artefact in found.everything()]
     data = sorted({artefact.input("data") for artefact in found.ensembles})
@@ -77,7 +77,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, quiet: bool = False) 
         workers, needs = 1, evaluation_needs(data, 1)
     preflight("evaluate", out, needs, quiet=quiet)
     with create_artefact(
-        out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force
+        out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:
         with (
             create_hdf5(folder / "arrays.h5") as arrays,

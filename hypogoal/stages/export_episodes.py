@@ -31,7 +31,7 @@ def export_episodes(
         out: the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
         episodes: how many.
         seed: of the draws of options.
-        force: replace an artefact at ``out``; another folder has to be moved away.
+        force: replace an empty folder at ``out``; any other has to be moved away.
         quiet: no progress.
 
     Returns:
@@ -44,7 +44,7 @@ def export_episodes(
     if not NAME.fullmatch(out.name):
         raise UserError("a Minari dataset has a version in its name", out.name, "Give --out DIR/NAME-v0.")
     source = open_artefact(meta, "meta").whole()
-    claim(out, force=force)
+    out = claim(out, kind="episodes", inputs=[meta], force=force)
     agent, domain = read_agent(source), load_domain(source.config["domain"])
     made = out.with_name(f".{out.name}.new")
     shutil.rmtree(made, ignore_errors=True)

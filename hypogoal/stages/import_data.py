@@ -11,6 +11,7 @@ from hypogoal.core import own_code
 from hypogoal.core.artefacts import claim
 from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError
+from hypogoal.core.kinds import ARRAYS, DATA
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
 from hypogoal.dataset import open_dataset, write_dataset
@@ -51,7 +52,7 @@ def import_data(
     Raises:
         UserError: see ``hypogoal.own_data``.
     """
-    claim(out, force=force)
+    claim(out, kind=DATA, inputs=[source], force=force)
     if (source / MAIN_FILE).exists():
         functions = [load_own(name, "label function", LABELS, {}) for name in (labels or {}).values()]
         parts, sub_goals = read_minari(source, functions, key=key, seed=seed), tuple(labels or ())
@@ -93,7 +94,7 @@ def export_data(data: Path, out: Path, *, force: bool = False) -> None:
     """
     if out.suffix != ".npz":
         raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
-    claim(out, force=force)
+    out = claim(out, kind=ARRAYS, inputs=[data], force=force)
     dataset = open_dataset(data)
     out.parent.mkdir(parents=True, exist_ok=True)
     made = out.with_name(f".{out.name}.new")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
@@ -12,13 +13,14 @@ from hypogoal.evaluation.evaluated import AGAIN, read_evaluation
 KINDS = ("svg", "pdf", "png")
 
 
-def report(run: Path, *, videos: int = 0, force: bool = False) -> Path:
+def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = False) -> Path:
     """Draw the report of an evaluated run.
 
     Args:
         run: a folder with an evaluation artefact in it; that in ``run/evaluation`` where there are several.
         videos: how many episodes of the agents to play and draw, see :func:`draw_videos`.
         force: replace an existing report.
+        resume: keep one that is complete.
 
     Returns:
         The page, ``run/report/index.html``. Beside it ``figures/*.svg``, ``figures/*.png`` and ``videos/*.gif``.
@@ -32,15 +34,17 @@ def report(run: Path, *, videos: int = 0, force: bool = False) -> Path:
 
     out = run / "report"
     found = read_evaluation(run)
-    claim(out, force=force)
-    material = Material(found.metrics, found.arrays)
-    try:
-        page = render(material, versions().get("hypogoal", "unknown"))
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise UserError("the evaluation does not fit this hypogoal, or is damaged", found.source.path, AGAIN) from error
+    claim(out, kind="report", force=force, resume=resume)
     agents = agents_of(run) if videos else []
     inputs = [found.source.path, *(agent.path for agent in agents[:videos])]
-    with create_artefact(out, kind="report", config={"videos": videos}, seed=0, inputs=inputs, force=force) as folder:
+    about: dict[str, Any] = {"kind": "report", "config": {"videos": videos}, "seed": 0, "inputs": inputs}
+    with create_artefact(out, **about, force=force, resume=resume) as folder:
+        material = Material(found.metrics, found.arrays)
+        try:
+            page = render(material, versions().get("hypogoal", "unknown"))
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+            what = "the evaluation does not fit this hypogoal, or is damaged"
+            raise UserError(what, found.source.path, AGAIN) from error
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
         for name, figure in material.figures.items():

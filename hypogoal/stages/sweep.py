@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +16,14 @@ from typing import Any
 
 from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
-from hypogoal.core.config import parse_assignments, resolve
+from hypogoal.core.config import STAGES, as_dict, parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import CONFIGS, defaults_of, load_domain, stage_config
 from hypogoal.experiments import doorkey, montezuma_ladders
-from hypogoal.experiments.cells import Plan
+from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
 from hypogoal.experiments.engines import slurm
 from hypogoal.experiments.engines.local import run_cells
@@ -50,7 +51,6 @@ FIGURES = {  # of the paper: the experiment and its preset
     "figure4": ("montezuma-ladders", "figure4"),
     "figure6": ("doorkey", "figure6"),
 }
-STAGES = ("collect", *CONFIGS, "run")
 AGAIN = "give the same command again to go on"
 
 
@@ -109,6 +109,8 @@ def plan(
     if name not in EXPERIMENTS:
         known = ", ".join([*EXPERIMENTS, *FIGURES])
         raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
+    if own_preset not in (None, preset or own_preset):
+        raise UserError(f"{experiment} has its own preset", preset, f"For another, give {name} with --preset.")
     chosen = assignments + ([f"seeds={seeds}"] if seeds else [])
     return _named_plan(name, out, preset or own_preset, chosen, device, _short(out, wanted=short))
 
@@ -154,7 +156,20 @@ def _named_plan(
         )
         for stage in found.STAGES
     }
-    return Plan(experiment, found.cells(out, config, resolved, common, short=short), config.workers or cores())
+    cells = found.cells(out, config, resolved, common, short=short)
+    _check_apart(cells, as_dict(config))
+    return Plan(experiment, cells, config.workers or cores())
+
+
+def _check_apart(cells: Sequence[Cell], settings: Mapping[str, Any]) -> None:
+    """Refuse cells of which two write the same, as those of a seed that is given twice do."""
+    outs = Counter(cell.out for cell in cells)
+    names = [cell.name for cell in cells if outs[cell.out] > 1]
+    if names:
+        lists = {name: values for name, values in settings.items() if isinstance(values, list)}
+        twice = [f"{name}={value}" for name, values in lists.items() for value in values if values.count(value) > 1]
+        where = ", ".join(dict.fromkeys(twice)) or names[0]
+        raise UserError("two cells would be the same", where, "Give each value once.")
 
 
 def _split(assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:

@@ -74,7 +74,7 @@ def train_baseline(
     from hypogoal.learners.baselines.settings import hyperparameters
 
     device = prepare(device)
-    claim(out, force=force, resume=resume)
+    out = claim(out, kind="baseline", force=force, resume=resume)
     played = load_domain(domain, given=True)
     chosen = hyperparameters(config.agent, config.setting)
     if config.environments:

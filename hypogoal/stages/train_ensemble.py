@@ -73,11 +73,13 @@ def train_ensemble(
         load_network(config.network)
     dataset = open_dataset(data)
     sub_goals = config.sub_goals or dataset.sub_goals
+    if len({*sub_goals}) < len(sub_goals):
+        raise UserError("a sub-goal twice", ", ".join(sub_goals), "Name each once.")
     for sub_goal in sub_goals:
         if sub_goal not in dataset.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
-    claim(out, force=force, resume=resume)
+    out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
     about = as_dict(config) | {
         "sub_goals": list(sub_goals),
         "observation_shape": list(dataset.observation_shape),

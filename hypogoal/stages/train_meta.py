@@ -76,7 +76,8 @@ def train_meta(
     trained = open_artefact(options, "options").whole() if options else None
     if trained:
         _check_fit(trained, source, config)
-    claim(out, force=force, resume=resume)
+    inputs = [ensemble, options] if options else [ensemble]
+    out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
@@ -89,7 +90,6 @@ def train_meta(
         "options_steps": trained.config["steps"] if trained else 0,
         "setting": config.network,
     }
-    inputs = [ensemble, options] if options else [ensemble]
     with create_artefact(
         out, kind="meta", config=about, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:

@@ -64,7 +64,7 @@ def train_options(
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
-    claim(out, force=force, resume=resume)
+    out = claim(out, kind="options", inputs=[ensemble], force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-options", out, play_needs(domain, source.config, config), quiet=quiet)

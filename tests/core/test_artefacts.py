@@ -1,7 +1,9 @@
 """Artefacts: complete or absent, and refused when they are not what is needed (Spec A8, G2)."""
 
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import torch
 
 from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import load_tensors, save_tensors
 
@@ -61,8 +64,8 @@ def test_refusals(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").write_text("precious")
     cases = [
-        (lambda: claim(out), "exists already"),
-        (lambda: claim(tmp_path / "other", force=True), "no manifest"),
+        (lambda: claim(out, kind="meta"), "exists already"),
+        (lambda: claim(tmp_path / "other", kind="meta", force=True), "no manifest"),
         (lambda: open_artefact(tmp_path / "none"), "no such artefact"),
         (lambda: open_artefact(tmp_path / "other"), "not an artefact"),
         (lambda: open_artefact(out, "ensemble"), "'ensemble' is needed|but ensemble is needed"),
@@ -73,6 +76,71 @@ def test_refusals(tmp_path: Path) -> None:
             case()
         assert "\n" not in str(caught.value)
     assert (tmp_path / "other" / "mine.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seed": 1 << 53}, "'seed'"),
+        ({"seed": -1}, "'seed'"),
+        ({"config": {"sub_goals": ["a", "a"]}}, "'sub_goals'"),
+        ({"config": {"layout_seed": (1 << 53) + 1}}, "'layout_seed'"),
+        ({"config": {"threshold": float("nan")}}, "not valid JSON"),
+        ({"inputs": [b"\xff.h5"]}, "not valid JSON"),
+    ],
+)
+def test_what_could_not_be_read_again_is_not_begun(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    """Spec A8, G2: a manifest is refused before the work for it, not by the next stage."""
+    out = tmp_path / "meta"
+    about: dict[str, Any] = {"kind": "meta", "config": {"steps": 3}, "seed": 0, **change}
+    about["inputs"] = [tmp_path / os.fsdecode(name) for name in about.get("inputs", ())]
+    for path in about["inputs"]:
+        path.write_text("states")
+    with pytest.raises(UserError, match=words) as caught, create_artefact(out, **about):
+        raise AssertionError("it worked")
+    assert "could not be read again" in str(caught.value) and not out.exists()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_force_replaces_only_what_a_stage_makes_there(tmp_path: Path) -> None:
+    """Spec A6, G2: nothing of another kind and no file of others', however wrong the --out."""
+    ensemble, meta = make(tmp_path / "ensemble", "ensemble"), make(tmp_path / "meta")
+    unreadable = make(tmp_path / "unreadable")
+    (unreadable / "manifest.json").write_text("{")
+    (tmp_path / "empty").mkdir()
+    texts = {"thesis.txt": b"precious", "foreign.h5": b"precious", "foreign.npz": b"precious"}
+    for name, text in texts.items():
+        (tmp_path / name).write_bytes(text)
+    with create_hdf5(tmp_path / "other.h5") as file:
+        file["weights"] = [1.0]
+    before = contents(tmp_path)
+    cases = [(ensemble, "meta"), (unreadable, "meta"), (ensemble, "data"), (tmp_path / "other.h5", "data")]
+    cases += [(tmp_path / name, kind) for name in texts for kind in ("meta", "data", "arrays")]
+    for out, kind in cases:
+        with pytest.raises(UserError, match="what stands there is not of kind"):
+            claim(out, kind=kind, force=True)
+    assert contents(tmp_path) == before
+    (meta / "manifest.json").write_text('{"format": 1, "kind": "meta"}')  # damaged, and to be made again
+    for out in (meta, tmp_path / "empty"):
+        make(out, force=True)
+        assert check_files(open_artefact(out, "meta")) == []
+
+
+def test_force_never_replaces_an_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G2: whatever it is called, and whatever lies in it."""
+    monkeypatch.chdir(tmp_path)
+    run = make(tmp_path / "run", "ensemble")
+    inner, beside = make(run / "inner", "options"), tmp_path / "link"
+    beside.symlink_to(run)
+    before = contents(tmp_path)
+    for out, path in ((run, run), (Path("run"), run), (beside, run), (run, beside), (run, inner), (Path("."), inner)):
+        with pytest.raises(UserError, match="would replace an input"):
+            make(out, "ensemble", inputs=(path,), force=True)
+    assert contents(tmp_path) == before
+    assert make(inner, "options", inputs=(run,), force=True) == inner
 
 
 @pytest.mark.parametrize(
@@ -132,8 +200,9 @@ def test_streams_are_named_and_reproducible() -> None:
 
 def test_claim_makes_nothing_and_finds_a_file_in_the_way(tmp_path: Path) -> None:
     """Spec G2."""
-    assert claim(tmp_path / "a" / "b" / "c") == tmp_path / "a" / "b" / "c"
+    assert claim(tmp_path / "a" / "b" / "c", kind="meta") == tmp_path / "a" / "b" / "c"
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("x")
-    with pytest.raises(UserError, match="in the way"):
-        claim(tmp_path / "file" / "out")
+    for name, words in (("file/out", "in the way"), (f"{'x' * 240}.h5", "longer than 200 bytes")):
+        with pytest.raises(UserError, match=words):
+            claim(tmp_path / name, kind="data")

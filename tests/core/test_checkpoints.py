@@ -90,6 +90,17 @@ def test_a_damaged_one_is_one_line(tmp_path: Path, size: int) -> None:
         Checkpoints(path).load()
 
 
+def test_a_changed_byte_is_one_line(tmp_path: Path) -> None:
+    """Spec G1, G2: wherever it is; other weights or counters would be gone on with."""
+    path = tmp_path / "stage.safetensors"
+    Checkpoints(path).save({"weight": torch.ones(2), "rng": np.arange(3), "step": 7})
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(UserError, match="damaged"):
+            Checkpoints(path).load()
+
+
 def test_they_are_paced_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A checkpoint may cost a few per cent: none in the first seconds, then thirty times its cost apart."""
     seconds = [100.0]

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hypogoal
-from hypogoal.core.config import as_dict, describe, from_values, resolve, setting
+from hypogoal.core.config import STAGES, as_dict, describe, from_values, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import defaults_of
-from hypogoal.stages.sweep import STAGES, config_class_of
+from hypogoal.stages.sweep import config_class_of
 
 PRESETS = Path(hypogoal.__file__).parent / "presets"
 
@@ -42,6 +42,22 @@ def test_precedence_is_set_over_option_over_preset_over_default(tmp_path: Path) 
         assignments=["steps=40"],
     )
     assert config == Example(steps=40, rate=2.0, kind="b", on=True, seeds=(1, 2))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[train_ensemble]\nsteps = 3", "Did you mean 'train-ensemble'"),
+        ("[trane]\nsteps = 3", "A preset has tables for collect, "),
+        ("steps = 7\n[train-ensemble]\nmembers = 3", "no such table in a preset: steps in "),
+    ],
+)
+def test_what_belongs_to_no_stage_is_no_preset(tmp_path: Path, text: str, words: str) -> None:
+    """Spec G2: a mistyped table must not pass for one that changes nothing."""
+    preset = tmp_path / "own.toml"
+    preset.write_text(text)
+    with pytest.raises(UserError, match=words):
+        resolve(Example, stage="train-ensemble", preset=str(preset))
 
 
 def test_a_domains_defaults_stand_between_the_presets_and_the_general_ones(tmp_path: Path) -> None:

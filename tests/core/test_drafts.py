@@ -1,5 +1,6 @@
 """Spec G1, G2: what a stage works on is its own, is gone on with only by what began it, and is never lost."""
 
+import json
 import os
 import signal
 import subprocess
@@ -11,8 +12,8 @@ import pytest
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
-from hypogoal.core.drafts import draft_folder, unfinished
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.drafts import draft, draft_folder, unfinished
+from hypogoal.core.errors import Complete, NumericalError, UserError
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "chooser": "ppo"}, "seed": 7}
 
@@ -101,16 +102,31 @@ def test_other_versions_do_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
         finish(out, resume=True)
 
 
+def test_what_other_versions_completed_is_complete(tmp_path: Path) -> None:
+    """Spec G1: nothing is gone on with; settings that only one version has do not make it another one's."""
+    out = tmp_path / "meta"
+    finish(out)
+    path = out / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["versions"]["torch"] = "0.1"
+    manifest["config"] = {"steps": 3, "gone": 1}
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(Complete, match=r"complete already \(made with torch 0.1\)"):
+        finish(out, resume=True)
+    with pytest.raises(UserError, match="was made with steps=3, not 4"):
+        finish(out, config={"steps": 4}, resume=True)
+
+
 def test_what_is_unfinished_is_not_begun_anew_by_mistake(tmp_path: Path) -> None:
     """Spec G1: neither flag, one line, before any work; --force says so."""
     out = tmp_path / "meta"
     with pytest.raises(Broken):
         stop(out, Broken())
     with pytest.raises(UserError, match="an unfinished one is there"):
-        claim(out)
+        claim(out, kind="meta")
     with pytest.raises(UserError, match="an unfinished one is there"):
         finish(out)
-    assert unfinished(out) and claim(out, resume=True) and claim(out, force=True)
+    assert unfinished(out) and claim(out, kind="meta", resume=True) and claim(out, kind="meta", force=True)
 
 
 def test_a_damaged_draft_is_one_line(tmp_path: Path) -> None:
@@ -158,6 +174,63 @@ def test_a_death_between_two_renames_loses_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["meta"]
 
 
+def test_a_command_that_could_not_be_read_again_begins_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A8, G2: a manifest says the command, and is UTF-8."""
+    monkeypatch.setattr("sys.argv", ["hypogoal", os.fsdecode(b"\xff")])
+    with pytest.raises(UserError, match="not valid JSON"):
+        finish(tmp_path / "meta")
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_another_process_finished_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    """Spec A6, G2: both saw nothing there; the later one is told before it works, not after."""
+    out = tmp_path / "meta"
+    claim(out, kind="meta")
+    finish(out)
+    for resume in (False, True):
+        with pytest.raises(UserError, match="exists already"), draft(out, {}, resume=resume):
+            raise AssertionError("it worked")
+    assert set(open_artefact(out).manifest["files"]) == {"whole"}
+
+
+def test_an_output_that_is_a_link_is_made_where_it_leads(tmp_path: Path) -> None:
+    """Spec A8: another disk, say; nothing is there yet, an empty folder is, or something to be replaced."""
+    far, near = tmp_path / "far", tmp_path / "near"
+    far.mkdir()
+    near.mkdir()
+    out, there = near / "meta", far / "there"
+    out.symlink_to(there)
+    finish(out)
+    there.rename(far / "moved")
+    there.mkdir()
+    with pytest.raises(Broken):
+        stop(out, Broken(), force=True)
+    assert unfinished(out) and os.listdir(near) == ["meta"]
+    assert finish(out, resume=True) == 1
+    finish(out, force=True)
+    assert out.is_symlink() and os.listdir(near) == ["meta"] and sorted(os.listdir(far)) == ["moved", "there"]
+    assert set(open_artefact(there).manifest["files"]) == {"whole"}
+
+
+def test_a_link_that_an_earlier_version_moved_aside_is_removed(tmp_path: Path) -> None:
+    """Spec G2: as a link; what it leads to stays."""
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "mine").write_text("precious")
+    (tmp_path / ".meta.old").symlink_to(tmp_path / "far")
+    (tmp_path / "meta").mkdir()
+    finish(tmp_path / "meta", force=True)
+    assert sorted(os.listdir(tmp_path)) == ["far", "meta"] and os.listdir(tmp_path / "far") == ["mine"]
+
+
+def test_the_folder_one_is_in_can_be_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A8: ``--out .``"""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    finish(Path("."), force=True)
+    assert open_artefact(here, "meta") and os.listdir(tmp_path) == ["here"]
+
+
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -173,7 +246,11 @@ def test_two_processes_do_not_write_one_output(tmp_path: Path) -> None:
     out = tmp_path / "meta"
     with subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "begun\n"
-        for attempt in (lambda: claim(out), lambda: finish(out, force=True), lambda: finish(out, resume=True)):
+        for attempt in (
+            lambda: claim(out, kind="meta"),
+            lambda: finish(out, force=True),
+            lambda: finish(out, resume=True),
+        ):
             with pytest.raises(UserError, match=f"process {other.pid} on .* is writing this"):
                 attempt()
         other.send_signal(signal.SIGKILL)

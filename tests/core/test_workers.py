@@ -1,8 +1,16 @@
 """Tasks on several cores: how many there may be."""
 
+import os
+import signal
+from pathlib import Path
+
 import pytest
 
-from hypogoal.core.workers import CORES, allowed, cores
+from hypogoal.cli import with_notes
+from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.checkpoints import checkpoints_of
+from hypogoal.core.errors import Killed
+from hypogoal.core.workers import CORES, allowed, cores, in_processes
 
 
 def test_no_stage_uses_more_processes_than_it_was_allotted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -11,3 +19,22 @@ def test_no_stage_uses_more_processes_than_it_was_allotted(monkeypatch: pytest.M
     assert allowed(4096) == 4096 and allowed(0) == cores()
     monkeypatch.setenv(CORES, "2")
     assert allowed(4096) == 2 and allowed(1) == 1 and allowed(0) == cores() <= 2
+
+
+def die() -> None:
+    """As the system has it where memory is used up."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def stage(out: Path) -> None:
+    """One that loses its processes after its first checkpoint."""
+    with create_artefact(out, kind="ensemble", config={}, seed=0) as folder:
+        checkpoints_of(folder).save({"step": 1})
+        in_processes([die, die], 2, lambda number, result: None)
+
+
+def test_a_process_that_the_system_kills_is_one_line(tmp_path: Path) -> None:
+    """Spec G1, G2: what happened and what to do, and that the checkpoint is kept."""
+    with pytest.raises(Killed, match=r"want of memory.*workers=1") as caught:
+        stage(tmp_path / "ensemble")
+    assert "the last checkpoint is kept" in with_notes(str(caught.value), caught.value)

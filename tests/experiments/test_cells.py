@@ -172,6 +172,24 @@ def test_a_ladders_experiment_that_cannot_be_is_told_in_one_line(changes: list[s
         plan("montezuma-ladders", OUT, assignments=changes)
 
 
+@pytest.mark.parametrize(
+    ("experiment", "changes", "words"),
+    [
+        ("doorkey", ["seeds=0,1,0"], "seeds=0"),
+        ("doorkey", ["layout_seeds=5-7,6,7"], "layout_seeds=6, layout_seeds=7"),
+        ("doorkey", ["controls=random,random"], "controls=random"),
+        ("doorkey", ["paired=true", "layout_seeds=1,2", "seeds=3,3"], "seeds=3"),
+        ("montezuma-ladders", ["seeds=0,0", "groups=1"], "seeds=0"),
+    ],
+)
+def test_a_value_that_is_given_twice_is_told_in_one_line(experiment: str, changes: list[str], words: str) -> None:
+    """Spec A6, G2: two cells of one output would be made twice, and their sweep never be finished."""
+    with pytest.raises(UserError, match=rf"two cells would be the same: {words}\. "):
+        plan(experiment, OUT, assignments=changes)
+    apart = plan("doorkey", OUT, assignments=["paired=true", "layout_seeds=1,1", "seeds=3,4"]).cells
+    assert len({cell.out for cell in apart}) == len(apart)
+
+
 def test_the_cost_is_that_of_the_cells_given_shared_among_the_workers() -> None:
     """Spec G4: two workers halve it, but never below the longest cell; a slower machine takes longer."""
     cells = [
@@ -202,6 +220,9 @@ def test_the_papers_figures_are_experiments() -> None:
     assert figure == plan("doorkey", OUT, preset="figure6").cells
     assert plan("figure3", OUT).cells == plan("montezuma-ladders", OUT, preset="figure3").cells
     assert plan("figure4", OUT).cells == plan("montezuma-ladders", OUT, preset="figure4").cells
+    assert figure == plan("figure6", OUT, preset="figure6").cells
+    with pytest.raises(UserError, match=r"figure6 has its own preset: demo. For another, give doorkey with --preset"):
+        plan("figure6", OUT, preset="demo")
     ten = plan("figure6", OUT, seeds="0", assignments=["paired=false", "layout_seeds=210-219"]).cells
     agents = [cell for cell in ten if cell.stage == "train-meta" and dict(cell.axes)["agent"] == "meta"]
     assert [dict(cell.axes)["layout_seed"] for cell in agents] == [*range(210, 220)]
