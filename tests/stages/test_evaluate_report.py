@@ -211,7 +211,9 @@ def test_hypotheses_alone_are_told_in_the_terminal(run, tmp_path, capsys, monkey
     numbers = [f"{row[which]['mean']:.3f}" for which in ("best", "mean", "worst")]
     (line,) = (line for line in told.splitlines() if "open-red-door" in line)
     assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
-    assert "dbat, K=2" in told and "no diversity, K=2" in told and max(map(len, told.splitlines())) <= 80
+    assert "dbat, K=2" in told and "no diversity, K=2" in told
+    *lines, where = told.splitlines()
+    assert max(map(len, lines)) <= 80 and where == str(tmp_path / "evaluation")
     assert metrics["missing"] == ["no agents"] and "PPO" not in told and "last 100" not in told
     for path in (tmp_path, tmp_path / "evaluation"):
         assert main(["show", str(path)]) == 0
