@@ -68,19 +68,26 @@ class _AfterGymnasium:
     and is too slow to be imported by ``import hypogoal``.
     """
 
+    def __init__(self) -> None:
+        self._passed = False  # while it asks the others, and once it is done
+
     def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
         """Gymnasium as the other finders find it; once it is loaded, the environments are registered."""
-        if name != "gymnasium":
+        if name != "gymnasium" or self._passed:
             return None
         import importlib.util
 
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
+        self._passed = True
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self._passed = False  # who asks may only look whether it is there
         if spec is not None and spec.loader is not None:
             load = spec.loader.exec_module
 
             def load_and_register(module: ModuleType) -> None:
                 load(module)
+                self._passed = True
                 register()
 
             spec.loader.exec_module = load_and_register  # type: ignore[method-assign]

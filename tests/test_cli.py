@@ -152,11 +152,12 @@ def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytes
     data, ensemble, meta = (str(made / name) for name in ("data.h5", "ensemble", "meta"))
     collect = ["collect", "doorkey", "--out", data, *SMALL, "--resume", "-q"]
     train = ["train-ensemble", data, "--out", ensemble, "--set", "steps=4", "--set", "workers=1", "--resume", "-q"]
+    fewer = [*train[:-2], "--set", "workers=2", *train[-2:]]  # of which no result depends
     evaluate, report = ["evaluate", str(made), "--resume", "-q"], ["report", str(made), "--resume", "-q"]
     files = [path for path in sorted(made.rglob("*")) if path.is_file()]
     before = [path.read_bytes() for path in files]
-    outs = (data, ensemble, str(made / "evaluation"), str(made / "report" / "index.html"))
-    for arguments, out in zip((collect, train, evaluate, report), outs, strict=True):
+    outs = (data, ensemble, ensemble, str(made / "evaluation"), str(made / "report" / "index.html"))
+    for arguments, out in zip((collect, train, fewer, evaluate, report), outs, strict=True):
         assert main(arguments) == 0
         said = capsys.readouterr()
         assert said.out == f"{out}\n" and f"{out} is complete already" in said.err
@@ -168,6 +169,7 @@ def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytes
         ([*train, "--unlabelled", data], f"{made_with} other inputs"),
         ([train[0], str(made / "none.h5"), *train[2:]], "no such data file"),
         (["train-meta", ensemble, "--out", str(made / "options"), "--resume"], "not of kind 'meta': it is of kind"),
+        (["collect", "montezuma", "--out", data, "--resume"], f"{made_with} domain=doorkey, not montezuma"),
         (["train-baseline", "montezuma", "--out", meta, "--resume"], "not of kind 'baseline'"),
         ([*report, "--videos", "1"], f"{made_with} videos=0, not 1"),
     ]

@@ -97,7 +97,12 @@ def test_a_changed_byte_is_found(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     "first",
-    ["import gymnasium, hypogoal", "import hypogoal, gymnasium", "import hypogoal; from gymnasium import spaces"],
+    [
+        "import gymnasium, hypogoal",
+        "import hypogoal, gymnasium",
+        "import hypogoal; from gymnasium import spaces",
+        "import hypogoal, importlib.util; assert importlib.util.find_spec('gymnasium')",
+    ],
 )
 def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> None:
     """Spec B1: the README's example works where nothing else was imported, and in whichever order one imports."""

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from hypogoal.cli.common import AsJson, app, echo, print_table
+from hypogoal.core.errors import UserError
 
 
 @app.command()
@@ -24,7 +25,11 @@ def show(
     about = describe_path(path)
     if not as_json:
         echo(about, False, lines(about))
-    numbers = numbers_of(path)
+    numbers = None
+    try:
+        numbers = numbers_of(path)
+    except UserError as error:  # what it is can be told all the same
+        typer.echo(f"hypogoal: {error}", err=True)
     if as_json:
         echo(about if numbers is None else {**about, "metrics": numbers}, True, [])
     elif numbers is not None:

@@ -199,7 +199,7 @@ def create_artefact(
         Complete: with ``resume``, it was made with these.
     """
     inputs = [Path(path) for path in inputs]
-    out = claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
+    given, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
     about = {
         "kind": kind,
         "format": FORMAT_VERSION,
@@ -212,7 +212,7 @@ def create_artefact(
     if resume and out.exists() and not unfinished(out):
         manifest = open_artefact(out, kind).manifest
         hashes = [entry["sha256"] for entry in manifest["inputs"]]
-        raise check_complete({**manifest, "inputs": hashes}, identity, out)
+        raise check_complete({**manifest, "inputs": hashes}, identity, given)
     with draft(out, identity, force=force, resume=resume) as work:
         yield work.files
         files = {

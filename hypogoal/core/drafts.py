@@ -211,8 +211,7 @@ def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str
     Raises:
         UserError: they differ.
     """
-    if before == now:
-        return
+    before, now = _that_matters(before), _that_matters(now)
     for key in {**before, **now}:
         old, new = before.get(key), now.get(key)
         if old == new:
@@ -222,6 +221,12 @@ def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str
             old, new = old.get(key), new.get(key)
         other = "other inputs" if key == "inputs" else f"{key}={_short(old)}, not {_short(new)}"
         raise UserError(f"{what} with {other}", out, do)
+
+
+def _that_matters(about: dict[str, Any]) -> dict[str, Any]:
+    """What results depend on: not on how many processes there are."""
+    config = about.get("config")
+    return about if not isinstance(config, dict) else {**about, "config": {**config, "workers": None}}
 
 
 def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
@@ -243,8 +248,10 @@ def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path)
         {"config": {key: about["config"][key] for key in settings}, **{key: about[key] for key in keys}}
         for about in (before, now)
     )
-    do = "Choose another --out, or give --force and no --resume."
+    do = "Give --force and no --resume, or write elsewhere."
     check_same(one, other, out, "what is complete there was made", do)
+    if now["config"] and not settings:
+        raise UserError("what is complete there was made with other settings", out, do)
     versions = before.get("versions")
     known = versions.items() if isinstance(versions, dict) else ()
     others = [f"{name} {version}" for name, version in known if now["versions"].get(name) != version]

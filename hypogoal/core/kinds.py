@@ -11,11 +11,12 @@ from pathlib import Path
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import open_hdf5
+from hypogoal.core.hdf5 import Busy, open_hdf5
 from hypogoal.core.manifests import MANIFEST, MAX_MANIFEST_BYTES
 
 DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
+FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
 
 
@@ -48,15 +49,22 @@ def _manifest_kind(folder: Path) -> str:
 
 
 def _is_data(path: Path) -> bool:
-    """Whether a file is one of collected states: HDF5 that is cut off, or has names of sub-goals."""
+    """Whether a file is one of collected states: HDF5 with names of sub-goals, which stand in front if it is cut off.
+
+    Raises:
+        Busy: another program writes it.
+    """
     with path.open("rb") as raw:
-        if raw.read(len(HDF5)) != HDF5:
-            return False
+        begin = raw.read(FRONT)
+    if not begin.startswith(HDF5):
+        return False
     try:
-        with open_hdf5(path, "", "") as file:
+        with open_hdf5(path, "the file", AWAY) as file:
             return "sub_goals" in file.attrs
+    except Busy:
+        raise
     except UserError:
-        return True
+        return b"sub_goals" in begin
 
 
 def _is_arrays(path: Path) -> bool:

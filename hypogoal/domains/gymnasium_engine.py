@@ -48,8 +48,11 @@ def make_checked(make: MakeEnv) -> gymnasium.Env:
 
 
 def channels_first(shape: tuple[int, ...]) -> bool:
-    """Whether a shape is (C, H, W) rather than (H, W, C): few rows, and more channels than any image has."""
-    return len(shape) == 3 and shape[0] <= MOST_CHANNELS < shape[2]
+    """Whether a shape is (C, H, W) rather than (H, W, C): few "rows", and more columns and "channels" than that.
+
+    Small grids with many planes, (7, 7, 20), are what they say.
+    """
+    return len(shape) == 3 and shape[0] <= MOST_CHANNELS < min(shape[1:])
 
 
 def shape_of(env: gymnasium.Env) -> tuple[int, ...]:

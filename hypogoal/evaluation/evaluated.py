@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, find_artefacts, sha256_of
+from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
@@ -56,7 +56,11 @@ def read_numbers(source: Artefact) -> Mapping[str, Any]:
     Raises:
         UserError: it is damaged.
     """
-    return _metrics(source.whole().path / "metrics.json")
+    path = source.path / "metrics.json"
+    fault = file_fault(source.path, path.name, source.manifest["files"].get(path.name, ""))
+    if fault:
+        raise UserError(f"the evaluation's file is {fault}", path, AGAIN)
+    return _metrics(path)
 
 
 def _since(run: Path, source: Artefact) -> list[str]:

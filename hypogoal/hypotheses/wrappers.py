@@ -33,7 +33,12 @@ def require_observations(env: Env, shape: tuple[int, ...]) -> None:
 
 
 def as_number(value: Any) -> int | None:
-    """An integer of Python's or of any array library's; None where it is something else, a truth value among it."""
+    """An integer of Python's or of any array library's; None where it is something else, a truth value among it.
+
+    An array of one integer is that integer: agents of one environment give such.
+    """
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
     if isinstance(value, bool | np.bool_):
         return None
     try:

@@ -10,6 +10,7 @@ from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
+from hypogoal.core.errors import UserError
 from hypogoal.core.kinds import DATA
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
@@ -46,12 +47,15 @@ def collect(
         Numbers of states and positives per split and sub-goal.
     """
     require_names(domain.sub_goals)  # not after all the play, when the file is written
-    out = claim(out, kind=DATA, force=force, resume=resume)
+    given, out = out, claim(out, kind=DATA, force=force, resume=resume)
     about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
     if resume and out.exists() and not unfinished(out):
         found = open_dataset(out)
+        if found.lost:
+            do = "Give --force and no --resume to collect it again."
+            raise UserError(f"the data file has lost {', '.join(found.lost)}", out, do)
         before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
-        raise check_complete(before, about, out)
+        raise check_complete(before, about, given)
     size = getattr(domain, "collected_bytes", lambda config: 0)(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:

@@ -116,8 +116,16 @@ def test_force_replaces_only_what_a_stage_makes_there(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(text)
     with create_hdf5(tmp_path / "other.h5") as file:
         file["weights"] = [1.0]
+    cut = tmp_path / "cut.h5"  # another's
+    cut.write_bytes((tmp_path / "other.h5").read_bytes()[:1000])
     before = contents(tmp_path)
-    cases = [(ensemble, "meta"), (unreadable, "meta"), (ensemble, "data"), (tmp_path / "other.h5", "data")]
+    cases = [
+        (ensemble, "meta"),
+        (cut, "data"),
+        (unreadable, "meta"),
+        (ensemble, "data"),
+        (tmp_path / "other.h5", "data"),
+    ]
     cases += [(tmp_path / name, kind) for name in texts for kind in ("meta", "data", "arrays")]
     for out, kind in cases:
         with pytest.raises(UserError, match="what stands there is not of kind"):

@@ -12,7 +12,7 @@ import pytest
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
-from hypogoal.core.drafts import draft, draft_folder, unfinished
+from hypogoal.core.drafts import check_complete, draft, draft_folder, unfinished
 from hypogoal.core.errors import Complete, NumericalError, UserError
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "chooser": "ppo"}, "seed": 7}
@@ -258,3 +258,28 @@ def test_two_processes_do_not_write_one_output(tmp_path: Path) -> None:
     assert draft_folder(out).exists()
     assert finish(out) == 0
     assert os.listdir(tmp_path) == ["meta"]
+
+
+def test_how_many_processes_there_are_is_no_matter(tmp_path: Path) -> None:
+    """Spec G1: with fewer (a process was killed for want of memory) it goes on where it was."""
+    out = tmp_path / "out"
+
+    def begin(workers: int, *, resume: bool) -> None:
+        with draft(out, {"kind": "meta", "config": {"workers": workers, "steps": 3}}, resume=resume) as work:
+            assert bool(checkpoints_of(work.files).load()) == resume
+            checkpoints_of(work.files).save({"step": 1})
+            raise KeyboardInterrupt
+
+    for workers, resume in ((4, False), (1, True)):
+        with pytest.raises(KeyboardInterrupt):
+            begin(workers, resume=resume)
+    other = {"kind": "meta", "config": {"workers": 1, "steps": 4}}
+    with pytest.raises(UserError, match="steps=3, not 4"), draft(out, other, resume=True):
+        pass
+
+
+def test_what_has_no_setting_in_common_was_made_otherwise(tmp_path: Path) -> None:
+    """Spec G2: imported states are none that 'collect' made."""
+    before, now = ({"config": config, "versions": {}} for config in ({"source": "own.npz"}, {"steps": 3}))
+    with pytest.raises(UserError, match="made with other settings"):
+        check_complete(before, now, tmp_path)

@@ -211,6 +211,7 @@ def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: py
         ((48, 48, 12), False),
         ((16, 64, 16), False),
         ((20, 84, 84), False),
+        ((7, 7, 20), False),  # MiniGrid's one-hot view
         ((3, 48), False),
     ],
 )
