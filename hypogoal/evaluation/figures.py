@@ -180,7 +180,7 @@ def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str,
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.set_xlim(min(0.45, float(np.nanmin([values for _, values in kinds])) - 0.03), 1.02)
-        axes.set_xlabel("balanced accuracy on held-out layouts (0.5: chance)")
+        axes.set_xlabel("balanced accuracy on held-out states (0.5: chance)")
         legend_below(figure, [axes], 3)
         return figure
 

@@ -78,7 +78,10 @@ def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
         for place, panel in zip(axes.flat, panels, strict=False):
             for series in panel.series:
                 _draw_series(place, series, names.index(series.name), len(names))
-            place.plot(list(panel.blind), list(panel.blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
+            if len(panel.blind) == 1:  # of one N a line is a point, which a method's marker may hide
+                place.axhline(*panel.blind.values(), color=GREY, linewidth=1.2, linestyle=":", zorder=0)
+            else:
+                place.plot(list(panel.blind), list(panel.blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
             place.set_title(panel.title, fontsize=9.5)
             place.set_ylim(max(0.0, float(np.nanmin(known)) - 0.03), 1.03)
             place.set_xticks(ticks)

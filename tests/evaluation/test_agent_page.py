@@ -121,15 +121,15 @@ def test_each_variant_of_the_option_agent_has_its_own_answer_and_control():
     assert dbat.startswith("The agent 'options (learned members), ensemble=dbat' reached the goal in 100 %")
     assert none.startswith("The agent 'options (learned members), ensemble=none' reached the goal in 100 %")
     for text in (dbat, none):
-        assert "Uniformly random choice among the same options: 0 %, 500 steps." in text
+        assert "Uniformly random choice among options of the same members: 0 %, 500 steps." in text
     for text in answers(*two()):
-        assert text.endswith("No random choice among the same options was run.")
+        assert text.endswith("No random choice among options of the same members was run.")
 
 
 def test_a_control_is_never_that_of_another_variant():
     """Spec F5: its name has no settings where it is the only one, or has those that few of its runs have."""
     dbat, none = answers(*two(), *two("random", reward=0.0)[2:])
-    assert dbat.endswith("No random choice among the same options was run.")
+    assert dbat.endswith("No random choice among options of the same members was run.")
     assert "Uniformly random choice among options of its ensemble: 0 %" in none
     most = [*two()[:2], made(ensemble="none")]  # 'dbat' goes unsaid here, 'none' there
     controls = [made(chooser="random", ensemble="dbat", reward=0.0), *two("random")[2:]]
@@ -144,7 +144,7 @@ def test_of_one_variant_nothing_is_said_of_variants():
     material = material_of(made(), made(chooser="random", reward=0.0))
     (text,) = summary_section(material)["paragraphs"][1:]
     assert text.startswith("The option agent reached the goal")
-    assert "Uniformly random choice among the same options: 0 %" in text
+    assert "Uniformly random choice among options of the same members: 0 %" in text
     said = str([terminations_section(material), choices_section(material)])
     assert "variant" not in said
     drawn, _ = paper_figures(material)

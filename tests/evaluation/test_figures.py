@@ -40,7 +40,7 @@ def preferences():
     ("draw", "texts"),
     [
         (curves, ["options", "PPO", "random play", "reward per episode", "environment steps, in thousands"]),
-        (members, ["red", "blue", "dbat, K=3", "single CNN", "balanced accuracy on held-out layouts"]),
+        (members, ["red", "blue", "dbat, K=3", "single CNN", "balanced accuracy on held-out states"]),
         (preferences, ["red", "blue", "random choice", "preference: chosen / expected", "match: balanced accuracy"]),
     ],
 )

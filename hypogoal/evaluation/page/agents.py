@@ -58,12 +58,13 @@ def summary_section(material: Material) -> Block:
     """What was asked, what came out."""
     metrics = material.metrics
     asked = (
-        "Each sub-goal is known from one layout only. An ensemble of classifiers holds several hypotheses about what "
+        "Each sub-goal is known from one context only. An ensemble of classifiers holds several hypotheses about what "
         "the sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by "
         "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
         "hypotheses that are true there?"
     )
-    return section("summary", "Summary", [asked, *_answers(material)], [_headline(material)], metrics["missing"])
+    headline = [_headline(material)] if metrics["agents"] else []
+    return section("summary", "Summary", [asked, *_answers(material)], headline, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
@@ -78,9 +79,9 @@ def _answers(material: Material) -> list[str]:
         control = control_of(material, agent, agents)
         if agent["success"]["mean"] is not None and control is not None:
             alike = not several or same_settings(agent, control)
-            text += f" {_by_chance(control, 'the same options' if alike else 'options of its ensemble')}"
+            text += f" {_by_chance(control, 'options of the same members' if alike else 'options of its ensemble')}"
         elif several and control is None:
-            text += " No random choice among the same options was run."
+            text += " No random choice among options of the same members was run."
         paragraphs.append(text)
     return paragraphs
 

@@ -29,13 +29,13 @@ def explorer_section(material: Material) -> Block:
         missing = [f"States to browse: they need {needed}."]
         return section("explorer", TITLE, [], [], missing)
     source = next(one for one in material.metrics["ensembles"] if one["path"] == found["ensemble"])
-    shown, states = (sum(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
+    shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
         f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them: {shown:,} "
-        f"of {states:,}, drawn so that every kind of outcome and every place comes up; how often one does says "
-        "nothing. Choose a state to see each member's verdict and what it goes by (orange speaks for 'reached', blue "
-        "against it), and a member to see the options it became. The address of the page holds the filters: it can "
-        "be shared."
+        f"of {states:,} for a sub-goal, drawn so that every kind of outcome and every place comes up; how often one "
+        "does says nothing. Choose a state to see each member's verdict and what it goes by (orange speaks for "
+        "'reached', blue against it), and a member to see the options it became. The address of the page holds the "
+        "filters: it can be shared."
     )
     goals = [_goal(material, source, goal["sub_goal"]) for goal in found["sub_goals"]]
     places = list(dict.fromkeys(state["place"] for goal in goals for state in goal["states"] if state["place"]))

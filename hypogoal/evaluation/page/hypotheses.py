@@ -35,10 +35,17 @@ KINDS = {
 def hypotheses_section(material: Material) -> Block:
     """Figure 3's question on held-out layouts: best, mean and worst member, and how much members disagree."""
     metrics = material.metrics
+    if _of_layouts(metrics):
+        judged = "Members are judged on layouts whose states were in no training set."
+    else:
+        judged = (
+            "Members are judged on the held-out states of the data. Where these are a share of the labelled ones they "
+            "say nothing of other contexts."
+        )
     text = (
-        "Members are judged on layouts whose states were in no training set. The best member shows whether a "
-        "hypothesis that transfers is in the ensemble at all; mean and worst show what the agent has to choose "
-        "among. Balanced accuracy is 0.5 for a member that always says the same."
+        f"{judged} The best member shows whether a hypothesis that holds there is in the ensemble at all; mean and "
+        "worst show what the agent has to choose among. Balanced accuracy is 0.5 for a member that always says the "
+        "same."
     )
     if not metrics["ensembles"]:
         nothing = figure(
@@ -51,6 +58,11 @@ def hypotheses_section(material: Material) -> Block:
     return section(
         "hypotheses", "Hypotheses", [text], [_dots(material), _table(metrics), *compared, *_members(metrics)]
     )
+
+
+def _of_layouts(metrics: Mapping[str, Any]) -> bool:
+    """Whether held-out states are of layouts, as collected ones are, and not only states, as imported ones."""
+    return any(goal["by_layout"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
 
 
 def _dots(material: Material) -> Block:
@@ -66,13 +78,14 @@ def _dots(material: Material) -> Block:
         kinds.append((name, values))
     drawn = best_mean_worst_members(sub_goals, kinds) if np.isfinite([values for _, values in kinds]).any() else None
     seeds = sorted({ensemble["seed"] for ensemble in material.metrics["ensembles"]})
+    where = "layouts, pooled over them" if _of_layouts(material.metrics) else "states"
     caption = (
-        "The quantity of the paper's Figure 3, for one labelled layout: balanced accuracy on held-out layouts, "
-        "pooled over them. Filled: best member; bar: mean of members; hollow: worst member; each a mean over "
-        f"ensemble seeds ({listed(seeds)}). Dotted: always the same answer."
+        f"The quantity of the paper's Figure 3, for one labelled context: balanced accuracy on held-out {where}. "
+        "Filled: best member; bar: mean of members; hollow: worst member; each a mean over ensemble seeds "
+        f"({listed(seeds)}). Dotted: always the same answer."
     )
     missing = "No held-out states have both classes."
-    return figure(material, "members", "Members' balanced accuracy on held-out layouts", drawn, caption, missing)
+    return figure(material, "members", "Members' balanced accuracy on held-out states", drawn, caption, missing)
 
 
 def _table(metrics: Mapping[str, Any]) -> Block:
@@ -95,7 +108,7 @@ def _table(metrics: Mapping[str, Any]) -> Block:
         ("ensemble", "sub-goal", "best", "mean", "worst", "disagree, unlabelled", "disagree, held-out", "seeds"),
         rows,
         texts=2,
-        caption="Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of states "
+        caption="Balanced accuracy on held-out states of the best, mean and worst member, and the share of states "
         "on which two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
     )
 
@@ -122,11 +135,15 @@ def _members(metrics: Mapping[str, Any]) -> list[Block]:
                 rows,
                 texts=2,
                 folded=f"Every member of {ensemble['path']} ({ensemble['name']}, seed {ensemble['seed']})",
-                caption=f"Pooled over {goal['states']} held-out states of {len(goal['by_layout'])} layouts; the last "
+                caption=f"Pooled over {goal['states']} held-out states{_layouts(goal)}; the last "
                 "column is the share of unlabelled states that the member calls positive.",
             )
         )
     return blocks
+
+
+def _layouts(goal: Mapping[str, Any]) -> str:
+    return f" of {len(goal['by_layout'])} layouts" if goal["by_layout"] else ""
 
 
 def examples_section(material: Material) -> Block:
@@ -139,7 +156,7 @@ def examples_section(material: Material) -> Block:
     source = next(ensemble for ensemble in material.metrics["ensembles"] if ensemble["path"] == shown)
     text = (
         f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
-        "probability that the sub-goal is reached. Coloured: verdicts that differ from the truth. Chosen to show "
+        "probability that the sub-goal is reached. Orange: verdicts that differ from the truth. Chosen to show "
         "each kind, so their frequency here says nothing."
     )
     order = [goal["sub_goal"] for goal in source["sub_goals"]]

@@ -52,8 +52,9 @@ def _options(rows: Sequence[Mapping[str, Any]]) -> str:
     oracle = next((entry for entry in known if entry["method"].startswith(ORACLE)), None)
     beside = f"; options that end at the true sub-goal: {fixed(oracle['best']['mean'], 0)}" if oracle else ""
     return (
-        f"The best member's options stop {fixed(near['best']['mean'], 0)} from a true base at best ({near['method']}, "
-        f"N={near['groups']}), mean over {len(near['ladders'])} ladders{beside}."
+        f"The best member's options stop {fixed(near['best']['mean'], 0)} units of position from a true base at best, "
+        f"the mean member's {fixed(near['mean']['mean'], 0)} ({near['method']}, N={near['groups']}), mean over "
+        f"{len(near['ladders'])} ladders{beside}."
     )
 
 
@@ -77,7 +78,7 @@ def _headline(metrics: Mapping[str, Any]) -> list[Block]:
                 "–" if groups is None else str(groups),
                 *unseen,
                 deviation(scores["scores"]["all"]["accuracy"]["best"], 2) if scores else cell("–"),
-                deviation(distance["best"], 1) if distance else cell("–"),
+                *(deviation(distance[which], 1) if distance else cell("–") for which in ("best", "mean")),
                 percent(distance["reached_base"]["mean"]) if distance else "–",
                 mark="first" if method != last else "",
             )
@@ -92,8 +93,9 @@ def _headline(metrics: Mapping[str, Any]) -> list[Block]:
                 "unseen: validated",
                 "unseen: mean",
                 "all: best acc.",
-                "distance",
-                "at base",
+                "distance: best",
+                "mean",
+                "at base: best",
             ),
             lines,
             texts=2,

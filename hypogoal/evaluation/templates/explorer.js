@@ -110,7 +110,7 @@
       add("rect", { x: index + 0.1, y: 10 - height, width: 0.8, height, fill: "var(--blue)" });
     });
     add("path", { d: `M0 ${10 - 10 / top}H${values.length}`, "vector-effect": "non-scaling-stroke", stroke: "var(--soft)" });
-    return make("div", { class: "spark" }, svg, soft(`preference over training; line: 1, highest: ${top.toFixed(1)}`));
+    return make("div", { class: "spark" }, svg, soft(`preference over training; line: 1, top: ${top.toFixed(1)}`));
   };
 
   const facts = (rows) => make("dl", {}, ...rows.flatMap(([key, value]) => [make("dt", {}, key), make("dd", {}, value)]));
