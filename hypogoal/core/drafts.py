@@ -119,7 +119,8 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
     """
     folder = draft_folder(out)
     words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
-    fresh = {"identity": identity, "command": [Path(sys.argv[0]).name, *words]}
+    called = Path(sys.argv[0]).name
+    fresh = {"identity": identity, "command": ["hypogoal" if called == "__main__.py" else called, *words]}
     fresh = parse_json(
         json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
     )

@@ -19,6 +19,7 @@ class Found:
         agents: what plays a layout: metas, options that no meta continues, baselines.
         ladders: options learned from a named start each, with a table of where they stopped.
         silent: options learned from a named start without that table; they are not evaluated.
+        continued: options that a meta artefact continues, and so is judged by.
     """
 
     run: Path
@@ -26,6 +27,7 @@ class Found:
     agents: list[Artefact]
     ladders: list[Artefact]
     silent: list[Artefact]
+    continued: list[Artefact]
 
     def everything(self) -> list[Artefact]:
         """All of them."""
@@ -49,12 +51,14 @@ def find(run: Path) -> Found:
         for entry in artefact.manifest["inputs"]
         if entry["kind"] == "options"
     }
-    options = [artefact for artefact in find_artefacts(run, "options") if artefact.path.resolve() not in continued]
+    learned = find_artefacts(run, "options")
+    options = [artefact for artefact in learned if artefact.path.resolve() not in continued]
     ladders = [artefact for artefact in options if "executions.csv" in artefact.manifest["files"]]
     silent = [artefact for artefact in options if artefact not in ladders and artefact.config.get("start")]
     others = [artefact for artefact in options if artefact not in (*ladders, *silent)]
     agents = [*metas, *others, *find_artefacts(run, "baseline")]
-    found = Found(run, find_artefacts(run, "ensemble"), agents, ladders, silent)
+    parts = [artefact for artefact in learned if artefact not in options]
+    found = Found(run, find_artefacts(run, "ensemble"), agents, ladders, silent, parts)
     if not found.everything():
         raise UserError("nothing to evaluate", run, "Train something into it first, see 'hypogoal run --help'.")
     return found

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FULL = 127  # what the strongest attribution of a picture is stored as
+MOST_SIDE = 128  # pixels of a picture on the page
 COLOURS = 256  # that a PNG's palette holds
 LEVELS, SHADES = 12, 6  # steps of an attribution's strength and of the state behind it, so that a palette holds all
 AGAINST, FOR = (0, 114, 178), (213, 94, 0)  # Okabe and Ito's blue and vermillion: a pair that all readers tell apart
@@ -26,6 +28,19 @@ def image_png(image: NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
+
+
+def reduced(values: NDArray[Any]) -> NDArray[Any]:
+    """A picture (H, W) or (H, W, C) of at most ``MOST_SIDE`` pixels a side: means of squares, for the page's sake.
+
+    One that is no larger is as it was; what no whole square fills at the right and below is cut.
+    """
+    step = -(-max(values.shape[:2]) // MOST_SIDE)
+    if step == 1:
+        return values
+    height, width = (size // step for size in values.shape[:2])
+    squares = values[: height * step, : width * step].reshape(height, step, width, step, *values.shape[2:])
+    return np.asarray(squares.mean((1, 3)).astype(values.dtype))
 
 
 def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) -> bytes:

@@ -309,7 +309,7 @@ def provenance(found: Found, data: list[Path]) -> dict[str, Any]:
             "command": artefact.manifest.get("command", []),
             "versions": artefact.manifest.get("versions", {}),
         }
-        for artefact in found.everything()
+        for artefact in (*found.everything(), *found.continued)
     ]
     collected = []
     for path in data:

@@ -7,7 +7,7 @@ from PIL import Image
 
 from hypogoal.evaluation.browsing import pick_to_browse, take_turns
 from hypogoal.evaluation.choices import Choices, over_training
-from hypogoal.evaluation.pictures import attribution_png, brightness, flat, image_png, to_bytes
+from hypogoal.evaluation.pictures import attribution_png, brightness, flat, image_png, reduced, to_bytes
 
 
 def test_groups_take_turns():
@@ -77,3 +77,13 @@ def test_pictures_are_the_same_pixels_and_small():
         np.testing.assert_array_equal(np.asarray(read.convert("RGB" if image.ndim == 3 else "L")), image)
     noise = attribution_png(rng.normal(size=(84, 84)), rng.random((84, 84)))
     assert Image.open(io.BytesIO(noise)).mode == "P"
+
+
+def test_large_pictures_are_reduced() -> None:
+    """Spec F7: a page of own photographs stays one that can be opened; small pictures are shown pixel for pixel."""
+    image = np.random.default_rng(0).integers(256, size=(300, 257, 3), dtype=np.uint8)
+    small = reduced(image)
+    assert small.shape == (100, 85, 3) and small.dtype == np.uint8
+    np.testing.assert_array_equal(small[1, 2], image[3:6, 6:9].mean((0, 1)).astype(np.uint8))
+    assert reduced(image[..., 0] / 255).shape == (100, 85)
+    assert reduced(image[:128, :128]) is not None and np.shares_memory(reduced(image[:128, :128]), image)

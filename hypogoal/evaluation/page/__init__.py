@@ -47,7 +47,8 @@ def render(material: Material, version: str) -> str:
     """
     about = material.metrics["provenance"]
     domains = sorted({data["domain"] for data in about["data"]} | _domains_of(about["artefacts"]))
-    subtitle = f"{listed(domains)}; {len(about['artefacts'])} artefacts evaluated; hypogoal {version}"
+    count = len(about["artefacts"])
+    subtitle = f"{listed(domains)}; {count} artefact{'' if count == 1 else 's'} evaluated; hypogoal {version}"
     return draw_page(f"hypogoal: {material.metrics['run']}", subtitle, sections_of(material), version)
 
 

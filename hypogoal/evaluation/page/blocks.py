@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hypogoal.evaluation.figures import COLOURS, to_svg
-from hypogoal.evaluation.pictures import image_png
+from hypogoal.evaluation.pictures import image_png, reduced
 
 Block = dict[str, Any]
 
@@ -134,10 +134,10 @@ def figure(
 
 
 def picture(image: NDArray[np.uint8]) -> str:
-    """An observation as base64 PNG; of a stack of frames (H, W, C) with C other than 3 the last frame."""
+    """An observation as base64 PNG, see :func:`reduced`; of a stack (H, W, C) with C other than 3 the last frame."""
     if image.ndim == 3 and image.shape[2] != 3:
         image = image[..., -1]
-    return base64.b64encode(image_png(np.ascontiguousarray(image))).decode("ascii")
+    return base64.b64encode(image_png(reduced(image))).decode("ascii")
 
 
 def texts(packed: Any) -> list[str]:

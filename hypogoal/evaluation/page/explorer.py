@@ -14,7 +14,7 @@ import numpy as np
 
 from hypogoal.evaluation.page.blocks import Block, Material, fixed, picture, section, texts
 from hypogoal.evaluation.page.variants import settings_of, variants
-from hypogoal.evaluation.pictures import FULL, attribution_png
+from hypogoal.evaluation.pictures import FULL, attribution_png, reduced
 from hypogoal.evaluation.summary import percent
 
 TITLE = "Explore the hypotheses"
@@ -92,8 +92,8 @@ def _states(material: Material, sub_goal: str) -> list[dict[str, Any]]:
     for index in np.argsort(arrays["rows"], kind="stable"):
         saliency = []
         if index < explained:
-            grey = arrays["brightness"][index] / 255
-            saliency = [_png(attribution_png(values / FULL, grey)) for values in arrays["attributions"][index]]
+            grey = reduced(arrays["brightness"][index] / 255)
+            saliency = [_png(attribution_png(reduced(values / FULL), grey)) for values in arrays["attributions"][index]]
         found.append(
             {
                 "png": picture(arrays["observations"][index]),

@@ -102,8 +102,9 @@ def _headline(metrics: Mapping[str, Any]) -> list[Block]:
             tight=True,
             caption="Unseen: balanced accuracy on rooms that no training state came from, of the best, the "
             "validated and the mean member. All: accuracy of the best member on all held-out rooms, training "
-            "rooms included: the paper's Figure 3. Distance: where the best member's options stop, from the nearest "
-            "true base, mean over ladders: the paper's Figure 4, lower is better; and the share of their executions "
-            "that got to a base. Mean over seeds ± standard deviation; N: labelled ladder groups.",
+            "rooms included: the paper's Figure 3. Distance, in units of position: where options stop, from the "
+            "nearest true base, mean over ladders, of the best member (the paper's Figure 4, lower is better) and of "
+            "the mean one; and the share of the best one's executions that got to a base. Mean over seeds ± standard "
+            "deviation; N: labelled ladder groups.",
         )
     ]
