@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -103,9 +104,11 @@ def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
 
 
 def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
+    """What training came to; what NaN says, that no episode has ended, the number of episodes says too."""
     if not quiet:
+        known = {key: value for key, value in numbers.items() if not (isinstance(value, float) and math.isnan(value))}
         text = ", ".join(
-            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in numbers.items()
+            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in known.items()
         )
         typer.echo(text)
 

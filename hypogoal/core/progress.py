@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import time
@@ -61,7 +62,7 @@ class Progress:
         self.update(done)
 
     def advance(self, n: int = 1, **numbers: float) -> None:
-        """``n`` more units are done; ``numbers`` are shown beside the bar."""
+        """``n`` more units are done; ``numbers`` are shown beside the bar, but for NaN: not known yet."""
         self.update(self.done + n, **numbers)
 
     def update(self, done: int, **numbers: float) -> None:
@@ -69,7 +70,7 @@ class Progress:
         self.done = done
         if self.quiet:
             return
-        text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items())
+        text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value))
         if self._bar is not None:
             self._bar.update(self._task, completed=done, numbers=text)
         elif time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
