@@ -6,23 +6,27 @@ import shutil
 import sys
 from pathlib import Path
 
+from hypogoal.core.drafts import unfinished
 from hypogoal.core.errors import UserError
 
 CGROUP = Path("/sys/fs/cgroup")
 
 
-def preflight(stage: str, out: Path, needs: tuple[float, float], *, quiet: bool = False) -> None:
+def preflight(stage: str, out: Path, needs: tuple[float, float], *, resume: bool = False, quiet: bool = False) -> None:
     """Say what a stage will need, and refuse to start where that does not fit.
 
     Args:
         stage: its command.
         out: what it writes; nothing of it need be there yet.
         needs: bytes of memory, of all its processes, and of disk, what it removes at the end included.
+        resume: what is complete is kept, for which nothing is needed.
         quiet: say nothing where it fits.
 
     Raises:
         UserError: it does not fit; the numbers are in the message.
     """
+    if resume and out.exists() and not unfinished(out):
+        return
     memory, disk = needs
     free, space = free_memory(), free_disk(out)
     if free is not None:

@@ -75,7 +75,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False,
     needs = evaluation_needs(data, workers)
     if workers > 1 and needs.memory > (free_memory() or math.inf):
         workers, needs = 1, evaluation_needs(data, 1)
-    preflight("evaluate", out, needs, quiet=quiet)
+    preflight("evaluate", out, needs, resume=resume, quiet=quiet)
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:

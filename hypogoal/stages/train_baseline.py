@@ -82,7 +82,7 @@ def train_baseline(
     engine = _make_engine(played, config, chosen.environments)
     env = EngineEnv(engine)
     size = math.prod(env.observation_space.shape or (1,))
-    preflight("train-baseline", out, baseline_needs(size, getattr(chosen, "replay", 0)), quiet=quiet)
+    preflight("train-baseline", out, baseline_needs(size, getattr(chosen, "replay", 0)), resume=resume, quiet=quiet)
     about = as_dict(config) | {
         "domain": domain,
         "environments": chosen.environments,

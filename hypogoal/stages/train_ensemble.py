@@ -87,9 +87,8 @@ def train_ensemble(
         "domain_config": dataset.config,
     }
     workers = min(allowed(config.workers), len(sub_goals))
-    preflight(
-        "train-ensemble", out, ensemble_needs(data, others or (data,), config, len(sub_goals), workers), quiet=quiet
-    )
+    needs = ensemble_needs(data, others or (data,), config, len(sub_goals), workers)
+    preflight("train-ensemble", out, needs, resume=resume, quiet=quiet)
     with create_artefact(
         out, kind="ensemble", config=about, seed=seed, inputs=[data, *others], force=force, resume=resume
     ) as folder:

@@ -80,7 +80,7 @@ def train_meta(
     out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
-    preflight("train-meta", out, play_needs(domain, source.config, config), quiet=quiet)
+    preflight("train-meta", out, play_needs(domain, source.config, config), resume=resume, quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed, device)
     about = as_dict(config) | {
         "sub_goals": source.config["sub_goals"],

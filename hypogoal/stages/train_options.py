@@ -67,7 +67,7 @@ def train_options(
     out = claim(out, kind="options", inputs=[ensemble], force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
-    preflight("train-options", out, play_needs(domain, source.config, config), quiet=quiet)
+    preflight("train-options", out, play_needs(domain, source.config, config), resume=resume, quiet=quiet)
     engine, verdicts, learner = build(domain, source.path, source.config, config, seed, device)
     members = verdicts.options // len(source.config["sub_goals"])
     steps = config.steps * (verdicts.options if config.steps_for == "each" else 1)

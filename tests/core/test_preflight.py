@@ -22,6 +22,17 @@ def test_needs_are_said_or_refused_with_numbers(tmp_path: Path, capsys: pytest.C
     assert list(tmp_path.iterdir()) == []
 
 
+def test_nothing_is_needed_for_what_is_complete(tmp_path: Path) -> None:
+    """Spec A6, G1: --resume keeps it on a full disk too; to make it again takes what it takes."""
+    out = tmp_path / "out"
+    out.mkdir()
+    preflight.preflight("collect", out, (1e15, 1e15), resume=True)
+    with pytest.raises(UserError, match="not enough memory"):
+        preflight.preflight("collect", out, (1e15, 1e15))
+    with pytest.raises(UserError, match="not enough memory"):
+        preflight.preflight("collect", tmp_path / "other", (1e15, 1e15), resume=True)
+
+
 @pytest.mark.parametrize(("limit", "free"), [("3000000", 1_500_000), ("max", None), ("9" * 18, None)])
 def test_a_control_group_allows_less(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, free: int | None
