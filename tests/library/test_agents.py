@@ -309,7 +309,7 @@ def test_stable_baselines3_learns_a_classifiers_reward(run: Path) -> None:
 def test_maskable_ppo_reaches_the_goal_with_the_options_of_the_demo(tmp_path: Path) -> None:
     """Spec E1, done when: MaskablePPO on OptionEnv, with options of the demo's recipe, solves the demo's layout.
 
-    Takes the run that HYPOGOAL_DEMO_RUN names, or makes the options anew (a minute or two). All of it took four minutes.
+    Takes the run that HYPOGOAL_DEMO_RUN names, or makes the options anew: four minutes in all.
     """
     given = os.environ.get(DEMO)
     run = Path(given) if given else tmp_path / "demo"
