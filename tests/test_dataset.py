@@ -102,10 +102,15 @@ def test_a_changed_byte_is_found(tmp_path: Path, name: str) -> None:
         "import hypogoal, gymnasium",
         "import hypogoal; from gymnasium import spaces",
         "import hypogoal, importlib.util; assert importlib.util.find_spec('gymnasium')",
+        "import hypogoal; hypogoal.load_ensemble",
+        "import hypogoal; hypogoal.GymnasiumDomain",
+        "import hypogoal; hypogoal.SubgoalReward",
+        "import hypogoal.domains.doorkey",
+        "import hypogoal.domains.montezuma",
     ],
 )
 def test_the_environment_is_registered_in_a_fresh_interpreter(first: str) -> None:
-    """Spec B1: the README's example works where nothing else was imported, and in whichever order one imports."""
+    """Spec B1: the README's example works where nothing else was imported, and whatever first wants Gymnasium."""
     code = f"{first}; import gymnasium; print(gymnasium.make('hypogoal/DoorKey-8x8-v0').observation_space.shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "(64, 64, 3)", done.stderr
