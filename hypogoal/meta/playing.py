@@ -19,8 +19,7 @@ from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
 from hypogoal.options.memory import STACK
 from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.running import MemberVerdicts
-from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
+from hypogoal.options.verdicts import MemberVerdicts, Verdicts, learned_terminations, oracle_terminations
 from hypogoal.options.visited import Visited
 
 LOG_INTERVAL = 2_000  # environment steps

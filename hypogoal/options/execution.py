@@ -20,7 +20,6 @@ from hypogoal.domains.base import Engine, Step
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
-from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 from hypogoal.options.visited import Visited
 
@@ -172,7 +171,7 @@ class OptionLoop:
             place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
             where = f"in environment {place} under option {option[place]} at step {self.recorder.steps}"
             raise NumericalError(f"the reward is {step.rewards[place]} {where}")
-        reached = self._reached(step.next_ids, option)
+        reached = self.verdicts.running(step.next_ids, option)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
@@ -196,12 +195,6 @@ class OptionLoop:
             if self.initiation:
                 numbers |= self.initiation.learn()
         return numbers
-
-    def _reached(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether each option's own sub-goal holds in the state it arrived at, bool (E,)."""
-        if self.config.experience == "own" and not self.config.mask_reached:
-            return running_verdicts(self.verdicts, ids, options)  # nobody asks for the other members'
-        return self.verdicts.of(ids)[np.arange(len(ids)), options]
 
     def _choose(self) -> None:
         free = np.flatnonzero(self.option == NONE)

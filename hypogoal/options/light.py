@@ -31,7 +31,6 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
 from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
-from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 POSITIVES_KEPT = 512  # per member
@@ -173,7 +172,7 @@ class LightLearner:
             return self.verdicts.of(s), self.verdicts.of(following)
         option = rows["option"].astype(np.int64)
         owner = option[:, None] == np.arange(self.options)
-        here, reached = (running_verdicts(self.verdicts, ids, option) for ids in (s, following))
+        here, reached = (self.verdicts.running(ids, option) for ids in (s, following))
         return owner & here[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:

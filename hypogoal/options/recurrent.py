@@ -28,7 +28,6 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
 from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import PaperQNetwork
-from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 FIELDS = {
@@ -169,7 +168,7 @@ class RecurrentLearner:
     def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool]]) -> None:
         member = self.members[option]
         s, a, following, end, timeout = (np.array(column) for column in zip(*steps, strict=True))
-        reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
+        reached = self.verdicts.running(following, np.full(len(following), option))
         member.replay.add(
             s=s, a=a, next=following, terminal=reached | end, timeout=timeout,
             place=np.arange(len(s)), execution=np.full(len(s), member.executions),
@@ -224,7 +223,7 @@ class RecurrentLearner:
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]
         following = data["next"][indices].astype(np.int64)
-        reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
+        reached = self.verdicts.running(following, np.full(len(following), option))
         goal = double_q_targets(
             self._tensor(reached).float(),
             self._tensor(terminal),

@@ -12,7 +12,6 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
@@ -22,7 +21,6 @@ from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbed
 from hypogoal.options.policies import make_policies
 from hypogoal.options.recording import EXECUTION_COLUMNS, EXECUTIONS_KEPT, Recorder
 from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.running import MemberVerdicts, running_verdicts
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
 
 LEFT, RIGHT, STAY = 2, 3, 0
@@ -335,43 +333,3 @@ def test_even_choice_gives_every_option_as_many_steps() -> None:
     assert abs(steps[0] - steps[1]) <= 4 * 10 and sum(steps) > 3900
     masked = np.array([[True, False]])
     assert [chooser.choose(np.array([9]), np.zeros(1, np.int64), masked)[0] for _ in range(5)] == [0] * 5
-
-
-class TallCorridor(LongCorridor):
-    """In pictures that the member network takes."""
-
-    observation_shape = (84, 84, 4)
-
-
-def test_running_members_are_judged_alone_and_once() -> None:
-    """Spec D1: the verdicts of each ensemble's own, its thresholds included, member by member, each state once."""
-    engine = TallCorridor(3)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        engine.step(rng.integers(4, size=3))
-    everything = np.arange(engine.n_states)
-    ensembles = [
-        Ensemble("montezuma", engine.observation_shape, 2, torch.Generator().manual_seed(g)).eval() for g in range(2)
-    ]
-    for ensemble in ensembles:  # so that each member says yes in some of the states
-        ensemble.set_thresholds(np.quantile(ensemble.predict(engine.images(everything)), 0.6, axis=0))
-    wanted = np.concatenate([ensemble.verdicts(engine.images(everything)) for ensemble in ensembles], axis=1)
-    assert (wanted.any(0) & ~wanted.all(0)).all()
-    verdicts = MemberVerdicts(engine, ensembles)
-    asked: list[tuple[int, int]] = []
-    ask = verdicts._ask
-
-    def counted(ids, option):
-        asked.extend((int(identity), option) for identity in ids)
-        return ask(ids, option)
-
-    verdicts._ask = counted
-    for _ in range(30):
-        ids, options = rng.integers(engine.n_states, size=9), rng.integers(4, size=9)
-        np.testing.assert_array_equal(running_verdicts(verdicts, ids, options), wanted[ids, options])
-    assert len(set(asked)) == len(asked) > 100
-    np.testing.assert_array_equal(running_verdicts(verdicts, everything[:0], everything[:0]), [])
-    plain = Verdicts(oracle_terminations(engine), 2)
-    options = rng.integers(2, size=len(everything))
-    truth = engine.labels(everything)[everything, options]
-    np.testing.assert_array_equal(running_verdicts(plain, everything, options), truth)
