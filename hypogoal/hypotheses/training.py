@@ -46,7 +46,7 @@ def fit(
     device: torch.device | str = "cpu",
     checkpoints: Checkpoints | None = None,
 ) -> Ensemble:
-    """Eq. (1): the trained members of one sub-goal. On one CPU the same arguments give the same bytes.
+    """Eq. (1): the trained members of one sub-goal. On one CPU in one thread the same arguments give the same bytes.
 
     Args:
         observations: uint8 (N, H, W, C), the labelled states.
@@ -133,7 +133,8 @@ def quantile_thresholds(probabilities: NDArray[np.float32]) -> NDArray[np.float3
     """Thresholds float32 (K,) above which each member says yes to 5 % of states, from its probabilities (M, K) of them.
 
     Members of a crop are sure of what is no base and unsure of what is one in a room they do not know; the quantile
-    needs no labels. It stays below 1: a member that is certain of more than 5 % goes on saying yes to those.
+    needs no labels. It stays below 1: a member that is certain of more than 5 % goes on saying yes to those. The state
+    whose probability it is lies at its edge: see :meth:`Ensemble.verdicts`.
     """
     quantiles = np.quantile(probabilities, QUANTILE_LEVEL, axis=0, method="higher").astype(np.float32)
     return np.minimum(quantiles, np.nextafter(np.float32(1), np.float32(0)))
