@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,7 +11,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from hypogoal.core.drafts import unfinished
-from hypogoal.core.workers import CORES, die_with_parent
+from hypogoal.core.own_code import environment_of_children
+from hypogoal.core.workers import CORES, PYTHON, die_with_parent
 from hypogoal.experiments.cells import Cell
 from hypogoal.experiments.records import Record, begun, open_log, read_record, write_record
 
@@ -63,8 +63,8 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Runn
         log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
         fresh = force or cell.out.exists()  # what is there is an evaluation of before
         again = "--force" if fresh and not (before.attempts and unfinished(cell.out)) else "--resume"
-        command = [sys.executable, "-m", "hypogoal", *cell.arguments, again]
-        environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores)}
+        command = [*PYTHON, "-m", "hypogoal", *cell.arguments, again]
+        environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores), **environment_of_children()}
         process = subprocess.Popen(
             command,
             stdout=log,

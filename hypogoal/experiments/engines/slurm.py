@@ -13,7 +13,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,6 +22,8 @@ from typing import Any
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text
+from hypogoal.core.own_code import TRUST, environment_of_children
+from hypogoal.core.workers import PYTHON
 from hypogoal.experiments.cells import Cell, Plan, depths
 from hypogoal.experiments.records import AGAIN
 
@@ -183,22 +184,27 @@ def _script(array: Array, run: Path, options: Options) -> str:
     names = " ".join(shlex.quote(cell.name) for cell in array.cells)
     lines += [
         "trap '' USR2  # until the program listens: the warning must not end it",
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
         f"set -- {names}",
         'shift "$SLURM_ARRAY_TASK_ID"',
-        f'exec {shlex.quote(sys.executable)} -m hypogoal sweep --out {shlex.quote(str(run))} --cell "$1"',
+        f"export {TRUST}={shlex.quote(environment_of_children()[TRUST])}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_sweep(run, '--cell "$1"')]) + "\n"
+
+
+def _sweep(run: Path, what: str) -> list[str]:
+    python = shlex.join(PYTHON)
+    return [
+        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
+        f"exec {python} -m hypogoal sweep --out {shlex.quote(str(run))} {what}",
+    ]
 
 
 def _gather(run: Path, options: Options) -> str:
     lines = _head(run, GATHER, options)
     lines += [
         f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M",
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
-        f"exec {shlex.quote(sys.executable)} -m hypogoal sweep --out {shlex.quote(str(run))} --gather",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_sweep(run, "--gather")]) + "\n"
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
