@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from hypogoal.core.checkpoints import FOLDER, sync
+from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.errors import Complete, Killed, NumericalError, UserError
-from hypogoal.core.files import parse_json
+from hypogoal.core.files import parse_json, replace_text, sync
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -179,11 +179,7 @@ def _begin(folder: Path, begun: dict[str, Any]) -> None:
     for name in (BEGUN, FOLDER, FILES):
         _remove(folder / name)
     (folder / FILES).mkdir()
-    fresh = folder / f"{BEGUN}.new"
-    fresh.write_text(json.dumps(begun) + "\n", encoding="utf-8")
-    sync(fresh)
-    fresh.replace(folder / BEGUN)
-    sync(folder)
+    replace_text(folder / BEGUN, json.dumps(begun) + "\n")
 
 
 def _begun(folder: Path) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from hypogoal.core.files import read_json, replace_text
 from hypogoal.core.own_code import TRUST, environment_of_children
 from hypogoal.core.workers import PYTHON
 from hypogoal.experiments.cells import Cell, Plan, depths
-from hypogoal.experiments.records import AGAIN
 
 FOLDER, JOBS = "slurm", "jobs.json"
 MOST_ELEMENTS = 1000  # of one array, where Slurm does not say: its limit, if nobody changed it, is 1001
@@ -227,11 +226,12 @@ def jobs_of(run: Path) -> list[str]:
     path = run / FOLDER / JOBS
     if not path.is_file():
         return []
-    jobs = read_json(path, "the list of jobs is", AGAIN)
+    do = "Look with squeue that no job of the sweep waits or runs, then remove this file."
+    jobs = read_json(path, "the list of jobs is", do)
     try:
         numbers = [str(job["id"]) for job in jobs]
     except (KeyError, TypeError):
-        raise UserError("the list of jobs is damaged", path, "Remove it if no job runs.") from None
+        raise UserError("the list of jobs is damaged", path, do) from None
     return [number for number in numbers if number.isdigit()]
 
 
