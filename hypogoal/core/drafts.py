@@ -87,10 +87,7 @@ def sole_writer(out: Path) -> Iterator[None]:
         UserError: another process does.
     """
     with _locked(out):
-        try:
-            yield
-        finally:
-            shutil.rmtree(draft_folder(out), ignore_errors=True)
+        yield
 
 
 def unfinished(out: Path) -> bool:
@@ -262,7 +259,7 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Hold the lock on the draft of ``out``, whose folder is made where there is none."""
+    """Hold the lock on the draft of ``out``, whose folder is made where there is none and removed if it stays empty."""
     folder = draft_folder(out)
     until = time.monotonic() + PATIENCE_SECONDS
     while True:
@@ -276,7 +273,12 @@ def _locked(out: Path) -> Iterator[None]:
                 file.truncate(0)
                 file.write(f"process {os.getpid()} on {socket.gethostname()}")
                 file.flush()
-                yield
+                try:
+                    yield
+                finally:
+                    with contextlib.suppress(OSError):  # unless it is another's by now, who made it anew
+                        if _is_there(file, folder / LOCK) and os.listdir(folder) == [LOCK]:
+                            shutil.rmtree(folder)
                 return
             file.seek(0)
             owner = file.read(200) or "another process"
