@@ -23,6 +23,7 @@ from hypogoal.cli.common import (
     print_outcome,
     print_table,
     resolve_for,
+    values_of,
 )
 
 
@@ -78,13 +79,10 @@ def train_ensemble(
     given = {"diversity": diversity, "members": members}
     domain = domain_of(data, "data")
     config = resolve_for(domain, TrainEnsembleConfig, "train-ensemble", preset, set_, given)
-    typed = [diversity or "", *(text.partition("=")[2] for text in set_ or ())]
     own = [value for value in defaults_of(domain, "train-ensemble").values() if isinstance(value, str)]
-    with own_code.given(*typed, *own):  # and not what a preset says, which may be a stranger's file
-        own_code.require_trust(config.diversity, "diversity objective")
-        own_code.require_trust(config.network, "network")
     others = tuple(unlabelled or ())
-    stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
+    with own_code.given(diversity or "", *values_of(set_)), own_code.vouched(*own):  # and not what a preset says
+        stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)
 
 

@@ -137,12 +137,12 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
     Raises:
         UserError: the name is code that the user did not allow (see :func:`load_domain`).
     """
-    if not given:
+    with own_code.given(*([name] if given else [])):
         own_code.require_trust(name, "domain")
-    try:
-        return load_domain(name, given=given)
-    except UserError:
-        return None
+        try:
+            return load_domain(name)
+        except UserError:
+            return None
 
 
 def stage_config(stage: str) -> type:

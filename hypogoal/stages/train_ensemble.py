@@ -16,7 +16,6 @@ from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import given
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
@@ -68,9 +67,8 @@ def train_ensemble(
         NumericalError: a loss became NaN or Inf.
     """
     device = prepare(device)
-    with given(config.diversity, config.network):
-        load_objective(config.diversity)
-        load_network(config.network)
+    load_objective(config.diversity)
+    load_network(config.network)
     dataset = open_dataset(data)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
@@ -177,19 +175,18 @@ def _train_one(
     report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)))
     if not checkpoints.saved:
         report.log.restore(0)
-    with given(config.diversity, config.network):
-        ensemble = fit(
-            split.observations,
-            split.labels,
-            unlabelled,
-            config,
-            seed_for(seed, "ensemble", sub_goal),
-            report,
-            origins=split.origins,
-            unlabelled_origins=origins,
-            device=device,
-            checkpoints=checkpoints,
-        )
+    ensemble = fit(
+        split.observations,
+        split.labels,
+        unlabelled,
+        config,
+        seed_for(seed, "ensemble", sub_goal),
+        report,
+        origins=split.origins,
+        unlabelled_origins=origins,
+        device=device,
+        checkpoints=checkpoints,
+    )
     write_ensemble(folder, sub_goal, ensemble)
     report.log.close()
     return {"sub_goal": sub_goal, **report.numbers}
