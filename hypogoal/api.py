@@ -76,4 +76,14 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     masked = config["mask_reached"]
     if not isinstance(masked, bool):
         raise UserError("the manifest's setting 'mask_reached' is malformed", artefact.path / MANIFEST, AGAIN)
-    return Options(goals, members, ensembles, policies, config["option_timeout"], initiation, masked)
+    return Options(
+        goals,
+        members,
+        ensembles,
+        policies,
+        config["option_timeout"],
+        initiation,
+        masked,
+        domain=config["domain"],
+        domain_config=config["domain_config"],
+    )

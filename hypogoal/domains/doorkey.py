@@ -19,7 +19,8 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, leave_out
-from hypogoal.domains.doorkey_engine import DoorKeyEngine, SingleDoorKey, draw
+from hypogoal.domains.base import Domain
+from hypogoal.domains.doorkey_engine import DoorKeyEngine, draw
 from hypogoal.domains.doorkey_env import (
     DOOR_LABELS,
     MAX_STEPS,
@@ -41,7 +42,6 @@ __all__ = [
     "DoorKeyEngine",
     "DoorKeyEnv",
     "DoorKeyGrid",
-    "SingleDoorKey",
     "collect",
     "register",
 ]
@@ -188,13 +188,14 @@ def _states_of(sweeps: Sequence[_Sweep], keep: NDArray[np.int64] | None = None) 
     return States(np.concatenate(images), np.concatenate(labels), joined)
 
 
-class DoorKeyDomain:
-    """Spec B6: three-key DoorKey behind the interface of ``hypogoal.domains.base.Domain``."""
+class DoorKeyDomain(Domain):
+    """Spec B6: three-key DoorKey."""
 
     name = "doorkey"
-    sub_goals: tuple[str, ...] = SUB_GOALS
-    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    sub_goals = SUB_GOALS
+    observation_shape = OBSERVATION_SHAPE
     config_class = DoorKeyConfig
+    engine_settings = ("keyring", "door_label")
     env_id = ENV_ID
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:

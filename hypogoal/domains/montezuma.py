@@ -21,6 +21,7 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States
+from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS, MontezumaLadder
@@ -207,8 +208,8 @@ def _states_of(states: RoomStates) -> States:
     return States(states.observations, labels_of(states.ram)[:, None], origins_of(states))
 
 
-class MontezumaDomain:
-    """Spec B6: the ladders of Montezuma's Revenge behind the interface of ``hypogoal.domains.base.Domain``.
+class MontezumaDomain(Domain):
+    """Spec B6: the ladders of Montezuma's Revenge.
 
     Attributes:
         starts: the ladders at whose tops episodes can begin.
@@ -218,14 +219,14 @@ class MontezumaDomain:
     """
 
     name = "montezuma"
-    sub_goals: tuple[str, ...] = SUB_GOALS
-    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    sub_goals = SUB_GOALS
+    observation_shape = OBSERVATION_SHAPE
     config_class = MontezumaConfig
     env_id = ENV_ID
-    starts: tuple[str, ...] = tuple(ladder.name for ladder in LADDERS)
+    starts = tuple(ladder.name for ladder in LADDERS)
     kinds = KINDS
-    resumes = True
-    defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    resumes = measures = pictures = True
+    defaults = MappingProxyType(
         {
             "train-ensemble": {
                 "network": "montezuma",
@@ -253,6 +254,10 @@ class MontezumaDomain:
         """Observations of a collection, at the most: every room labelled, unlabelled and held out."""
         each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
         return ROOMS * each * math.prod(self.observation_shape)
+
+    def played_bytes(self, steps: int, frames: int) -> int:
+        """A frame of each step, as far back as replays reach."""
+        return frames * math.prod(self.observation_shape[:2])
 
     def collect(
         self, config: MontezumaConfig, seed: int, progress: Any, kept: Callable[[str], Checkpoints] | None = None

@@ -8,15 +8,15 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.config import STAGES as STAGES
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell, with_common
-from hypogoal.learners.baselines.settings import hyperparameters
+from hypogoal.learners.baselines.settings import DQNSettings, hyperparameters
 from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "doorkey"
-STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
 DECIDED = {"layout_seed": "layout_seeds", "agent": "baselines"}  # settings of stages, and which of the run's they are
 
 # What things cost on one core of the machine of docs/performance.md: seconds per environment step, per gradient step of
@@ -91,8 +91,8 @@ def cells(
     single = short and len(cases) == 1
     data = out / "data.h5"
     ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
-    states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
-    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_layouts=0))  # type: ignore[attr-defined]
+    states: int = domain.collected_bytes(resolved["collect"])
+    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_layouts=0))
     collecting = Cost(PER_COLLECTION, BASE + 2 * states, states)
     planned = [stage_cell(data, out, ("collect", DOMAIN, *common["collect"]), cost=collecting)]
     goals = len(ensemble.sub_goals or domain.sub_goals)
@@ -144,10 +144,11 @@ def cells(
     for baseline in config.baselines:
         agent, _, kind = baseline.partition("-")
         for layout, seed in cases:
-            arguments = ("train-baseline", DOMAIN, "--agent", agent, "--set", f"setting={kind}")
+            played_by = ("--data", str(data), "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
             picture = prod(domain.observation_shape)
-            kept = getattr(hyperparameters(agent, kind), "replay", 0)
+            chosen = hyperparameters(agent, kind)
+            kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             costs = Cost(steps * PER_BASELINE_STEP[baseline], *baseline_needs(picture, kept))
-            agents.append(add(baseline, (*arguments, "--set", f"steps={budget}"), seed, layout, (), costs))
+            agents.append(add(baseline, ("train-baseline", DOMAIN, *played_by), seed, layout, (data,), costs))
     evaluating = Cost(PER_EVALUATION * len(ensembles), BASE + 300e6 + 2 * states, 2 * LOGS)
     return planned + closing_cells(out, (*ensembles.values(), *agents), evaluating)

@@ -117,8 +117,8 @@ def cells(
     evaluated = judged = 0
 
     domain = load_domain(DOMAIN)
-    states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
-    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_per_room=0))  # type: ignore[attr-defined]
+    states: int = domain.collected_bytes(resolved["collect"])
+    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_per_room=0))
     goals = len(ensemble.sub_goals or domain.sub_goals)
     collecting = Cost(PER_COLLECTION, BASE + 2 * states / PLAYING, states, resolved["collect"].workers or PLAYING)
 

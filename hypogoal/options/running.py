@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.compute import tensor
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import as_input, folded
-from hypogoal.options.verdicts import Verdicts, learned_terminations
+from hypogoal.options.verdicts import Verdicts, learned_terminations, positions_of
 
 if TYPE_CHECKING:
     from hypogoal.hypotheses.ensemble import Ensemble
@@ -49,7 +49,7 @@ class MemberVerdicts(Verdicts):
 
     def _ask(self, ids: NDArray[np.int64], option: int) -> NDArray[np.bool_]:
         ensemble, member = self.ensembles[option // self.members], option % self.members
-        positions = self.engine.positions(ids) if ensemble.needs_positions else None  # type: ignore[attr-defined]
+        positions = positions_of(self.engine, ids) if ensemble.needs_positions else None
         seen = ensemble.see(self.engine.images(ids), positions)
         with torch.inference_mode():
             images = as_input(tensor(seen, ensemble.thresholds.device))

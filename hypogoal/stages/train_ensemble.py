@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import as_dict, setting
+from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import given
 from hypogoal.core.preflight import preflight
@@ -23,19 +22,12 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.networks import load_network
 from hypogoal.hypotheses.storage import write_ensemble
-from hypogoal.hypotheses.training import EnsembleConfig, fit
+from hypogoal.hypotheses.training import fit
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
-
-
-@dataclass(frozen=True)
-class TrainEnsembleConfig(EnsembleConfig):
-    """An ensemble's settings, and which sub-goals to train it for."""
-
-    sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
-    workers: int = setting(0, "processes; 0 for one per core", low=0, high=1024)
 
 
 def train_ensemble(

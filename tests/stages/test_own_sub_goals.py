@@ -13,8 +13,8 @@ import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS
+from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.playing import build
-from hypogoal.stages.train_options import TrainOptionsConfig
 
 FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
 
