@@ -33,7 +33,7 @@ SETUP_FILES = ("pyproject.toml", "constraints.txt", "Makefile", ".ci/run")
 # Not in constraints.txt: what a CUDA build of torch pulls in is fixed by torch itself.
 TORCH_CUDA = ("nvidia-", "cuda-", "triton")
 # Each costs more than the half second that --help may take.
-HEAVY = {"torch", "numpy", "scipy", "matplotlib", "h5py", "gymnasium", "stable_baselines3"} | {"minigrid", "ale_py"}
+HEAVY = {"torch", "scipy", "matplotlib", "h5py", "stable_baselines3"} | {"minigrid", "ale_py"}
 
 
 def requirements() -> list[Requirement]:

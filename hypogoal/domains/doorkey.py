@@ -1,7 +1,7 @@
 """DoorKey with three keys (Spec B1-B3): the domain as the stages see it, and how its states are collected.
 
 The parts: ``doorkey_env`` (the Gymnasium environment and the sub-goals), ``doorkey_states`` (states and rules
-of one layout), ``doorkey_engine`` (many environments, fast), ``doorkey_registration`` (the Gymnasium id).
+of one layout), ``doorkey_engine`` (many environments, fast).
 """
 
 from __future__ import annotations
@@ -31,22 +31,17 @@ from hypogoal.domains.doorkey_env import (
     Layout,
     layout_of,
 )
-from hypogoal.domains.doorkey_registration import ENV_ID, register
 from hypogoal.domains.doorkey_states import DoorKeyStates
 
 __all__ = [
     "DOMAIN",
-    "ENV_ID",
     "SUB_GOALS",
     "DoorKeyConfig",
     "DoorKeyEngine",
     "DoorKeyEnv",
     "DoorKeyGrid",
     "collect",
-    "register",
 ]
-
-register()
 
 
 @dataclass(frozen=True)
@@ -196,7 +191,7 @@ class DoorKeyDomain(Domain):
     observation_shape = OBSERVATION_SHAPE
     config_class = DoorKeyConfig
     engine_settings = ("keyring", "door_label")
-    env_id = ENV_ID
+    env_id = "hypogoal/DoorKey-8x8-v0"
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:
         """Observations of a collection, at the most: a layout has some 1,640 states (seed 0), others up to 2,500."""

@@ -2,7 +2,7 @@
 
 The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezuma_ladders`` (where the ladders are),
 ``montezuma_rollouts`` and ``montezuma_states`` (what is collected), ``montezuma_pictures`` (rooms), ``montezuma_env``
-and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``montezuma_registration`` (its id).
+and ``montezuma_engine`` (one game and many, from the top of a ladder on).
 """
 
 from __future__ import annotations
@@ -27,23 +27,18 @@ from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS, MontezumaLadder
 from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
 from hypogoal.domains.montezuma_pictures import picture, pixel
-from hypogoal.domains.montezuma_registration import ENV_ID, register
 from hypogoal.domains.montezuma_rollouts import PLAYS
 from hypogoal.domains.montezuma_states import KINDS, RoomStates, emulator_of_process, gather, labels_of, origins_of
 
 __all__ = [
     "DOMAIN",
-    "ENV_ID",
     "SUB_GOALS",
     "MontezumaConfig",
     "MontezumaDomain",
     "MontezumaEngine",
     "MontezumaLadder",
     "collect",
-    "register",
 ]
-
-register()
 
 # The unlabelled rooms where none are given: the first of these ladder rooms that has no labels, and a room without a
 # ladder; where all have labels, two without.
@@ -222,7 +217,7 @@ class MontezumaDomain(Domain):
     sub_goals = SUB_GOALS
     observation_shape = OBSERVATION_SHAPE
     config_class = MontezumaConfig
-    env_id = ENV_ID
+    env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(ladder.name for ladder in LADDERS)
     kinds = KINDS
     resumes = measures = pictures = True

@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium
 
-import hypogoal
 from hypogoal.core import own_code
 from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
@@ -76,7 +75,6 @@ def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
     Raises:
         UserError: there is no such thing.
     """
-    hypogoal.register()
     import ale_py
     import minigrid  # noqa: F401 - registers its environments when it is loaded
 

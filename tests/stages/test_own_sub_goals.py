@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 import pytest
 
-import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS
@@ -21,7 +20,6 @@ FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episode
 
 def walked(layout_seed: int, steps: int) -> np.ndarray:
     """What random play sees, uint8 (steps, 64, 64, 3)."""
-    hypogoal.register()
     env = gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=layout_seed)
     env.reset(seed=0)
     rng = np.random.default_rng(layout_seed)
