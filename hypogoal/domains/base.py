@@ -158,7 +158,8 @@ class Domain(ABC):
             that name is kept until all are there.
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
-        measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`.
+        measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has
+            :meth:`agent_pixels`.
     """
 
     name: str
@@ -170,7 +171,7 @@ class Domain(ABC):
     resumes = False
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
-    measures = pictures = False
+    measures = pictures = sees_agent = False
 
     @property
     @abstractmethod
@@ -235,6 +236,10 @@ class Domain(ABC):
     def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
         """Column and row in that picture, (n, 2), of positions; where ``pictures``."""
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
+
+    def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Row and column of the agent's middle in an observation, (n, 2), of positions; where ``sees_agent``."""
+        raise UserError("this domain does not say where in an observation the agent is", self.name, "Set view=full.")
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:

@@ -26,7 +26,7 @@ from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS, MontezumaLadder
 from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
-from hypogoal.domains.montezuma_pictures import picture, pixel
+from hypogoal.domains.montezuma_pictures import observed_pixel, picture, pixel
 from hypogoal.domains.montezuma_rollouts import PLAYS
 from hypogoal.domains.montezuma_states import KINDS, RoomStates, emulator_of_process, gather, labels_of, origins_of
 
@@ -220,7 +220,7 @@ class MontezumaDomain(Domain):
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(ladder.name for ladder in LADDERS)
     kinds = KINDS
-    resumes = measures = pictures = True
+    resumes = measures = pictures = sees_agent = True
     defaults = MappingProxyType(
         {
             "train-ensemble": {
@@ -296,6 +296,10 @@ class MontezumaDomain(Domain):
     def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
         """Where in that picture the agent's middle is, at positions (n, 3): column, row (n, 2)."""
         return pixel(positions)
+
+    def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Where in an observation it is: row, column (n, 2)."""
+        return observed_pixel(positions)
 
 
 DOMAIN = MontezumaDomain()

@@ -22,6 +22,7 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
+from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.networks import load_network
 from hypogoal.hypotheses.storage import write_ensemble
@@ -169,6 +170,7 @@ def _train_one(
     report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)))
     if not checkpoints.saved:
         report.log.restore(0)
+    domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
     with given(config.diversity, config.network):
         ensemble = fit(
             split.observations,
@@ -179,6 +181,7 @@ def _train_one(
             report,
             origins=split.origins,
             unlabelled_origins=origins,
+            agent_pixels=domain.agent_pixels if domain and domain.sees_agent else None,
             device=device,
             checkpoints=checkpoints,
         )
