@@ -51,7 +51,7 @@ class DoorKeyConfig:
     regime: str = setting(
         "fixed",
         "labelled states: 'fixed', the layout as it lies; 'shuffled', keys re-drawn within its walls",
-        source="Spec B3",
+        source="paper, MiniGrid experiment",
         choices=("fixed", "shuffled"),
     )
     draws: int = setting(20, "key placements of the regime 'shuffled'", source="own choice", low=1, high=1000)
@@ -64,14 +64,14 @@ class DoorKeyConfig:
         "first held-out layout seed; seeds whose grid is a training layout's or came before are passed over",
         low=0,
     )
-    heldout_layouts: int = setting(20, "held-out layouts", source="Spec B3", low=1, high=500)
+    heldout_layouts: int = setting(20, "held-out layouts", source="paper, MiniGrid experiment", low=1, high=500)
     door_label: str = setting(
         "open",
         "open-red-door holds when the door is 'open', or when the agent is also 'in-front', facing it",
-        source="Spec B2",
+        source="in-front: paper; open: the authors' code",
         choices=DOOR_LABELS,
     )
-    keyring: bool = setting(True, "several keys can be held", source="Spec B1")
+    keyring: bool = setting(True, "several keys can be held", source="the authors' code")
 
 
 @dataclass(frozen=True)

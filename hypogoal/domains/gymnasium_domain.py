@@ -40,10 +40,17 @@ Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 class GymnasiumConfig:
     """What ``hypogoal collect`` can be told about such a domain."""
 
-    labelled_seeds: tuple[int, ...] = setting((0,), "layout seeds of the labelled states", source="Spec B3", low=0)
-    unlabelled_seeds: tuple[int, ...] = setting((1, 2), "layout seeds of the unlabelled states", source="B3", low=0)
+    labelled_seeds: tuple[int, ...] = setting(
+        (0,), "layout seeds of the labelled states", source="as the paper's MiniGrid experiment", low=0
+    )
+    unlabelled_seeds: tuple[int, ...] = setting(
+        (1, 2), "layout seeds of the unlabelled states", source="as the paper's MiniGrid experiment", low=0
+    )
     heldout_seeds: tuple[int, ...] = setting(
-        tuple(range(1000, 1010)), "layout seeds of the held-out states", source="Spec B3", low=0
+        tuple(range(1000, 1010)),
+        "layout seeds of the held-out states",
+        source="as the paper's MiniGrid experiment",
+        low=0,
     )
     steps: int = setting(3_000, "steps that are played on each layout", unit="steps", low=1)
     states: int = setting(

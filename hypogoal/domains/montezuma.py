@@ -88,7 +88,7 @@ class MontezumaConfig:
     unlabelled_from: str = setting(
         "expert",
         "who plays in the unlabelled rooms: the labelled states' expert, or uniformly random actions from their sides",
-        source="Spec B7",
+        source="the paper's suggestion",
         choices=PLAYS,
     )
     workers: int = setting(0, "rooms played in at once, each by a process; 0 for one per core", low=0, high=1024)

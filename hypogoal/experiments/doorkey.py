@@ -32,21 +32,23 @@ PER_EVALUATION = 20.0
 class RunConfig:
     """Which cells the experiment has."""
 
-    layout_seeds: tuple[int, ...] = setting((100,), "layouts, each with an agent of its own", source="Spec E4", low=0)
+    layout_seeds: tuple[int, ...] = setting(
+        (100,), "layouts, each with an agent of its own", source="paper, Figure 6", low=0
+    )
     seeds: tuple[int, ...] = setting((0,), "run seeds, each with an ensemble of its own", low=0)
     paired: bool = setting(
         False,
         "the first layout with the first seed, the second with the second, instead of all with all",
-        source="Spec E4",
+        source="paper, Figure 6",
     )
     pretrain: bool = setting(True, "train-options before train-meta; false is the paper's D5")
     controls: tuple[str, ...] = setting(
-        ("random", "oracle"), "controls beside the agent", source="Spec E6", choices=("random", "oracle")
+        ("random", "oracle"), "controls beside the agent", source="ours: controls", choices=("random", "oracle")
     )
     baselines: tuple[str, ...] = setting(
         ("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
         "agents on the primitive actions",
-        source="Spec E7",
+        source="paper, Figure 6",
         choices=("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
     )
     workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
