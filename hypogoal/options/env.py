@@ -21,7 +21,7 @@ from hypogoal.options.initiation import Narrowing
 from hypogoal.options.policies import Policies
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Options:
     """G x K options; option g*K + k aims at member k's hypothesis of sub-goal g.
 
@@ -47,6 +47,10 @@ class Options:
     mask_reached: bool = True
     domain: str = ""
     domain_config: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        goals = ", ".join(self.sub_goals)
+        return f"Options({self.count} of {goals}: {self.members} members each, at most {self.timeout} steps)"
 
     @property
     def count(self) -> int:
