@@ -88,7 +88,7 @@ def show_stops(
     Returns:
         Per figure ladder, groups, seed, rooms and columns; none where the domain has no pictures.
     """
-    if domain is None or not (hasattr(domain, "picture") and hasattr(domain, "pixel")):
+    if domain is None or not domain.pictures:
         return []
     first = min((row["seed"] for row in rows), default=0)
     numbers = sorted({row["groups"] for row in rows if row["groups"] is not None}) or [None]
@@ -107,8 +107,12 @@ def show_stops(
                 columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
                 where.append(stops.room)
             if columns:
-                own = domain.rooms_of(ladder) if hasattr(domain, "rooms_of") else ()
-                about = {"ladder": ladder, "groups": groups, "seed": first, "rooms": rooms_shown(where, own)}
+                about = {
+                    "ladder": ladder,
+                    "groups": groups,
+                    "seed": first,
+                    "rooms": rooms_shown(where, domain.rooms_of(ladder)),
+                }
                 shown.append({**about, "columns": columns})
     for room in sorted({room for one in shown for room in one["rooms"]}):
         arrays[f"pictures/{room}"] = domain.picture(room)

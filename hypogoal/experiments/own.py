@@ -16,7 +16,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import MAX_PRESET_BYTES, parse_assignments, parse_integers
+from hypogoal.core.config import MAX_PRESET_BYTES, STAGES, parse_assignments, parse_integers
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_text
 from hypogoal.core.workers import cores
@@ -25,7 +25,6 @@ from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_ce
 from hypogoal.experiments.results import Number
 
 FORMAT_VERSION = 1
-STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
 KEYS = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
 CELL_KEYS = {"name": str, "command": str, "axes": list, "minutes": (int, float), "memory_gb": (int, float)}
 RESERVED = ("--out", "--force", "--resume")

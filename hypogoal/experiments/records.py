@@ -15,11 +15,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hypogoal.core.config import parse_assignments, preset_digest
+from hypogoal.core.config import STAGES, parse_assignments, preset_digest
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, replace_text
-from hypogoal.experiments.cells import Cell, Cost, Plan, moved
+from hypogoal.experiments.cells import DERIVED, Cell, Cost, Plan, moved
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -30,7 +30,7 @@ except ImportError:  # Windows: as on a file system that cannot lock
 FORMAT_VERSION = 1
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
-COMMANDS = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "evaluate", "report")
+COMMANDS = (*STAGES, *DERIVED)
 SHORT = ("--members", "--diversity", "--layout-seed", "--agent")  # options that are settings, which --set goes before
 AGAIN = "Start the sweep again."
 GIVE = "Give the command that began it, of 'run' with --resume and without --force: what is complete is kept."

@@ -59,6 +59,9 @@ class Ensemble(nn.Module):
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self._networks = tuple(reordered(member) for member in self.members if isinstance(member, nn.Sequential))
 
+    def __repr__(self) -> str:
+        return f"Ensemble({len(self)} members, network {self.network!r}, observations uint8 {self.observation_shape})"
+
     def __len__(self) -> int:
         """K, the number of members."""
         return len(self.members)

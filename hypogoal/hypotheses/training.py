@@ -19,6 +19,7 @@ from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import Pixels
 from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 
 __all__ = ["EnsembleConfig", "fit", "total_steps"]
@@ -43,6 +44,7 @@ def fit(
     *,
     origins: Origins | None = None,
     unlabelled_origins: Origins | None = None,
+    agent_pixels: Pixels | None = None,
     device: torch.device | str = "cpu",
     checkpoints: Checkpoints | None = None,
 ) -> Ensemble:
@@ -61,6 +63,7 @@ def fit(
             ``room``, ``x``, ``y`` (and ``dying``) for view=agent-crop.
         unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram,
             ``action``, ``previous_action`` for localiser=learned.
+        agent_pixels: the domain's, for view=agent-crop; None where it does not know.
         device: where to train; the ensemble stays there.
         checkpoints: spec G1; ``on_step`` is part of them where it has ``snapshot`` and ``restore``.
 
@@ -80,7 +83,14 @@ def fit(
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
     view = view_of(
-        observations, unlabelled, config, seed_for(seed, "localiser"), origins, unlabelled_origins, fitted=not saved
+        observations,
+        unlabelled,
+        config,
+        seed_for(seed, "localiser"),
+        origins,
+        unlabelled_origins,
+        agent_pixels,
+        fitted=not saved,
     )
     generator = torch_generator(seed, "weights")
     ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)

@@ -36,11 +36,11 @@ def learned_terminations(engine: Engine, ensembles: Sequence[Ensemble]) -> Class
         A function from state ids (n,) to verdicts bool (n, G*K).
     """
 
-    stacked = StackedMembers(ensembles, repeats=hasattr(engine, "tiles"))
+    stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
 
     def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         images = engine.images(ids)
-        positions = _positions(engine, ids) if stacked.needs_positions else None
+        positions = positions_of(engine, ids) if stacked.needs_positions else None
         if len(ids) < MANY:
             return stacked.verdicts(images, positions)
         return np.concatenate([ensemble.verdicts(images, positions) for ensemble in ensembles], axis=1)
@@ -48,14 +48,17 @@ def learned_terminations(engine: Engine, ensembles: Sequence[Ensemble]) -> Class
     return classify
 
 
-def _positions(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-    positions = getattr(engine, "positions", None)
-    if positions is None:
+def positions_of(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where the agent is in states, for ensembles that need it.
+
+    Raises:
+        UserError: the engine does not know it.
+    """
+    if not engine.position_names:
         raise UserError(
             "the ensemble needs the agent's positions (localiser=ram)", None, "Train it with localiser=learned."
         )
-    found: NDArray[np.int64] = positions(ids)
-    return found
+    return engine.positions(ids)
 
 
 def oracle_terminations(engine: Engine, columns: Sequence[int] | None = None) -> Classifier:
@@ -134,7 +137,8 @@ class MemberVerdicts(Verdicts):
 
     def _ask(self, ids: NDArray[np.int64], option: int) -> NDArray[np.bool_]:
         ensemble, member = self.ensembles[option // self.members], option % self.members
-        seen = ensemble.see(self.engine.images(ids), _positions(self.engine, ids) if ensemble.needs_positions else None)
+        positions = positions_of(self.engine, ids) if ensemble.needs_positions else None
+        seen = ensemble.see(self.engine.images(ids), positions)
         with torch.inference_mode():
             images = as_input(tensor(seen, ensemble.thresholds.device))
             chance = self._networks[option](images).softmax(-1)[:, 1]

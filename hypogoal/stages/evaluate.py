@@ -207,7 +207,7 @@ def evaluate_distance(
     names = {artefact.config["domain"] for artefact in found.ladders}
     domain = installed_domain(names.pop()) if len(names) == 1 else None
     used = {row["ladder"] for row in rows}
-    starts = [start for start in getattr(domain, "starts", ()) if start in used]
+    starts = [start for start in (domain.starts if domain else ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
     shown = show_stops(rows, ladders, executions, domain, arrays)
     return {"options": rows, **distance_tables(rows, ladders), "shown": shown}

@@ -16,12 +16,12 @@ from typing import Any
 
 from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
-from hypogoal.core.config import STAGES, as_dict, parse_assignments, resolve
+from hypogoal.core.config import TABLES, as_dict, parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.workers import cores
-from hypogoal.domains.base import CONFIGS, defaults_of, load_domain, stage_config
+from hypogoal.domains.base import defaults_of, load_domain
 from hypogoal.experiments import doorkey, montezuma_ladders
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
@@ -45,6 +45,7 @@ from hypogoal.experiments.records import (
 )
 from hypogoal.experiments.results import write_results
 from hypogoal.experiments.status import done_of
+from hypogoal.settings import CONFIGS
 
 EXPERIMENTS: Mapping[str, Any] = {"doorkey": doorkey, "montezuma-ladders": montezuma_ladders}
 FIGURES = {  # of the paper: the experiment and its preset
@@ -69,8 +70,8 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
                 return experiment.RunConfig
         raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
     if stage not in CONFIGS:
-        raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}.")
-    return stage_config(stage)
+        raise UserError("no such stage", stage, f"Choose one of {', '.join(TABLES)}.")
+    return CONFIGS[stage]
 
 
 def plan(

@@ -35,8 +35,9 @@ class Scripted:
     def act(self, ids, options, age, *, explore=True):
         return np.full(len(ids), self.action)
 
-    def observe(self, ids, actions, next_ids, options, *, terminated, timed_out, ended):
-        self.seen.append((ids.copy(), next_ids.copy(), options.copy(), timed_out.copy(), ended.copy()))
+    def observe(self, move):
+        parts = (move.ids, move.next_ids, move.options, move.timed_out, move.ended)
+        self.seen.append(tuple(part.copy() for part in parts))
 
     def learn(self):
         return {}

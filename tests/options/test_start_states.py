@@ -16,7 +16,6 @@ from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
-from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels
 from hypogoal.options.policies import make_policies
 from hypogoal.options.recording import EXECUTION_COLUMNS, EXECUTIONS_KEPT, Recorder
@@ -37,7 +36,7 @@ class Script:
     def act(self, ids, options, age, *, explore=True):
         return np.full(len(ids), self.actions.pop(0))
 
-    def observe(self, ids, actions, next_ids, options, **ends):
+    def observe(self, move):
         pass
 
     def learn(self):
@@ -153,7 +152,7 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
     engine = LongCorridor(1, memory=5)
     _, recorder = play(engine, [LEFT, LEFT, *[STAY] * 40], [0] * 12)
     (stop,) = recorder.stops[0]
-    assert not remembered(engine, np.array([stop])).any()
+    assert not engine.remembers(np.array([stop])).any()
     with pytest.raises(ValueError, match="forgotten"):
         engine.images(np.array([stop]))
     recorder.write(tmp_path, engine.images)
@@ -230,9 +229,9 @@ def test_forgotten_states_are_not_learned_from() -> None:
     learner.act = lambda ids, options, age, **_: np.zeros(len(ids), np.int64)  # from now on nothing is reached
     for _ in range(150):
         loop.step()
-    assert not remembered(engine, learner.positive["next"][learner.positive["next"] > 0]).any()
+    assert not engine.remembers(learner.positive["next"][learner.positive["next"] > 0]).any()
     batch, indices, weights = learner._batch()
-    assert remembered(engine, batch["s"]).all() and remembered(engine, batch["next"]).all()
+    assert engine.remembers(batch["s"]).all() and engine.remembers(batch["next"]).all()
     assert len(indices) == len(weights) == config.option_batch, "all of it from the replay"
 
 
