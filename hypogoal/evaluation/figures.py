@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Any
 
 import matplotlib
@@ -222,13 +223,20 @@ def preference_against_match(
         return figure
 
 
+def slug(text: str) -> str:
+    """An id, or a file's name without its ending: of other signs than letters, digits, - and _ a digest is left."""
+    plain = re.sub(r"[^\w-]+", "-", text)[:80]
+    return text if plain == text else f"{plain}-{blake2b(text.encode(), digest_size=4).hexdigest()}"
+
+
 def to_svg(figure: Figure, name: str) -> str:
     """The figure as an SVG document, the same bytes each time.
 
     Args:
         figure: any figure.
-        name: makes the ids inside unique among several on one page.
+        name: its :func:`slug` makes the ids inside unique among several on one page.
     """
+    name = slug(name)
     buffer = io.StringIO()
     with styled({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

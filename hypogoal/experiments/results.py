@@ -6,17 +6,15 @@ that differs between two runs of the same commands is in it: no time, no machine
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_text, replace_text
+from hypogoal.core.files import read_json, read_text, write_table
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.curves import run_numbers
 from hypogoal.evaluation.distance import ladder_numbers
@@ -44,23 +42,20 @@ def write_results(plan: Plan, run: Path) -> Path:
     Raises:
         UserError: an artefact is damaged.
     """
+    names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
+    columns = ["cell", "stage", *names, *Number._fields[2:], *Number._fields[:2]]
+    path = run / RESULTS
     try:
-        text = _table(plan, run)
+        write_table(path, columns, _rows(plan, run, names))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"an artefact is damaged ({type(error).__name__} {error})"
         raise UserError(what, run, "'hypogoal verify' says which.") from None
-    path = run / RESULTS
-    replace_text(path, text)
     return path
 
 
-def _table(plan: Plan, run: Path) -> str:
-    names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
+def _rows(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
     done = done_of(plan)
     judged = _judged([cell for cell in plan.cells if cell.out in done])
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["cell", "stage", *names, *Number._fields[2:], *Number._fields[:2]])
     for cell in plan.cells:
         if cell.out not in done:
             continue
@@ -68,8 +63,7 @@ def _table(plan: Plan, run: Path) -> str:
         about = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
         for number in (*_numbers(cell), *judged.get(cell.out.relative_to(run).as_posix(), ())):
             if math.isfinite(number.value):
-                table.writerow([*about, *number[2:], number.number, number.value])
-    return text.getvalue()
+                yield [*about, *number[2:], number.number, number.value]
 
 
 def _numbers(cell: Cell) -> Iterator[Number]:

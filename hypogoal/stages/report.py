@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.evaluated import AGAIN, read_evaluation
+from hypogoal.evaluation.evaluated import fitting, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
 
@@ -40,11 +41,8 @@ def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = Fa
     about: dict[str, Any] = {"kind": "report", "config": {"videos": videos}, "seed": 0, "inputs": inputs}
     with create_artefact(out, **about, force=force, resume=resume) as folder:
         material = Material(found.metrics, found.arrays)
-        try:
+        with fitting(found.source.path):
             page = render(material, versions().get("hypogoal", "unknown"))
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-            what = "the evaluation does not fit this hypogoal, or is damaged"
-            raise UserError(what, found.source.path, AGAIN) from error
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
         for name, figure in material.figures.items():
@@ -103,15 +101,16 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
     Raises:
         UserError: no such kind, the run was not evaluated, or a file is there already.
     """
-    from hypogoal.evaluation.figures import to_file
+    from hypogoal.evaluation.figures import slug, to_file
     from hypogoal.evaluation.page import Material
     from hypogoal.evaluation.page.paper import paper_figures
 
     if kind not in KINDS:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(KINDS)}.")
     found = read_evaluation(run)
-    drawn, missing = paper_figures(Material(found.metrics, found.arrays))
-    files = {folder / f"{one.name}.{kind}": one for one in drawn}
+    with fitting(found.source.path):
+        drawn, missing = paper_figures(Material(found.metrics, found.arrays))
+    files = {folder / f"{slug(one.name)}.{kind}": one for one in drawn}
     captions = folder / "captions.md"
     for path in (*files, captions):
         if path.exists() and not force:
@@ -120,7 +119,7 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
         folder.mkdir(parents=True, exist_ok=True)
         for path, one in files.items():
             path.write_bytes(to_file(one.figure, one.name, kind))
-        text = [f"## {path.name}\n\n{one.caption}\n" for path, one in files.items()]
+        text = [f"## {path.name}\n\n{escape(one.caption, quote=False)}\n" for path, one in files.items()]
         captions.write_text("\n".join([*text, *(f"{line}\n" for line in missing)]), encoding="utf-8")
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None

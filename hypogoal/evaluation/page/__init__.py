@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Sequence
+from hashlib import sha256
 from importlib import resources
 
 from hypogoal.evaluation.page.agents import curves_section, summary_section
@@ -22,6 +24,11 @@ AGENTS = (summary_section, curves_section)
 LADDERS = (ladders_section, rooms_section, distance_section, stops_section)
 STATES = (explorer_section, examples_section, saliency_section)
 CHOICES = (terminations_section, choices_section)
+# What a browser may do with the page. Attributes of style are matplotlib's; they run and fetch nothing.
+POLICY = (
+    "default-src 'none'; script-src {script}; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'"
+)
 
 
 def sections_of(material: Material) -> list[Block]:
@@ -53,19 +60,34 @@ def render(material: Material, version: str) -> str:
 
 
 def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
-    """Sections as one HTML file that needs nothing else."""
+    """Sections as one HTML file that needs nothing else.
+
+    Every text in it is escaped but our own style and script and what matplotlib drew; should a text of a file ever slip
+    through, the page's policy still lets nothing run and nothing be fetched.
+    """
     import jinja2
 
     loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    css, script = (
+        resources.files("hypogoal.evaluation").joinpath(f"templates/{name}").read_text(encoding="utf-8")
+        for name in ("report.css", "explorer.js")
+    )
     return environment.get_template("report.html").render(
         title=title,
         subtitle=subtitle,
         version=version,
-        css=resources.files("hypogoal.evaluation").joinpath("templates/report.css").read_text(encoding="utf-8"),
+        policy=POLICY.format(script=_digest(script), style=_digest(css)),
+        css=css,
+        script=script,
         sections=sections,
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
+
+
+def _digest(text: str) -> str:
+    """As a policy names a script or a style that is in the page."""
+    return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
 
 
 def _domains_of(artefacts: list[dict]) -> set[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.figures import COLOURS, to_svg
+from hypogoal.evaluation.figures import COLOURS, slug, to_svg
 from hypogoal.evaluation.pictures import image_png, reduced
 
 Block = dict[str, Any]
@@ -109,17 +110,18 @@ def figure(
 
     Args:
         material: the figure is added to its ``figures``.
-        name: the file's name and the id on the page.
+        name: its :func:`slug` is the file's name and the id on the page.
         label: what it shows.
         drawn: None where it cannot be drawn.
         caption: with seeds and intervals.
         missing: which artefact would be needed.
         folded: what is shown of it until asked for.
     """
-    svg = ""
+    name, svg = slug(name), ""
     if drawn is not None:
         material.figures[name] = drawn
         svg = material.drawings[name] = to_svg(drawn, name)
+        svg = re.sub(r"<style.*?</style>", "", svg, flags=re.S)  # the page allows its own alone, which says the same
         for colour, variable in COLOURS.items():
             svg = svg.replace(colour, f"var(--{variable})")
     return {
@@ -131,6 +133,18 @@ def figure(
         "missing": missing,
         "folded": folded,
     }
+
+
+def pick(rows: Iterable[Mapping[str, Any]], key: str, value: Any) -> Mapping[str, Any]:
+    """The first of the rows with this value.
+
+    Raises:
+        LookupError: none has it.
+    """
+    for one in rows:
+        if one[key] == value:
+            return one
+    raise LookupError(f"nothing whose {key!r} is {value!r}")
 
 
 def picture(image: NDArray[np.uint8]) -> str:

@@ -17,6 +17,7 @@ from hypogoal.evaluation.page.blocks import (
     deviation,
     figure,
     listed,
+    pick,
     row,
     section,
     spread,
@@ -153,7 +154,7 @@ def _curve(
     grid = np.linspace(0, end, POINTS).round().astype(np.int64)
     lines = []
     for index, (label, agent, called) in enumerate(shown):
-        place = next(i for i, one in enumerate(runs[label]["agents"]) if one["name"] == agent)
+        place = [one["name"] for one in runs[label]["agents"]].index(agent)
         own = curves[label]
         values = on_grid(own[f"curves/{place}/{quantity}"], own["curves/grid"], grid)
         lines.append(Line(called, values, PALETTE[index], dashed=index % 2 == 1))
@@ -170,7 +171,7 @@ def _curve(
 
 
 def _count(metrics: Mapping[str, Any], agent: str) -> str:
-    found = next(one for one in metrics["agents"] if one["name"] == agent)["runs"]
+    found = pick(metrics["agents"], "name", agent)["runs"]
     layouts, seeds = (sorted({run[key] for run in found}) for key in ("layout_seed", "seed"))
     count = f"{len(found)} run{'s' if len(found) > 1 else ''}"
     return f"{count}: layout seeds {listed(layouts)}, run seeds {listed(seeds)}"

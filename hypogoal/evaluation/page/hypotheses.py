@@ -15,6 +15,7 @@ from hypogoal.evaluation.page.blocks import (
     figure,
     fixed,
     listed,
+    pick,
     picture,
     row,
     section,
@@ -153,7 +154,7 @@ def examples_section(material: Material) -> Block:
         missing = ["No example states: they need an ensemble artefact."]
         return section("examples", "Example states", [], [], missing)
     shown = material.metrics["saliency"]["ensemble"]
-    source = next(ensemble for ensemble in material.metrics["ensembles"] if ensemble["path"] == shown)
+    source = pick(material.metrics["ensembles"], "path", shown)
     text = (
         f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
         "probability that the sub-goal is reached. Orange: verdicts that differ from the truth. Chosen to show "
