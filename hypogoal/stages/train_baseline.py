@@ -86,7 +86,6 @@ def train_baseline(
                 report.log.restore(0)
             agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL, checkpoints, device)
             progress.update(config.steps)
-        report.log.close()
         with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(("step", "length", "reward", "terminated"))
