@@ -123,7 +123,7 @@ def write_dataset(
     """Write collected states; the file appears under its name only when it is whole.
 
     Raises:
-        UserError: see :func:`require_names`, an origin's name is none, or the file exists.
+        UserError: see :func:`require_names`, an origin's name is none, labels are no truth values, or the file exists.
     """
     require_names(collected.sub_goals)
     for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
@@ -155,6 +155,10 @@ def write_dataset(
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ...]) -> None:
+    labels, shape = states.labels, (len(states.observations), len(sub_goals))
+    if getattr(labels, "dtype", None) != np.bool_ or labels.shape != shape:  # of the text 'False' NumPy makes True
+        found = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
+        raise UserError(f"the domain's {split} labels are no truth values", found, f"Give bool {shape}.")
     first: Any = None
     for index, sub_goal in enumerate(sub_goals):
         group = file.create_group(f"{split}/{sub_goal}")
@@ -166,7 +170,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
             group["observations"] = first["observations"]
             if "origin" in first:
                 group["origin"] = first["origin"]
-        write_column(group, "labels", states.labels[:, index].astype(np.bool_))
+        write_column(group, "labels", labels[:, index])
 
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:

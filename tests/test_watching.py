@@ -23,7 +23,6 @@ def write(folder, rows):
     log = MetricsLog(folder / "metrics.jsonl")
     for row in rows:
         log.write(**row)
-    log.close()
 
 
 @pytest.fixture

@@ -74,14 +74,25 @@ def main(arguments: list[str] | None = None) -> int:
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
         return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         code = getattr(error, "exit_code", None)
         if code is not None:
             message = getattr(error, "format_message", lambda: "")()
             return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(code)
-        if debug:
+        message, code = _internal(error)
+        if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a pipe that nobody reads any more
             raise
-        return _fail(f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1)
+        return _fail(message, code)
+
+
+def _internal(error: BaseException) -> tuple[str, int]:
+    """What to tell, and the exit code, of an error that nobody foresaw: own code's, or ours."""
+    from hypogoal.core.own_code import users_own
+
+    if (told := users_own(error)) is not None:
+        return with_notes(str(told), error), 2
+    first = next(iter(str(error).splitlines()), "")  # those of numbers that are none have a tensor after it
+    return f"internal error: {type(error).__name__}: {first}. Run again with --debug for the traceback.", 1
 
 
 def _refused(error: OSError) -> tuple[str, int]:
@@ -103,7 +114,7 @@ def _refused(error: OSError) -> tuple[str, int]:
         return f"{os.strerror(code)}{where}. Ask for permission to read it.", 2
     if code in known:
         return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
-    return f"internal error: {type(error).__name__}: {error}. Run again with --debug for the traceback.", 1
+    return _internal(error)
 
 
 def _may_read(name: str | bytes) -> bool:

@@ -6,27 +6,36 @@ or a preset, which may be a stranger's, has it in it: then the user allows it by
 
 Here alone is it decided whose word a name is. The command of a sweep's cell comes from a file, however it is spelt: the
 process that runs it is told so (:func:`environment_of_children`), and in it nothing is the user's but what is allowed.
+
+Whatever such code does, raises or gives back ends as one line that says where it is: :class:`UsersCode`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import inspect
+import operator
 import os
 import sys
+import sysconfig
+import threading
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from types import FrameType, TracebackType
+from typing import Any, NoReturn
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import Complete, NumericalError, UserError
 
 TRUST = "HYPOGOAL_TRUST"
 OF_FILE = "HYPOGOAL_COMMAND_OF_FILE"  # in the environment: this process runs a command that the user did not type
+MOST = 3.4028234663852886e38  # float32's: rewards are kept as such
+LONGEST = 200  # signs of what own code says that are quoted
 _given: ContextVar[frozenset[str]] = ContextVar("_given", default=frozenset())
+_own: set[str] = set()  # top-level modules that were loaded by name and are not hypogoal's
 
 
 def given(*names: str) -> contextlib.AbstractContextManager[None]:
@@ -97,39 +106,169 @@ def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> A
         known = ", ".join(sorted({*built_in, *entries}))
         raise UserError(f"unknown {what}", name, f"Choose one of {known}, or give module:object.")
     module, _, attribute = target.partition(":")
-    try:
+    if name not in built_in and not target.startswith("hypogoal."):
+        _own.add(module.partition(".")[0])
+    with UsersCode(f"the {what}", name, failed="cannot be loaded:"):
         found = importlib.import_module(module)
         return getattr(found, attribute) if attribute else found
-    except UserError:
-        raise
-    except Exception as error:  # whatever a module does when it is loaded
-        do = "Check the module and the object; --debug shows where."
-        raise UserError(f"the {what} cannot be loaded ({type(error).__name__}: {error})", name, do) from error
+
+
+class _Running(threading.local):
+    blocks = 0  # of UsersCode that this thread is in
+
+
+_running = _Running()
+_exit = os._exit
+
+
+def _stay(status: int) -> NoReturn:
+    """``os._exit``, which as a call of own code would end a stage without a word and, with 0, as a success.
+
+    Nothing can be told after it, so it is replaced while own code may call it; multiprocessing, our own workers and a
+    child that own code forked end by the real one. C code that ends the process is beyond this.
+    """
+    if _running.blocks or _module(sys._getframe(1)) in _own:
+        raise SystemExit(status)
+    _exit(status)
+
+
+os._exit = _stay
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: setattr(os, "_exit", _exit))
 
 
 class UsersCode:
-    """A block in which code of the user's own runs: what it raises is told with its place, as the user's to mend.
+    """A block in which own code runs, and the one place where what it gives back becomes what hypogoal needs.
+
+    Whatever it raises (``SystemExit`` too, but not Ctrl-C) and whatever it gives that is not as promised is told as one
+    line with its place, as the user's to mend. The block is around every step of an environment: keep it cheap.
 
     Args:
         what: whose code it is ("the label function of won").
+        of: the function, or the object that has ``method``; or a text, what the user calls it.
+        method: see ``of``.
+        failed: between ``what`` and the exception.
 
     Raises:
-        UserError: when leaving the block by another exception than a UserError.
+        UserError: when leaving the block by another exception than a UserError or Ctrl-C.
     """
 
-    __slots__ = ("what",)
+    __slots__ = ("failed", "method", "of", "what")
 
-    def __init__(self, what: str):
-        self.what = what
+    def __init__(self, what: str, of: object = None, method: str = "", *, failed: str = "raised"):
+        self.what, self.of, self.method, self.failed = what, of, method, failed
 
-    def __enter__(self) -> None:
-        return None
+    def __enter__(self) -> UsersCode:
+        _running.blocks += 1
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, Exception) and not isinstance(error, UserError):
-            place = traceback.extract_tb(trace)[-1]
-            where = f"{Path(place.filename).name}, line {place.lineno}"
-            do = "Mend it; --debug shows how it was called."
-            raise UserError(f"{self.what} raised {type(error).__name__}: {error}", where, do) from error
+        _running.blocks -= 1
+        if error is None or isinstance(error, KeyboardInterrupt):
+            return
+        if not isinstance(error, UserError) or isinstance(error, Complete):  # which would say that all is well
+            raise self._told(error) from error
+
+    def _told(self, error: BaseException) -> UserError:
+        do = "Mend it; --debug shows how it was called."
+        if isinstance(self.of, str):
+            do = "Check the module and the object; --debug shows where."
+        text = f"{type(error).__name__}: {_quoted(str, error)}"
+        if isinstance(error, SystemExit):
+            text, do = f"{_quoted(repr, error)}, to end the program", "Have it raise an error that says what is wrong."
+        libraries = [sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")]
+        others = (*(f"{folder}{os.sep}" for folder in (*libraries, Path(__file__).parents[1])), "<")
+        theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(others)]
+        place = _place(theirs[-1].filename, theirs[-1].lineno) if theirs else ""
+        if isinstance(self.of, str):
+            place = f"{self.of} ({place})" if place else self.of
+        return UserError(f"{self.what} {self.failed} {text}", place or self._place() or None, do)
+
+    def refuse(self, gave: str, do: str) -> NoReturn:
+        """What it gave is not what it promised to.
+
+        Raises:
+            UserError: with the place where the code begins.
+        """
+        raise UserError(f"{self.what} {gave}", self._place() or None, do)
+
+    def _place(self) -> str:
+        """Where the code begins: an environment's own, behind its wrappers; nothing where Python does not know."""
+        try:
+            of: Any = getattr(self.of, "unwrapped", self.of)
+            of = inspect.unwrap(getattr(of, self.method) if self.method else getattr(of, "func", of))
+            of = of if inspect.isroutine(of) or inspect.isclass(of) else type(of)
+            return _place(inspect.getsourcefile(of) or "", inspect.getsourcelines(of)[1])
+        except Exception:  # noqa: BLE001 - whatever own objects do when they are asked
+            return ""
+
+    def truth(self, value: Any, name: str) -> bool:
+        """A truth value, or a number that is 0 or 1, of Python's or of any array library's."""
+        if value is True or value is False:
+            return value
+        plain = _plain(value)
+        if not isinstance(plain, bool | int | float) or plain not in (0, 1):
+            self.refuse(f"gave {name} {_quoted(repr, value)}", "Give True or False.")
+        return bool(plain)
+
+    def number(self, value: Any, name: str) -> float:
+        """A finite number that float32 holds, of Python's or of any array library's."""
+        plain = value if type(value) is float else _plain(value)
+        if not isinstance(plain, float | int) or not -MOST <= plain <= MOST:
+            self.refuse(f"gave {name} {_quoted(repr, value)}", "Give a finite number.")
+        return float(plain)
+
+    def choice(self, value: Any, name: str, count: int) -> int:
+        """One of the numbers 0 .. count - 1."""
+        number = as_number(value)
+        if number is None or not 0 <= number < count:
+            self.refuse(f"gave {name} {_quoted(repr, value)}", f"Give an integer, 0 to {count - 1}.")
+        return number
+
+
+def users_own(error: BaseException) -> UserError | None:
+    """An error that came from or through own code outside all blocks, told as the user's; None where it did not."""
+    if isinstance(error, UserError | NumericalError):
+        return None
+    passed = [_module(frame) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    own = next((module for module in passed if module in _own), None)
+    return UsersCode(f"own code of {own}")._told(error) if own else None
+
+
+def as_number(value: Any) -> int | None:
+    """An integer of Python's or of any array library's; None where it is something else, a truth value among it.
+
+    An array of one integer is that integer: agents of one environment give such.
+    """
+    if getattr(value, "size", None) == 1:
+        value = value.item()
+    if isinstance(value, bool):
+        return None
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
+
+
+def _plain(value: Any) -> Any:
+    """Python's number of a scalar of any array library's; anything else as it is."""
+    return value.item() if getattr(value, "shape", None) == () else value
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__")).partition(".")[0]
+
+
+def _place(file: str, line: int | None) -> str:
+    return f"{Path(file).name}, line {line}"
+
+
+def _quoted(how: Callable[[object], str], value: object) -> str:
+    """What a value or an error of own code says of itself, which may be long, or may fail as well."""
+    try:
+        text = " ".join(how(value).split())
+    except Exception:  # noqa: BLE001 - see above
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

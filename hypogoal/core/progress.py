@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 PLAIN_INTERVAL_SECONDS = 10.0
 
@@ -90,25 +90,23 @@ class Progress:
 
 
 class MetricsLog:
-    """``metrics.jsonl``: one JSON object a line, flushed as it is written."""
+    """``metrics.jsonl``: one JSON object a line; no open file is left behind by whatever ends a stage."""
 
     def __init__(self, path: Path):
-        self._file: TextIO = path.open("a", encoding="utf-8")
+        self._path = path
+        path.touch()
 
     def write(self, **numbers: Any) -> None:
         """Append one line."""
-        self._file.write(json.dumps(numbers) + "\n")
-        self._file.flush()
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(numbers) + "\n")
 
     def snapshot(self) -> int:
         """How long the file is, in bytes, all of them on the disk."""
-        os.fsync(self._file.fileno())
-        return os.fstat(self._file.fileno()).st_size
+        with self._path.open("a") as file:
+            os.fsync(file.fileno())
+            return os.fstat(file.fileno()).st_size
 
     def restore(self, snapshot: int) -> None:
         """Forget what was written after the ``snapshot``; 0, all of it."""
-        self._file.truncate(snapshot)
-
-    def close(self) -> None:
-        """Close the file; further writes fail."""
-        self._file.close()
+        os.truncate(self._path, snapshot)

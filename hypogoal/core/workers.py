@@ -15,10 +15,12 @@ from typing import TypeVar
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import Killed
+from hypogoal.core.own_code import users_own
 
 T = TypeVar("T")
 SAFE_PATH = "PYTHONSAFEPATH"
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
+RESEND_SECONDS = 1.0
 KILLED = 9  # SIGKILL, which Windows has no name for
 PYTHON = (sys.executable, "-P")  # a Python that does not run a random.py of the current folder in place of its own
 PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
@@ -73,8 +75,12 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         do = f"Have fewer at once: --set workers=1, or {CORES}=1 in the environment."
         raise Killed("a process was killed by the system, most likely for want of memory", None, do) from None
     except BaseException:
-        for process in set(multiprocessing.active_children()) - before:
-            process.terminate()
+        # Again until none is left: one that fails of its own has kept the first for the checkpoint that never comes,
+        # and waits for the next task, behind a lock that a killed one may hold.
+        while left := set(multiprocessing.active_children()) - before:
+            for process in left:
+                process.terminate()
+            left.pop().join(RESEND_SECONDS)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -111,3 +117,7 @@ def _guarded(task: Callable[[], T], own: frozenset[str]) -> T:
             return task()
     except KeyboardInterrupt:  # the pool would give this process the next task
         os._exit(128 + signal.SIGTERM)
+    except BaseException as error:
+        if (told := users_own(error)) is None:
+            raise
+        raise told from error  # where it came from is known here only: no traceback goes along

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load_own
+from hypogoal.core.own_code import UsersCode, load_own
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,4 +44,23 @@ def load_objective(name: str) -> PairLoss:
     found = getattr(found, "pair_loss", found)
     if not callable(found):
         raise UserError("this is no diversity objective", name, "Give a pair_loss(logits_a, logits_b).")
-    return found
+    return found if name in OBJECTIVES else _watched(name, found)
+
+
+def _watched(name: str, objective: PairLoss) -> PairLoss:
+    """An objective of someone's own, whose loss must have the shape that Eq. (1) sums.
+
+    Whether it is finite is looked at in training, every few steps: a look makes a GPU wait.
+    """
+
+    def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
+        with UsersCode(f"the diversity objective {name}", objective) as code:
+            loss = objective(logits_a, logits_b)
+            shape = getattr(loss, "shape", None)
+            if shape != logits_a.shape[:-2] or not loss.is_floating_point():
+                gave = type(loss).__name__ if shape is None else f"{loss.dtype} {tuple(shape)}"
+                do = f"Give a float {tuple(logits_a.shape[:-2])}: a mean over the states, axis -2."
+                code.refuse(f"gave {gave} for logits {tuple(logits_a.shape)}", do)
+            return loss
+
+    return pair_loss

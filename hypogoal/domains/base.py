@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core import own_code
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import Collected
 
 if TYPE_CHECKING:
@@ -240,6 +241,25 @@ class Domain(ABC):
     def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
         """Row and column of the agent's middle in an observation, (n, 2), of positions; where ``sees_agent``."""
         raise UserError("this domain does not say where in an observation the agent is", self.name, "Set view=full.")
+
+
+def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
+    """One step of an engine, which may be someone's own.
+
+    Raises:
+        UserError: it does not give one id, finite reward and pair of truth values for each environment.
+    """
+    step = engine.step(actions)
+    for name, kinds in (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b")):
+        values = getattr(step, name, None)
+        if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:  # type: ignore[union-attr]
+            do = f"Give a Step of arrays of {engine.count}; hypogoal check says of which type."
+            UsersCode("the engine's step", engine, "step").refuse(f"gave {name} {values!r}", do)
+    if not np.isfinite(step.rewards).all():
+        place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
+        what = f"gave the reward {step.rewards[place]} in environment {place}"
+        UsersCode("the engine's step", engine, "step").refuse(what, "Give finite numbers.")
+    return step
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:

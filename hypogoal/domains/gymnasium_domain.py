@@ -21,15 +21,15 @@ from hypogoal.dataset import Collected, States, digest
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_engine import (
     MEMORY,
-    RESET,
-    STEP,
     GymnasiumEngine,
     Label,
     MakeEnv,
     as_image,
+    begun,
     labels_of,
     make_checked,
     shape_of,
+    stepped,
 )
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
@@ -167,9 +167,10 @@ class GymnasiumDomain(Domain):
         rng, known = rng_for(seed, "play", layout), set(known)
         groups: dict[bytes, _Sample] = {}
         episode = step = 0
+        actions = int(env.action_space.n)  # type: ignore[attr-defined]
 
         def look(observation: Any) -> None:
-            image = as_image(observation, self.observation_shape)
+            image = as_image(env, observation, self.observation_shape)
             picture = digest(image)
             if picture not in known:
                 known.add(picture)
@@ -177,23 +178,20 @@ class GymnasiumDomain(Domain):
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states, labels))
                 group.offer((image, layout, episode, step), rng)
 
-        with RESET:
-            observation, _info = env.reset(seed=layout)
+        observation, _info = begun(env, seed=layout)
         look(observation)
         for _ in range(config.steps):
             if self.policy is None or rng.random() < config.explore:
-                action = int(rng.integers(env.action_space.n))  # type: ignore[attr-defined]
+                action = int(rng.integers(actions))
             else:
-                with UsersCode("the domain's policy"):
-                    action = int(self.policy(env, observation, rng))
-            with STEP:
-                observation, _reward, terminated, truncated, _info = env.step(action)
+                with UsersCode("the domain's policy", self.policy) as code:
+                    action = code.choice(self.policy(env, observation, rng), "the action", actions)
+            observation, _reward, terminated, truncated, _info = stepped(env, action)
             step += 1
             look(observation)  # the last state of an episode, too: a sub-goal may lie there
             progress.advance()
             if terminated or truncated or step >= config.max_episode_steps:
-                with RESET:
-                    observation, _info = env.reset(seed=layout)
+                observation, _info = begun(env, seed=layout)
                 episode, step = episode + 1, 0
         return _shared_out(list(groups.values()), config.states, rng)
 

@@ -17,7 +17,6 @@ from hypogoal.domains.base import Engine, Step
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
-STEP, RESET = UsersCode("the environment's step"), UsersCode("the environment's reset")
 MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
@@ -28,14 +27,11 @@ def make_checked(make: MakeEnv) -> gymnasium.Env:
     Raises:
         UserError: it cannot be made, its observations are no uint8 images, or its actions are not ``Discrete``.
     """
-    try:
+    with UsersCode("the environment", make, failed="cannot be made:") as code:
         env = make()
-    except UserError:
-        raise
-    except Exception as error:  # whatever it does
-        do = "Mend the function that makes it; --debug shows where it fails."
-        raise UserError(f"the environment cannot be made ({type(error).__name__}: {error})", None, do) from error
-    space, actions = env.observation_space, env.action_space
+        if not isinstance(env, gymnasium.Env):
+            code.refuse(f"is none, but a {type(env).__name__}", "Give a function that returns a gymnasium.Env.")
+        space, actions = env.observation_space, env.action_space
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
         do = "Wrap it so that it gives images, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
         raise UserError("observations must be images, uint8 (H, W, C) or (H, W)", space, do)
@@ -67,24 +63,69 @@ def with_channels(shape: tuple[int, ...]) -> tuple[int, ...]:
     return (*shape, 1) if len(shape) == 2 else shape
 
 
-def as_image(observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """An observation as uint8 (H, W, C), in memory of its own.
+def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """An environment's observation as uint8 (H, W, C), in memory of its own.
 
     Raises:
         UserError: it is not what the environment's observation space says.
     """
-    image = np.array(observation, order="C")
-    if image.dtype != np.uint8 or with_channels(image.shape) != shape:
-        found = f"{image.dtype} {image.shape}"
-        do = f"Make the observation space and the observations agree; the former says uint8 {shape}."
-        raise UserError("the environment gave another observation than its space says", found, do)
-    return image.reshape(shape)
+    with UsersCode("the environment", env, "step") as code:
+        image = np.array(observation, order="C")
+        if image.dtype != np.uint8 or with_channels(image.shape) != shape:
+            found = f"{image.dtype} {image.shape}"
+            do = f"Make the observation space and the observations agree; the former says uint8 {shape}."
+            code.refuse(f"gave another observation than its space says: {found}", do)
+        return image.reshape(shape)
+
+
+def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+    """What ``env.reset(**arguments)`` gives: an observation, see :func:`as_image`, and a dict.
+
+    Raises:
+        UserError: it fails, or gives something else.
+    """
+    with UsersCode("the environment's reset", env, "reset") as code:
+        given: Any = env.reset(**arguments)
+        if not isinstance(given, tuple | list) or len(given) != 2 or not isinstance(given[1], dict):
+            code.refuse(f"gave {_kinds(given)}", "Give (observation, info), info a dict.")
+        return given[0], given[1]
+
+
+def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """What ``env.step(action)`` gives: an observation, see :func:`as_image`, and the rest as it should be.
+
+    Raises:
+        UserError: it fails, or gives something else.
+    """
+    with UsersCode("the environment's step", env, "step") as code:
+        given: Any = env.step(action)
+        if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
+            do = "Give (observation, reward, terminated, truncated, info), info a dict."
+            code.refuse(f"gave {_kinds(given)}", do)
+        observation, reward, over, cut, info = given
+        return (
+            observation,
+            code.number(reward, "the reward"),
+            code.truth(over, "terminated"),
+            code.truth(cut, "truncated"),
+            info,
+        )
+
+
+def _kinds(given: object) -> str:
+    """The types of what was given."""
+    if isinstance(given, tuple | list):
+        return f"({', '.join(type(part).__name__ for part in given)})"
+    return f"no tuple but a {type(given).__name__}"
 
 
 def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
     """Which sub-goals hold in an environment's current state, bool (G,)."""
-    with UsersCode("a sub-goal's function"):
-        return np.array([bool(label(env)) for label in labels], dtype=np.bool_)
+    told = np.empty(len(labels), np.bool_)
+    for column, label in enumerate(labels):
+        with UsersCode("a sub-goal's function", label) as code:
+            told[column] = code.truth(label(env), "the label")
+    return told
 
 
 class GymnasiumEngine(Engine):
@@ -158,26 +199,24 @@ class GymnasiumEngine(Engine):
         terminated, truncated = np.zeros((2, self.count), dtype=np.bool_)
         ids, elapsed = np.empty_like(next_ids), self.elapsed + 1
         for number, (env, action) in enumerate(zip(self._envs, actions.tolist(), strict=True)):
-            with STEP:
-                observation, reward, over, cut, _info = env.step(action)
+            observation, reward, over, cut, _info = stepped(env, action)
             self._played[number].append(action)
             next_ids[number] = ids[number] = self._remember(env, observation)
-            rewards[number], terminated[number] = float(reward), bool(over)
-            truncated[number] = bool(cut) or elapsed[number] >= self.max_steps
+            rewards[number], terminated[number] = reward, over
+            truncated[number] = cut or elapsed[number] >= self.max_steps
             if terminated[number] or truncated[number]:
                 ids[number], elapsed[number] = self._begin(number), 0
         self.ids, self.elapsed = ids, elapsed
         return Step(next_ids, rewards, terminated, truncated & ~terminated)
 
     def _begin(self, number: int) -> int:
-        with RESET:
-            observation, _info = self._envs[number].reset(seed=self.layout_seed)
+        observation, _info = begun(self._envs[number], seed=self.layout_seed)
         self._played[number] = []
         return self._remember(self._envs[number], observation)
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of what an environment is in now."""
-        image = as_image(observation, self.observation_shape)
+        image = as_image(env, observation, self.observation_shape)
         labels = labels_of(env, self._label_functions).tobytes()
         digest = blake2b(image.tobytes() + labels, digest_size=16).digest()
         known = self._ids.get(digest)
@@ -245,12 +284,10 @@ class GymnasiumEngine(Engine):
             self._ids[digest] = identity
         for number, actions in enumerate(snapshot["played"]):
             env = self._envs[number]
-            with RESET:
-                observation, _info = env.reset(seed=self.layout_seed)
-            with STEP:
-                for action in actions:
-                    observation = env.step(action)[0]
-            here, was = as_image(observation, self.observation_shape), int(snapshot["ids"][number])
+            observation, _info = begun(env, seed=self.layout_seed)
+            for action in actions:
+                observation = stepped(env, action)[0]
+            here, was = as_image(env, observation, self.observation_shape), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 raise UserError(
                     "the environment does not do the same again for the same seed, so this cannot be gone on with",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Engine, load_domain
+from hypogoal.domains.base import Engine, load_domain, step_of
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.evaluation.agents import LEARNED, PRETRAINING, RANDOM, Run, base_name
 from hypogoal.evaluation.choices import over_training, selection_of_run
@@ -87,7 +87,8 @@ def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
         return known
     rng = rng_for(0, "states-of-layout")
     met = [
-        engine.step(rng.integers(engine.n_actions, size=engine.count)).next_ids for _ in range(steps // engine.count)
+        step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids
+        for _ in range(steps // engine.count)
     ]
     return np.unique(np.concatenate([engine.ids, *met]))
 

@@ -22,7 +22,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import load_own
+from hypogoal.core.own_code import UsersCode, as_number, load_own
 
 CLASSES = 2
 MOST_PIXELS = 1024  # of a side, up to which it is looked for how large an image must be
@@ -110,7 +110,21 @@ def load_network(name: str) -> Callable[[int], Parts]:
     found: Callable[[int], Parts] = load_own(name, "network", ENTRY_POINTS, built_in)
     if not callable(found):
         raise UserError("this is no member network", name, "Give a function: channels -> (layers, hidden widths).")
-    return found
+    return _watched(name, found)
+
+
+def _watched(name: str, parts_of: Callable[[int], Parts]) -> Callable[[int], Parts]:
+    """A network of someone's own, which must give what :data:`NETWORKS` do."""
+
+    def watched(channels: int) -> Parts:
+        with UsersCode(f"the network {name!r}", parts_of) as code:
+            layers, hidden = parts_of(channels)
+            widths = bool(hidden) and all((as_number(width) or 0) > 0 for width in hidden)
+            if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
+                code.refuse(f"gave layers {layers} and widths {hidden}", "Give (modules, hidden widths above 0).")
+            return list(layers), tuple(hidden)
+
+    return watched
 
 
 def build_network(name: str, observation_shape: tuple[int, ...], generator: torch.Generator) -> nn.Sequential:
@@ -146,6 +160,9 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
                 what = f"the network {name!r} takes no images of {channels} channels"
                 raise UserError(what, where, "Its layers must take (N, channels, height, width).")
             raise UserError(f"images too small for the network {name!r}", where, _way_out(side, observation_shape))
+        if not isinstance(features, Tensor):
+            what = f"the network {name!r} makes no tensor but {features!r} of images"  # type: ignore[unreachable]
+            raise UserError(what, where, "Make a tensor.")
         layers.append(nn.Flatten())
         for inputs, outputs in pairwise((features.numel(), *hidden)):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]

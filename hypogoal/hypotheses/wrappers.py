@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
 
 import gymnasium
@@ -11,7 +10,8 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.gymnasium_engine import as_image, with_channels
+from hypogoal.core.own_code import as_number
+from hypogoal.domains.gymnasium_engine import as_image, stepped, with_channels
 from hypogoal.hypotheses.ensemble import Ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -32,21 +32,6 @@ def require_observations(env: Env, shape: tuple[int, ...]) -> None:
         raise UserError("the environment's observations are not those that these members know", found, do)
 
 
-def as_number(value: Any) -> int | None:
-    """An integer of Python's or of any array library's; None where it is something else, a truth value among it.
-
-    An array of one integer is that integer: agents of one environment give such.
-    """
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    if isinstance(value, bool | np.bool_):
-        return None
-    try:
-        return operator.index(value)
-    except TypeError:
-        return None
-
-
 class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """What both wrappers share: whether the sub-goal holds in an observation."""
 
@@ -65,7 +50,7 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def holds(self, observation: NDArray[np.uint8]) -> bool:
         """Whether the sub-goal holds in an observation (H, W, C), or (H, W), by the members asked."""
-        observation = as_image(observation, self.ensemble.observation_shape)
+        observation = as_image(self.env, observation, self.ensemble.observation_shape)
         if self.by == "mean":
             return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
         verdicts = self.ensemble.verdicts(observation[None])[0]
@@ -96,10 +81,10 @@ class SubgoalReward(_Subgoal):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """As the environment's, with the reward changed."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = stepped(self.env, action)
         holds = self.holds(observation)
         own = self.scale if holds else 0.0
-        return observation, float(reward) + own if self.add else own, terminated, truncated, info | {"subgoal": holds}
+        return observation, reward + own if self.add else own, terminated, truncated, info | {"subgoal": holds}
 
 
 class SubgoalTermination(_Subgoal):
@@ -113,6 +98,6 @@ class SubgoalTermination(_Subgoal):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """As the environment's, ``terminated`` where the sub-goal holds."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = stepped(self.env, action)
         holds = self.holds(observation)
         return observation, reward, terminated or holds, truncated, info | {"subgoal": holds}

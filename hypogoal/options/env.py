@@ -12,10 +12,11 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import as_number
 from hypogoal.domains.base import load_domain
-from hypogoal.domains.gymnasium_engine import as_image
+from hypogoal.domains.gymnasium_engine import as_image, begun, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.wrappers import as_number, require_observations
+from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.execution import offered_options
 from hypogoal.options.initiation import Narrowing
 from hypogoal.options.policies import Policies
@@ -131,8 +132,8 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """As the environment's own."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._image = as_image(observation, self._shape)
+        observation, info = begun(self.env, seed=seed, options=options)
+        self._image = as_image(self.env, observation, self._shape)
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -154,9 +155,9 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         terminated = truncated = False
         info: dict[str, Any] = {}
         while not ended:
-            observation, reward, terminated, truncated, info = self.env.step(act(image))
-            image = as_image(observation, self._shape)
-            total += self.gamma**duration * float(reward)
+            observation, reward, terminated, truncated, info = stepped(self.env, act(image))
+            image = as_image(self.env, observation, self._shape)
+            total += self.gamma**duration * reward
             duration += 1
             reached = self.options.holds(option, image)
             ended = reached or terminated or truncated or duration >= self.options.timeout

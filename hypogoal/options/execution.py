@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.domains.base import Engine, Step
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine, Step, step_of
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
@@ -178,11 +178,7 @@ class OptionLoop:
         self._choose()
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=explore)
-        step = self.engine.step(actions)
-        if not np.isfinite(step.rewards).all():
-            place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
-            where = f"in environment {place} under option {option[place]} at step {self.recorder.steps}"
-            raise NumericalError(f"the reward is {step.rewards[place]} {where}")
+        step = step_of(self.engine, actions)
         reached = self.verdicts.running(step.next_ids, option)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1

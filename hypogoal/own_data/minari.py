@@ -98,8 +98,8 @@ def _told(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.boo
     """What the functions say of each observation, bool (N, G)."""
     told = np.empty((len(observations), len(labels)), np.bool_)
     for column, label in enumerate(labels):
-        with UsersCode(f"the label function {getattr(label, '__name__', column)}"):
-            told[:, column] = [bool(label(observation)) for observation in observations]
+        with UsersCode(f"the label function {getattr(label, '__name__', column)}", label) as code:
+            told[:, column] = [code.truth(label(observation), "the label") for observation in observations]
     return told
 
 

@@ -10,8 +10,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import open_dataset
-from hypogoal.domains.gymnasium_engine import as_image, make_checked, shape_of
+from hypogoal.domains.gymnasium_engine import as_image, begun, make_checked, shape_of, stepped
 from hypogoal.own_data.arrays import read_states
 from hypogoal.own_data.images import image_files, read_image
 
@@ -113,8 +114,8 @@ class Played:
         self._begin()
 
     def _begin(self) -> None:
-        observation, _info = self._env.reset(seed=self._layout)
-        self.state = as_image(observation, shape_of(self._env))
+        observation, _info = begun(self._env, seed=self._layout)
+        self.state = as_image(self._env, observation, shape_of(self._env))
         self._steps, self._over = 0, False
 
     @property
@@ -142,9 +143,9 @@ class Played:
         if self._over:
             self._begin()
             return True
-        observation, _reward, terminated, truncated, _info = self._env.step(action)
-        self.state = as_image(observation, shape_of(self._env))
-        self._steps, self._over = self._steps + 1, bool(terminated or truncated)
+        observation, _reward, terminated, truncated, _info = stepped(self._env, action)
+        self.state = as_image(self._env, observation, shape_of(self._env))
+        self._steps, self._over = self._steps + 1, terminated or truncated
         return True
 
     def marked(self) -> None:
@@ -153,12 +154,13 @@ class Played:
 
 def action_names(env: gymnasium.Env) -> tuple[str, ...]:
     """What an environment calls its actions, else their numbers: MiniGrid has ``actions``, Atari its meanings."""
-    inner = env.unwrapped
     count = int(env.action_space.n)  # type: ignore[attr-defined]
-    if hasattr(inner, "get_action_meanings"):
-        names = tuple(map(str, inner.get_action_meanings()))
-    else:
-        names = tuple(str(getattr(action, "name", action)) for action in getattr(inner, "actions", ()))
+    with UsersCode("the names of the environment's actions", env):
+        inner = env.unwrapped
+        if hasattr(inner, "get_action_meanings"):
+            names = tuple(map(str, inner.get_action_meanings()))
+        else:
+            names = tuple(str(getattr(action, "name", action)) for action in getattr(inner, "actions", ()))
     return names if len(names) == count else tuple(map(str, range(count)))
 
 

@@ -87,7 +87,6 @@ def train_baseline(
                 report.log.restore(0)
             agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL, checkpoints, device)
             progress.update(config.steps)
-        report.log.close()
         write_table(folder / "episodes.csv", EPISODE_COLUMNS, env.episodes)
         save_tensors(folder / "policy.safetensors", weights(agent))
         facts = layout_facts(engine, config.layout_seed, config.random_episodes, seed)

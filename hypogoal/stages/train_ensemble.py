@@ -183,5 +183,4 @@ def _train_one(
         checkpoints=checkpoints,
     )
     write_ensemble(folder, sub_goal, ensemble)
-    report.log.close()
     return {"sub_goal": sub_goal, **report.numbers}

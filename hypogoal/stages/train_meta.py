@@ -104,7 +104,6 @@ def train_meta(
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             play(loop, config.steps, log, progress, checkpoints_of(folder))
-        log.close()
         recorder.write(folder, engine.images)
         if visited:
             visited.write(folder, domain, source.config, seed)

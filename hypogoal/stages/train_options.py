@@ -74,7 +74,6 @@ def train_options(
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:
             play(loop, steps, log, progress, checkpoints_of(folder))
-        log.close()
         recorder.write(folder, engine.images)
         if domain.measures and engine.position_names:
             recorder.write_executions(folder, engine.positions, domain.distance)

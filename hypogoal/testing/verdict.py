@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from hypogoal.core.errors import UserError, printable
+from hypogoal.core.own_code import UsersCode
 
 Test = tuple[str, Callable[[], str]]
 
 
-class Broken(Exception):
+class Broken(UserError):
     """A promise that is not kept: what was found, and what to do about it."""
 
     def __init__(self, what: str, do: str):
-        self.what, self.do = what, do
-        super().__init__(f"{what}. {do}")
+        super().__init__(what, do=do)
 
 
 @dataclass(frozen=True)
@@ -54,15 +52,10 @@ def run(tests: Iterable[Test]) -> Iterator[Verdict]:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             try:
-                ok, text = True, test()
-            except Broken as error:
-                ok, text = False, str(error)
+                with UsersCode("what is checked"):
+                    ok, text = True, test()
             except UserError as error:
                 ok, text = False, str(error)
-            except Exception as error:  # noqa: BLE001 - what is checked is someone's code, and may raise anything
-                place = traceback.extract_tb(error.__traceback__)[-1]
-                where = f"{Path(place.filename).name}, line {place.lineno}"
-                ok, text = False, f"{type(error).__name__}: {error} ({where}). Mend what raises it."
         yield Verdict(name, ok, " ".join(text.split()), tuple(dict.fromkeys(str(one.message) for one in told)))
         if not ok:
             return

@@ -2,13 +2,14 @@
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from hypogoal.cli import with_notes
 from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.checkpoints import checkpoints_of
+from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
 from hypogoal.core.errors import Killed
 from hypogoal.core.workers import CORES, allowed, cores, in_processes
 
@@ -38,3 +39,26 @@ def test_a_process_that_the_system_kills_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(Killed, match=r"want of memory.*workers=1") as caught:
         stage(tmp_path / "ensemble")
     assert "the last checkpoint is kept" in with_notes(str(caught.value), caught.value)
+
+
+def fail_after(begun: Path) -> None:
+    """When the other one has begun."""
+    while not begun.exists():
+        os.sched_yield()
+    raise ValueError("first")
+
+
+def fail_when_told_to_stop(begun: Path) -> None:
+    """Its own error is what ends it: the SIGTERM was for the next checkpoint, of which there is none."""
+    with Checkpoints(None) as checkpoints:
+        begun.touch()
+        while checkpoints._signal is None:
+            os.sched_yield()
+        raise ValueError("second")
+
+
+def test_processes_that_fail_at_once_are_not_waited_for_for_ever(tmp_path: Path) -> None:
+    """Spec G2: the first error is told, though the others fail of their own while they are told to stop."""
+    tasks = [partial(fail, tmp_path / "begun") for fail in (fail_after, fail_when_told_to_stop)]
+    with pytest.raises(ValueError, match="first"):
+        in_processes(tasks, 2, lambda number, result: None)

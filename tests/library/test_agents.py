@@ -29,6 +29,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.env import Options
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.networks import LightQNetwork
+from hypogoal.own_data import Played
 
 TESTS = Path(__file__).parents[1]
 MEMBERS = 2
@@ -159,6 +160,26 @@ def test_options_go_to_another_process(run: Path, options: Options) -> None:
                 known.policies(one)(observation) for one in range(4)
             ]
             observation, *_ = env.step(action)
+
+
+def test_what_a_wrapped_environment_gives_is_looked_at(options: Options, ensemble: Ensemble) -> None:
+    """Spec E1, G2: of options, of a sub-goal as reward or end, and of what is played by hand."""
+
+    class Unsure(CorridorEnv):
+        def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+            observation, _, *rest = super().step(action)
+            return observation, float("nan"), *rest  # type: ignore[return-value]
+
+    for env in (
+        hypogoal.OptionEnv(Unsure(), options),
+        hypogoal.SubgoalReward(Unsure(), ensemble),
+        hypogoal.SubgoalTermination(Unsure(), ensemble),
+    ):
+        env.reset(seed=0)
+        with pytest.raises(UserError, match=r"^the environment's step gave the reward nan: test_agents\.py, line "):
+            env.step(0)
+    with pytest.raises(UserError, match=r"^the environment's step gave the reward nan"):
+        Played(Unsure).press("0", frozenset())
 
 
 def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) -> None:

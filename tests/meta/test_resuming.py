@@ -39,11 +39,7 @@ class Breaking(Checkpoints):
 
 def run(case: str, folder: Path, checkpoints: Checkpoints) -> OptionLoop:
     loop = loop_of(case)
-    log = MetricsLog(folder / "metrics.jsonl")
-    try:
-        playing.play(loop, STEPS, log, Progress("", 0, quiet=True), checkpoints)
-    finally:
-        log.close()
+    playing.play(loop, STEPS, MetricsLog(folder / "metrics.jsonl"), Progress("", 0, quiet=True), checkpoints)
     return loop
 
 

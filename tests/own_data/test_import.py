@@ -303,6 +303,14 @@ def at_right(observation: np.ndarray) -> bool:
     return bool(observation[20, 35, 0] == 255)
 
 
+def is_unsure(observation: np.ndarray) -> Any:
+    return np.nan
+
+
+def is_told(observation: np.ndarray) -> Any:
+    return "False"
+
+
 def fails(observation: np.ndarray) -> bool:
     return bool(observation["nothing"])
 
@@ -339,6 +347,14 @@ def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.Ca
             save_minari(tmp_path / "h"),
             ["--label", "right=test_import:fails"],
             "the label function fails raised IndexError: ",
+        ),
+        *(
+            (
+                save_minari(tmp_path / name),
+                ["--label", f"right=test_import:{name}"],
+                f"the label function {name} gave the label {value}: test_import.py, line ",
+            )
+            for name, value in (("is_unsure", "nan"), ("is_told", "'False'"))
         ),
     ]
     for folder, more, message in cases:

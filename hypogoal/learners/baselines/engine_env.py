@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from hypogoal.domains.base import Engine
+from hypogoal.domains.base import Engine, step_of
 
 
 class EngineEnv(VecEnv):
@@ -52,7 +52,7 @@ class EngineEnv(VecEnv):
     def step_wait(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step every environment; where an episode ended, the observation is that of the next one's start."""
         lengths = self.engine.elapsed + 1
-        step = self.engine.step(self._actions)
+        step = step_of(self.engine, self._actions)
         self.steps += self.num_envs
         self._rewards += step.rewards
         done = step.terminated | step.truncated
