@@ -17,7 +17,7 @@ from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
-from hypogoal.core.hdf5 import set_attribute
+from hypogoal.core.hdf5 import Foreign, set_attribute, walk
 from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
@@ -73,6 +73,12 @@ HOSTILE = {
         lambda f, s: f.create_dataset("labelled/one/origin", shape=(2**40,), dtype="u1"),
         "a group should be",
     ),
+    "a chunk for each byte": (
+        lambda f, s: f.create_dataset(
+            OBSERVATIONS, shape=(7000, *SHAPE), dtype="u1", chunks=(1, 1, 1, 1), compression="gzip"
+        ).__setitem__(slice(50), 1),
+        "in 420000 chunks",
+    ),
     "another shape": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, 9), "u1")), "not uint8"),
 }
 
@@ -95,6 +101,27 @@ def test_hostile_hdf5(tmp_path: Path, case: str) -> None:
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     assert any(words in fault for fault in faults_of(path))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+def test_a_maze_of_hdf5_groups_is_not_walked(tmp_path: Path) -> None:
+    """Spec G2: with ten hard links in each of eight groups there are 10^8 ways to the last; datasets likewise."""
+    path = tmp_path / "arrays.h5"
+    with h5py.File(path, "w") as file:
+        file["values"] = np.zeros(3)
+        assert list(walk(file)) == ["values"]
+        place = file
+        for _ in range(6):
+            inner = place.create_group("0")
+            for number in range(1, 4):
+                place[str(number)] = inner
+            place = inner
+    with h5py.File(path) as file, pytest.raises(Foreign, match="/1' is there under another name too"):
+        list(walk(file))
+    with h5py.File(path, "w") as file:
+        file["one"] = np.zeros(3)
+        file["two"] = file["one"]
+    with h5py.File(path) as file, pytest.raises(Foreign, match="'two' is there under another name too"):
+        list(walk(file))
 
 
 def test_a_bomb_is_weighed_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
