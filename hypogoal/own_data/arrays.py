@@ -23,18 +23,9 @@ NAMES = "sub_goals"
 KNOWN = (*NEEDED, *OPTIONAL, NAMES)
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others make gigabytes of a kilobyte
 ENCRYPTED = 1  # among the flags of an entry
-# What NumPy and zipfile raise on bytes that are no array: a text for a size, a size of thirty digits, an odd stream.
 DAMAGED = (
-    ValueError,
-    OSError,
-    EOFError,
-    KeyError,
-    TypeError,
-    OverflowError,
-    MemoryError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+    ValueError, TypeError, OverflowError, KeyError, EOFError, OSError, MemoryError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip # of NumPy and zipfile: a text for a size, a size of thirty digits, an odd stream
 
 
 def read_arrays(path: Path) -> Parts:

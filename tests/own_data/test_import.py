@@ -250,7 +250,7 @@ def everywhere(data: bytearray, mark: bytes, offset: int, value: int) -> None:
 
 
 def test_zip_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
-    """Spec G2: encrypted, packed by methods that make gigabytes of a kilobyte or that nobody knows, two files in one."""
+    """Spec G2: encrypted, packed by methods that make gigabytes of a kilobyte or are unknown, two files in one."""
     path = tmp_path / "own.npz"
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
         packed(path, method)
