@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from safetensors.torch import save_file
 from toy_data import SHAPE, write
 
 from hypogoal.core.artefacts import create_artefact, open_artefact
-from hypogoal.core.config import resolve
+from hypogoal.core.config import load_preset, preset_digest, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
 from hypogoal.core.hdf5 import Foreign, set_attribute, walk
@@ -101,6 +102,19 @@ def test_hostile_hdf5(tmp_path: Path, case: str) -> None:
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     assert any(words in fault for fault in faults_of(path))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+@pytest.mark.parametrize(
+    "text", ["a." * 1000 + "a = 1", "[" + '".".' * 1000 + "a]", "x = {" + "a . " * 1000 + "a = 1}"]
+)
+def test_toml_with_keys_within_keys_is_not_parsed(tmp_path: Path, text: str) -> None:
+    """Spec G2: of 300 kB of them ``tomllib`` would make nothing in an hour."""
+    path = tmp_path / "deep.toml"
+    path.write_text(f"format = 1\n{text}\n")
+    for read in (partial(own_plan, path, tmp_path), partial(load_preset, str(path), "collect")):
+        with pytest.raises(UserError, match=r"not valid TOML \(more than 256 dots in line 2\): .*deep\.toml"):
+            read()
+    assert preset_digest(str(path)) == ""
 
 
 def test_a_maze_of_hdf5_groups_is_not_walked(tmp_path: Path) -> None:
