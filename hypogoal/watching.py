@@ -127,7 +127,8 @@ def read_progress(run: Path) -> list[Progressing]:
 def _read(log: Path, run: Path) -> Progressing:
     lines = _lines(log)
     last = lines[-1] if lines else {}
-    draft = next((folder for folder in log.parents if re.fullmatch(rf"\..+{re.escape(PARTIAL)}", folder.name)), None)
+    named = re.compile(rf"\.+[^.].*{re.escape(PARTIAL)}")  # and not that of an output called '.' or '..'
+    draft = next((folder for folder in log.parents if named.fullmatch(folder.name)), None)
     place = draft.with_name(draft.name[1 : -len(PARTIAL)]) if draft else log.parent
     name = place.relative_to(run).as_posix() if place != run else place.name
     goal = str(last.get("sub_goal", ""))

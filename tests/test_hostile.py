@@ -4,6 +4,7 @@ import json
 import os
 import resource
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from toy_data import SHAPE, write
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
-from hypogoal.core.config import resolve
+from hypogoal.core.config import load_preset, preset_digest, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
-from hypogoal.core.hdf5 import set_attribute
+from hypogoal.core.hdf5 import Foreign, set_attribute, walk
 from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
 from hypogoal.domains.base import load_domain
@@ -75,6 +76,12 @@ HOSTILE = {
         lambda f, s: f.create_dataset("labelled/one/origin", shape=(2**40,), dtype="u1"),
         "a group should be",
     ),
+    "a chunk for each byte": (
+        lambda f, s: f.create_dataset(
+            OBSERVATIONS, shape=(7000, *SHAPE), dtype="u1", chunks=(1, 1, 1, 1), compression="gzip"
+        ).__setitem__(slice(50), 1),
+        "in 420000 chunks",
+    ),
     "another shape": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, 9), "u1")), "not uint8"),
 }
 
@@ -97,6 +104,40 @@ def test_hostile_hdf5(tmp_path: Path, case: str) -> None:
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
     assert any(words in fault for fault in faults_of(path))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+@pytest.mark.parametrize(
+    "text", ["a." * 1000 + "a = 1", "[" + '".".' * 1000 + "a]", "x = {" + "a . " * 1000 + "a = 1}"]
+)
+def test_toml_with_keys_within_keys_is_not_parsed(tmp_path: Path, text: str) -> None:
+    """Spec G2: of 300 kB of them ``tomllib`` would make nothing in an hour."""
+    path = tmp_path / "deep.toml"
+    path.write_text(f"format = 1\n{text}\n")
+    for read in (partial(own_plan, path, tmp_path), partial(load_preset, str(path), "collect")):
+        with pytest.raises(UserError, match=r"not valid TOML \(more than 256 dots in line 2\): .*deep\.toml"):
+            read()
+    assert preset_digest(str(path)) == ""
+
+
+def test_a_maze_of_hdf5_groups_is_not_walked(tmp_path: Path) -> None:
+    """Spec G2: with ten hard links in each of eight groups there are 10^8 ways to the last; datasets likewise."""
+    path = tmp_path / "arrays.h5"
+    with h5py.File(path, "w") as file:
+        file["values"] = np.zeros(3)
+        assert list(walk(file)) == ["values"]
+        place = file
+        for _ in range(6):
+            inner = place.create_group("0")
+            for number in range(1, 4):
+                place[str(number)] = inner
+            place = inner
+    with h5py.File(path) as file, pytest.raises(Foreign, match="/1' is there under another name too"):
+        list(walk(file))
+    with h5py.File(path, "w") as file:
+        file["one"] = np.zeros(3)
+        file["two"] = file["one"]
+    with h5py.File(path) as file, pytest.raises(Foreign, match="'two' is there under another name too"):
+        list(walk(file))
 
 
 def test_a_bomb_is_weighed_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

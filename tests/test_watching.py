@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -177,14 +178,45 @@ def test_tensorboard_gets_what_is_new_once(run, tmp_path):
     kept = log.read_text().splitlines()[:5]
     log.write_text("\n".join([*kept, '{"step": 6000, "success": 0.6}', '{"step": 10000, "success": 1.0}']) + "\n")
     mirror(read_progress(run), boards)
-    boards.close()
     found = [step for step, tag, _ in events(tmp_path / "boards/meta/layout-100-seed-0") if tag == "success"]
     assert found == [1_000 * s for s in range(1, 11)]
 
 
+@pytest.mark.parametrize("name", ["...partial", "....partial"])
+def test_boards_stay_in_their_folder(tmp_path, name):
+    """Spec G2: the name of a draft is a stranger's: it may not climb."""
+    (tmp_path / "run" / name / "files").mkdir(parents=True)
+    (tmp_path / "run" / name / "files" / "metrics.jsonl").write_text('{"step": 1, "loss": 1}\n')
+    assert main(["watch", str(tmp_path / "run"), "--once", "--tensorboard", str(tmp_path / "boards")]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["boards", "run"]
+    assert sum(len(events(folder)) for folder in [tmp_path / "boards", *(tmp_path / "boards").rglob("*/")]) == 1
+
+
+def test_boards_of_whatever_is_in_a_log(tmp_path, capsys):
+    """Spec G2: names and keys that are no UTF-8, thousands of sub-goals; nothing is kept open for them."""
+    odd = tmp_path / "run" / "\udcff\udcfe"
+    odd.mkdir(parents=True)
+    (odd / "metrics.jsonl").write_text('{"step": 1, "\\ud800": 2}\n')
+    many = "".join(f'{{"step": 1, "loss": 1, "sub_goal": "g{number}"}}\n' for number in range(2000))
+    (tmp_path / "run" / "metrics.jsonl").write_text(many)
+    open_files, threads = len(os.listdir("/proc/self/fd")), threading.active_count()
+    boards = Boards(tmp_path / "boards")
+    mirror(read_progress(tmp_path / "run"), boards)
+    assert len(os.listdir("/proc/self/fd")) <= open_files + 1 and threading.active_count() == threads
+    assert events(tmp_path / "boards" / "??") == [(1, "?", 2.0)]
+    assert sum(len(events(folder)) for folder in (tmp_path / "boards").rglob("g*")) == 2000
+
+
+def test_boards_that_are_a_link_into_nothing(tmp_path, run, capsys):
+    """Spec G2: the folder would be made where the link leads."""
+    (tmp_path / "boards").symlink_to(tmp_path / "nothing")
+    assert main(["watch", str(run), "--once", "--tensorboard", str(tmp_path / "boards")]) == 2
+    assert "exists already" in capsys.readouterr().err and not (tmp_path / "nothing").exists()
+
+
 def test_without_the_extra(run, tmp_path, monkeypatch, capsys):
     """Spec A6: one line that says what to install, and no folder."""
-    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.event_file_writer", None)
+    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.record_writer", None)
     assert main(["watch", str(run), "--tensorboard", str(tmp_path / "boards")]) == 2
     assert "pip install 'hypogoal[tensorboard]'" in capsys.readouterr().err
     assert not (tmp_path / "boards").exists()

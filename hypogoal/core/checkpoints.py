@@ -63,7 +63,7 @@ class Checkpoints:
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Checkpoints:
-        self._signal, self._interrupted = None, False
+        self._signal, self._interrupted, self._handlers = None, False, {}
         if threading.current_thread() is threading.main_thread():  # no other may have handlers
             for number in SIGNALS:
                 if signal.getsignal(number) is not signal.SIG_IGN:
@@ -75,9 +75,10 @@ class Checkpoints:
     ) -> None:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        self._handlers.clear()
         if self._signal is not None and kind is None:
             raise KeyboardInterrupt(self._signal)
+        if self._signal is not None and self._handlers.get(self._signal) is signal.SIG_DFL:
+            signal.raise_signal(self._signal)  # a pool's process that fails and is told to end, or it would never
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and self._interrupted:

@@ -13,7 +13,6 @@ import hashlib
 import json
 import math
 import re
-import tomllib
 import typing
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, read_text
+from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
@@ -77,10 +76,7 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str,
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     else:
         raise UserError("unknown preset", name, f"Choose one of {', '.join(known)}, or give a .toml file.")
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
-        raise UserError(f"the preset is not valid TOML ({str(error)[:200]})", name, "Mend the file.") from None
+    table = parse_toml(text, name, "the preset is", "Mend the file.")
     for key in table:
         if key not in (*TABLES, stage):
             do = f"{_meant(key, TABLES)}A preset has tables for {', '.join(TABLES)}."
@@ -97,7 +93,8 @@ def preset_digest(path: str) -> str:
     Its ``[run]`` is left out: that says which cells there are, and a sweep may be given more.
     """
     try:
-        table = tomllib.loads(read_text(Path(path), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES))
+        text = read_text(Path(path), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
+        table = parse_toml(text, path, "the preset is", "Mend the file.")
         text = json.dumps({**table, "run": None}, sort_keys=True, default=str)
     except (UserError, ValueError, RecursionError):
         return ""

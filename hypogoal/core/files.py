@@ -10,6 +10,7 @@ import io
 import json
 import os
 import re
+import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, TypeGuard
@@ -19,6 +20,7 @@ from hypogoal.core.errors import UserError, printable
 MAX_TEXT_BYTES = 64 * 2**20
 MAX_JSON_DEPTH = 32
 MAX_NAME_BYTES = 200
+MOST_DOTS = 256  # in a line of TOML
 MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
 NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
 FORMULA = "=+-@＝＋－＠"  # signs with which a spreadsheet begins to compute, of full width too
@@ -85,6 +87,21 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
     except (ValueError, RecursionError):
         raise UserError(f"{what} not valid JSON", where, do) from None
     return value
+
+
+def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
+    """TOML without keys in hundreds of parts (``a.a.a``), for which the parser takes the square of their number.
+
+    Raises:
+        UserError: it is not, or not TOML at all.
+    """
+    try:
+        for number, line in enumerate(text.split("\n"), 1):
+            if line.count(".") > MOST_DOTS:
+                raise ValueError(f"more than {MOST_DOTS} dots in line {number}")
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
+        raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
 
 
 def _no_number(name: str) -> NoReturn:

@@ -175,14 +175,30 @@ def check_dataset(dataset: Any, kinds: str) -> int:
             if settings.get_filter(index)[0] not in FILTERS:
                 raise Foreign(f"{name!r} needs a filter that is not one of {', '.join(FILTERS.values())}")
         size, stored = prod(map(int, shape)) * dtype.itemsize, int(dataset.id.get_storage_size())
-        chunk = prod(map(int, dataset.chunks)) * dtype.itemsize if dataset.chunks else 0
+        sides = dataset.chunks or shape
+        chunk = prod(map(int, sides)) * dtype.itemsize if dataset.chunks else 0
+        chunks = prod(-(-side // width) for side, width in zip(shape, sides, strict=True) if width)
         whole = int(dataset.file.id.get_filesize())
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
         raise Foreign("a dataset is not readable") from None
     ratio = MOST_RATIO if settings.get_nfilters() else 1
     if stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES:
         raise Foreign(f"{name!r} declares {human(size)}, of which {human(stored)} are stored in {human(whole)}")
+    if chunks > max(stored, 1):  # HDF5 holds some hundred bytes in memory for each, stored or not
+        raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks, of which {human(stored)} are stored")
     return size
+
+
+def size_of(file: Any, name: str, kinds: str) -> int:
+    """What :func:`check_dataset` says of the dataset called ``name``.
+
+    Raises:
+        Foreign: it does, or there is none.
+    """
+    dataset = find(file, name)
+    if dataset is None:
+        raise Foreign(f"no readable {name!r}")
+    return check_dataset(dataset, kinds)
 
 
 def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
@@ -191,32 +207,35 @@ def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
     Raises:
         Foreign: missing, refused, damaged, or larger than the memory that is free.
     """
-    dataset = find(file, name)
-    if dataset is None:
-        raise Foreign(f"no readable {name!r}")
-    size = check_dataset(dataset, kinds)
+    size = size_of(file, name, kinds)
     free = free_memory()
     if free is not None and size > free:
         raise Foreign(f"{name!r} needs {human(size)} of memory, {human(free)} are free")
     try:
-        return np.asarray(dataset[()])
+        return np.asarray(file[name][()])
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError):
         raise Foreign(f"{name!r} is damaged") from None
 
 
-def walk(group: Any, prefix: str = "", depth: int = 8) -> Iterator[str]:
+def walk(group: Any, prefix: str = "", depth: int = 8, seen: set[int] | None = None) -> Iterator[str]:
     """The names of all datasets below a group.
 
     Raises:
-        Foreign: a link, unreadable parts, or groups within each other more than ``depth`` deep.
+        Foreign: a link, unreadable parts, groups within each other more than ``depth`` deep, or something that is there
+            twice: of names there may be millions for a few groups, or gigabytes to read for a few kilobytes.
     """
     import h5py
 
+    seen = set() if seen is None else seen
     for name in members(group):
         item = find(group, name)
+        address = int(h5py.h5o.get_info(item.id).addr)
+        if address in seen:
+            raise Foreign(f"{prefix + name!r} is there under another name too")
+        seen.add(address)
         if isinstance(item, h5py.Group):
             if depth == 0:
                 raise Foreign("groups are nested too deep")
-            yield from walk(item, f"{prefix}{name}/", depth - 1)
+            yield from walk(item, f"{prefix}{name}/", depth - 1, seen)
         elif isinstance(item, h5py.Dataset):
             yield f"{prefix}{name}"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import re
 import shlex
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -18,7 +17,7 @@ from typing import Any
 
 from hypogoal.core.config import MAX_PRESET_BYTES, STAGES, parse_assignments, parse_integers
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import path_part, plain_name, read_text
+from hypogoal.core.files import parse_toml, path_part, plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_cell
@@ -96,10 +95,7 @@ def own_plan(path: Path, out: Path, assignments: Sequence[str] = ()) -> Plan:
 
 def _read(path: Path) -> dict[str, Any]:
     text = read_text(path, "the experiment is", "Give a .toml file.", MAX_PRESET_BYTES)
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"the experiment is not valid TOML ({str(error)[:200]})", path, MEND) from None
+    table = parse_toml(text, path, "the experiment is", MEND)
     _check_keys(table, KEYS, path)
     if table.get("format") != FORMAT_VERSION:
         raise UserError(f"format must be {FORMAT_VERSION}", path, MEND)

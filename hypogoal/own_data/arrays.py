@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,18 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import require_file
-from hypogoal.core.preflight import free_memory, human
 from hypogoal.dataset import Dataset
-from hypogoal.own_data.parts import Parts, as_images
+from hypogoal.own_data.parts import Parts, as_images, require_memory
 
 NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
 NAMES = "sub_goals"
 KNOWN = (*NEEDED, *OPTIONAL, NAMES)
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others make gigabytes of a kilobyte
+ENCRYPTED = 1  # among the flags of an entry
+DAMAGED = (
+    ValueError, TypeError, OverflowError, KeyError, EOFError, OSError, MemoryError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip # of NumPy and zipfile: a text for a size, a size of thirty digits, an odd stream
 
 
 def read_arrays(path: Path) -> Parts:
@@ -91,16 +96,18 @@ def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
     require_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.")
     try:
         with zipfile.ZipFile(path) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-    except (zipfile.BadZipFile, OSError):
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, OSError, NotImplementedError, ValueError):
         raise UserError("this is no .npz file", path, "Write it with numpy.savez.") from None
-    _require_memory(size, path)
+    if any(entry.compress_type not in PACKED or entry.flag_bits & ENCRYPTED for entry in entries):
+        raise UserError("the arrays are packed as numpy does not pack them", path, "Write it with numpy.savez.")
+    require_memory(sum(entry.file_size for entry in entries), path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not others:
                 _require_known(archive.files, path)
             return {name: archive[name] for name in archive.files if name in KNOWN}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, MemoryError) as error:
+    except DAMAGED as error:
         raise _damaged(path, error) from None
 
 
@@ -109,11 +116,11 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
     _require_known(sorted(file.stem for file in path.glob("*.npy")), path)
     files = {name: path / f"{name}.npy" for name in KNOWN}
     found = {name: file for name, file in files.items() if file.is_file()}
-    _require_memory(sum(file.stat().st_size for file in found.values()), path)
+    require_memory(sum(file.stat().st_size for file in found.values()), path)
     for name, file in found.items():
         try:
             arrays[name] = np.load(file, allow_pickle=False)
-        except (ValueError, OSError, EOFError, MemoryError) as error:
+        except DAMAGED as error:
             raise _damaged(file, error) from None
     return arrays
 
@@ -129,12 +136,6 @@ def _require_known(names: Iterable[str], path: Path) -> None:
             near = difflib.get_close_matches(name, KNOWN, n=1)
             do = f"Did you mean {near[0]!r}?" if near else f"Known are {', '.join(KNOWN)}; leave it out."
             raise UserError(f"unknown array {name!r}", path, do)
-
-
-def _require_memory(size: int, path: Path) -> None:
-    free = free_memory()
-    if free is not None and size > free:
-        raise UserError(f"the arrays need {human(size)} of memory, {human(free)} are free", path, "Give fewer states.")
 
 
 def _damaged(path: Path, error: Exception) -> UserError:

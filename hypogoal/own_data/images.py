@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,12 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.own_data.parts import Parts
+from hypogoal.core.files import require_file
+from hypogoal.own_data.parts import Parts, require_memory
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP")  # whatever a file is called: for PostScript a program would be run
+MOST_PIXELS = 4096 * 4096  # of a state; a kilobyte can stand for a thousand times as many
 ARRAY = ".npy"  # a state that no image file holds, such as a stack of four frames
 DO = "Remove it, or write it again."
 GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", "PA", "RGBA")  # of 8 bits a channel
@@ -33,7 +38,8 @@ def read_images(folder: Path) -> Parts:
     heldout = folder / "heldout"
     if heldout.is_dir():
         wanted |= {f"heldout/{name}": _files(heldout / name) for name in ("positive", "negative")}
-    images = {name: _read(files) for name, files in wanted.items()}
+    count = sum(map(len, wanted.values()))
+    images = {name: _read(files, count) for name, files in wanted.items()}
     sizes = {_size(some[0]): name for name, some in images.items()}
     if len(sizes) > 1:
         text = ", ".join(f"{name} {size}" for size, name in sizes.items())
@@ -78,19 +84,26 @@ def read_image(file: Path) -> NDArray[np.uint8]:
         file: an image, or a ``.npy`` file with an array uint8 (H, W, C).
 
     Raises:
-        UserError: it cannot be read, has more than 8 bits a channel, or is transparent in places.
+        UserError: it cannot be read, is too large, has more than 8 bits a channel or several pictures, or is
+            transparent in places.
     """
     import PIL.Image
 
+    require_file(file, "the image is", DO)
     try:
         if file.suffix == ARRAY:
             values = np.load(file, mmap_mode="r", allow_pickle=False)
             if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
             return np.array(values)
-        with PIL.Image.open(file) as image:
+        with warnings.catch_warnings(action="ignore"), PIL.Image.open(file, formats=FORMATS) as image:
+            if (pixels := image.width * image.height) > MOST_PIXELS:
+                raise UserError(f"the image has {pixels:,} pixels, at most {MOST_PIXELS:,} are read", file, DO)
+            if getattr(image, "is_animated", False):
+                raise UserError("several pictures are in one file", file, "Write each as a file of its own.")
             values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
-    except (OSError, ValueError, SyntaxError, EOFError, PIL.Image.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError, EOFError, OverflowError, TypeError, LookupError, struct.error,
+            PIL.Image.DecompressionBombError):  # fmt: skip
         raise UserError("this is no image, or a damaged one", file, DO) from None
     return values.reshape(*values.shape[:2], -1)
 
@@ -107,10 +120,13 @@ def _opaque(image: Image, file: Path) -> Image:
     return image
 
 
-def _read(files: list[Path]) -> list[NDArray[np.uint8]]:
+def _read(files: list[Path], count: int) -> list[NDArray[np.uint8]]:
+    """The images of one size in some files, of ``count`` that there are in all."""
     images: list[NDArray[np.uint8]] = []
     for file in files:
         images.append(read_image(file))
+        if len(images) == 1:
+            require_memory(count * images[0].nbytes, file)
         if _size(images[-1]) != _size(images[0]):
             what = f"the image is {_size(images[-1])}, others are {_size(images[0])}"
             raise UserError(what, file, "Make them all one size.")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import replace_file, sync
+from hypogoal.core.files import inside, replace_file, sync
 from hypogoal.own_data.images import read_image
 
 KINDS = ("positive", "negative", "unlabelled")
@@ -26,6 +26,9 @@ class Marks:
     Args:
         folder: where, made with the first mark; what is in it already is gone on with.
         kinds: the marks that there are.
+
+    Raises:
+        UserError: a link in the folder leads out of it.
     """
 
     def __init__(self, folder: Path, kinds: Sequence[str] = KINDS):
@@ -33,6 +36,8 @@ class Marks:
         self._files: dict[str, Path] = {}
         self._before: list[tuple[str, str | None]] = []
         for kind in self.kinds:
+            if inside(folder, kind) is None:
+                raise UserError("a folder of marks leads elsewhere", folder / kind, "Give another --out.")
             for file in sorted((folder / kind).glob("[!.]*")):
                 if file.suffix in (".png", ".npy"):
                     self._files[file.stem] = file

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, read_array
+from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import write_observations
 from hypogoal.meta.episodes import Episode
-from hypogoal.own_data.parts import Parts
+from hypogoal.own_data.parts import Parts, require_memory
 
 MAIN_FILE = Path("data") / "main_data.hdf5"
 METADATA = Path("data") / "metadata.json"
@@ -73,9 +73,14 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArr
             if stored is not None and stored[1:] != shape:
                 what = "its images are not stored as they were seen, but as JPEG"
                 raise UserError(what, path, "Make it with jpeg_encoding=False.")
-            return [read_array(file, f"{name}/{place}", "uif") for name in sorted(names, key=_number)]
+            places = [f"{name}/{place}" for name in sorted(names, key=_number)]
+            require_memory(sum(size_of(file, name, "uif") for name in places), path)
+            episodes = [read_array(file, name, "uif") for name in places]
         except Foreign as error:
             raise UserError(f"the dataset cannot be used: {error}", path, DO) from None
+    if len({episode.shape[1:] for episode in episodes}) > 1 or not all(episode.ndim for episode in episodes):
+        raise UserError("its episodes have observations of different shapes", path, "Give those of one shape.")
+    return episodes
 
 
 def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:

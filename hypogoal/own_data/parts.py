@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.preflight import free_memory, human
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, digest, leave_out, require_names
 from hypogoal.domains.gymnasium_engine import channels_first
 
+COPIES = 4  # of the states, all held in memory at once while they are compared and written
 FEW = 10  # states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
 
@@ -83,6 +86,18 @@ def collected_of(
     sets = [States(images, labels), States(unlabelled, unknown), test]
     numbered = [replace(one, origins={"row": np.arange(len(one.labels), dtype=np.int64)}) for one in sets]
     return Collected(tuple(shape), goals, *numbered), warned
+
+
+def require_memory(size: int, where: Path) -> None:
+    """Weigh states of ``size`` bytes before they are read.
+
+    Raises:
+        UserError: with the copies that are made of them they need more memory than is free.
+    """
+    free = free_memory()
+    if free is not None and COPIES * size > free:
+        what = f"the states need {human(COPIES * size)} of memory, {human(free)} are free"
+        raise UserError(what, where, "Give fewer states.")
 
 
 def _unknown(

@@ -3,6 +3,8 @@
 import os
 import resource
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -160,3 +162,22 @@ def test_the_pace_is_set_from_outside(tmp_path: Path, monkeypatch: pytest.Monkey
     for step in range(3):
         checkpoints.offer(lambda step=step: {"step": step})  # type: ignore[misc]
         assert checkpoints.load() == {"step": step}
+
+
+STOPPED_WHILE_FAILING = """
+import os, signal
+from hypogoal.core.checkpoints import Checkpoints
+
+try:
+    with Checkpoints(None):
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise OSError("the disk is full")
+except OSError:
+    print("goes on")
+"""
+
+
+def test_a_signal_that_comes_with_an_error_is_not_forgotten() -> None:
+    """Spec G1: a process of a pool would wait for its next task, and its stage for the process, for ever."""
+    done = subprocess.run([sys.executable, "-c", STOPPED_WHILE_FAILING], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (-signal.SIGTERM, ""), done.stderr

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from PIL import Image
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
-from hypogoal.own_data import Parts, collected_of, read_arrays, read_images
+from hypogoal.own_data import Parts, collected_of, read_arrays, read_images, read_minari
 from hypogoal.own_data.images import read_image
 from hypogoal.own_data.parts import held_out
 
@@ -228,6 +231,78 @@ def test_damaged_arrays_are_one_line(tmp_path: Path) -> None:
         read_arrays(tmp_path / "nowhere.npz")
 
 
+def packed(path: Path, method: int = zipfile.ZIP_DEFLATED) -> bytearray:
+    """An honest ``.npz`` file, packed by hand."""
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, values in arrays().items():
+            made = io.BytesIO()
+            np.save(made, values)
+            archive.writestr(f"{name}.npy", made.getvalue())
+    return bytearray(path.read_bytes())
+
+
+def everywhere(data: bytearray, mark: bytes, offset: int, value: int) -> None:
+    """Change a byte of every entry of a zip file."""
+    at = data.find(mark)
+    while at >= 0:
+        data[at + offset] = value
+        at = data.find(mark, at + 4)
+
+
+def test_zip_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
+    """Spec G2: encrypted, packed by methods that make gigabytes of a kilobyte or are unknown, two files in one."""
+    path = tmp_path / "own.npz"
+    for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        packed(path, method)
+        with pytest.raises(UserError, match=r"packed as numpy does not pack them: .*own\.npz"):
+            read_arrays(path)
+    for offset, value in ((8, 1), (10, 99)):  # flags, method
+        data = packed(path)
+        everywhere(data, b"PK\x01\x02", offset, value)
+        everywhere(data, b"PK\x03\x04", offset - 2, value)
+        path.write_bytes(data)
+        with pytest.raises(UserError, match="packed as numpy does not"):
+            read_arrays(path)
+    data = packed(path, zipfile.ZIP_STORED)
+    np.save(tmp_path / "one.npy", arrays()["labels"])
+    path.write_bytes((tmp_path / "one.npy").read_bytes() + data)
+    with pytest.raises(UserError, match="damaged"):
+        read_arrays(path)
+    data = packed(path)
+    data[200:400] = bytes(b"\xff" * 200)
+    path.write_bytes(data)
+    with pytest.raises(UserError, match="damaged"):
+        read_arrays(path)
+    header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % 10**30
+    huge = b"\x93NUMPY\x02\0" + len(header).to_bytes(4, "little") + header
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("observations.npy", huge)
+    with pytest.raises(UserError, match="damaged"):
+        read_arrays(path)
+    for name in ("positive", "negative", "unlabelled"):
+        (tmp_path / "images" / name).mkdir(parents=True)
+        (tmp_path / "images" / name / "x.npy").write_bytes(huge)
+    with pytest.raises(UserError, match="no image, or a damaged one"):
+        read_images(tmp_path / "images")
+
+
+def test_what_is_to_be_imported_is_weighed_with_its_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G2: states are held several times over while they are looked at; images and episodes are weighed too."""
+    np.savez(tmp_path / "own.npz", **arrays())
+    size = sum(values.nbytes for values in arrays().values())
+    folder, dataset = save_images(tmp_path / "images"), save_minari(tmp_path / "episodes")
+    with h5py.File(dataset / "data" / "main_data.hdf5", "a") as file:
+        for number in range(10, 60):  # the same bytes again and again
+            file[f"episode_{number}/observations"] = file["episode_0/observations"]
+    monkeypatch.setattr("hypogoal.own_data.parts.free_memory", lambda: size)
+    with pytest.raises(UserError, match=r"need 2\.1 MB of memory, 525 kB are free: .*own\.npz"):
+        read_arrays(tmp_path / "own.npz")
+    with pytest.raises(UserError, match=r"need 1\.1 MB of memory, 525 kB are free: .*images"):
+        read_images(folder)
+    with pytest.raises(UserError, match=r"need 10\.0 MB of memory, 525 kB are free: .*main_data"):
+        read_minari(dataset, [at_right])
+
+
 def save_images(folder: Path, *, held: bool = True, grey: bool = False) -> Path:
     images, labels = pictures(24)
     for number, (image, label) in enumerate(zip(images, labels, strict=True)):
@@ -280,6 +355,33 @@ def test_what_is_wrong_with_images_is_one_line(tmp_path: Path) -> None:
         file.unlink()
     with pytest.raises(UserError, match=r"no images .*unlabelled"):
         read_images(folder)
+
+
+def test_what_is_no_picture_of_a_state_is_not_even_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Spec G2: PostScript, for which Pillow would run a program; huge pictures; pipes; several pictures in one."""
+    file = tmp_path / "x.png"
+    (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
+    (tmp_path / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    file.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n")
+    with pytest.raises(UserError, match=r"no image, or a damaged one: .*x\.png"):
+        read_image(file)
+    assert not (tmp_path / "ran").exists()
+    Image.new("1", (13_000, 13_000)).save(file)
+    with pytest.raises(UserError, match=r"the image has 169,000,000 pixels, at most 16,777,216 are read: .*x\.png"):
+        read_image(file)
+    frames = [Image.new("L", (SIDE, SIDE), value) for value in (0, 90, 180)]
+    for suffix in (".gif", ".png", ".webp"):
+        frames[0].save(tmp_path / f"several{suffix}", save_all=True, append_images=frames[1:])
+        with pytest.raises(UserError, match=rf"several pictures are in one file: .*several\{suffix}"):
+            read_image(tmp_path / f"several{suffix}")
+    assert not list(recwarn)
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(UserError, match=r"the image is not a regular file: .*x\.png"):
+        read_image(file)
 
 
 def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, stored: str = "hdf5") -> Path:
@@ -357,6 +459,11 @@ def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.Ca
             for name, value in (("is_unsure", "nan"), ("is_told", "'False'"))
         ),
     ]
+    for name, shape in (("i", (6, SIDE, 20, 3)), ("j", (6, SIDE)), ("k", ())):
+        cases.append((save_minari(tmp_path / name), label, "its episodes have observations of different shapes"))
+        with h5py.File(tmp_path / name / "data" / "main_data.hdf5", "a") as file:
+            del file["episode_3/observations"]
+            file["episode_3/observations"] = np.ones(shape, np.uint8)
     for folder, more, message in cases:
         assert main(["import", str(folder), "--out", str(tmp_path / "data.h5"), *more]) == 2
         assert message in capsys.readouterr().err

@@ -82,6 +82,16 @@ def test_recorded_states_are_stepped_through(tmp_path: Path) -> None:
         again.mark(np.zeros((8, 7, 3), np.uint8), "positive")
 
 
+def test_marks_stay_in_their_folder(tmp_path: Path) -> None:
+    """Spec G2: somebody's folder of marks that is gone on with may have links in it."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "marks").mkdir()
+    (tmp_path / "marks" / "positive").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match=r"a folder of marks leads elsewhere: .*marks/positive"):
+        Marks(tmp_path / "marks").mark(np.zeros((8, 6, 3), np.uint8), "positive")
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_images_and_data_files_are_recorded_states_too(tmp_path: Path) -> None:
     """Spec B6: what was marked before, or imported, can be looked at again."""
     states = np.random.default_rng(1).integers(0, 255, (3, 8, 8, 1), dtype=np.uint8)

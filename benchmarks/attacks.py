@@ -1,0 +1,510 @@
+"""Spec G1, G2: full disks, signals and turned clocks while stages run; files made to hurt whoever reads them.
+
+``python -m benchmarks.attacks [--family disk ...] [--cases 20] [--seed 0] [--json FILE]`` prints a row for each family.
+A case is bad when a command ends in a traceback, in more than one line, or not at all; when it writes outside its
+output or takes more memory than a small file is worth; when an output is there and not whole, has other bytes after
+``--resume`` than an undisturbed one, or when a process outlives its stage. ``--case 7`` runs one case again.
+
+``disk`` mounts a tmpfs, so it needs root on Linux; ``clock`` needs libfaketime. Without them these are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks import hostile
+from benchmarks.hostile import TRAINED
+from benchmarks.kills import PACES, STAGES, Stage, differences, needed, unbroken
+from benchmarks.sweeps import TOY
+from hypogoal.core.checkpoints import FOLDER, PACE
+from hypogoal.core.drafts import draft_folder
+
+SECONDS, WAIT = 60.0, 300.0  # of a core that a command may take; of the clock, on whatever machine
+MEMORY, SMALL = 2**30, 2**20  # bytes that a file below SMALL may cost
+PATIENCE = 10.0  # seconds for processes to die with their stage
+FAKETIME = next(iter(sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))), None)
+EVALUATION = Stage("evaluation", ("evaluate", "{run}"))
+REPORT = Stage("report", ("report", "{out}"))
+Rng = random.Random
+
+
+class Bad(Exception):
+    """What an attack came to that it must not."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: exit code, minus the signal; stderr, of ``verify`` stdout too; seconds; bytes of memory."""
+
+    command: str
+    code: int
+    words: str
+    seconds: float
+    memory: int
+
+    def accepted(self, *codes: int) -> bool:
+        """Whether it succeeded; anything but that, one line and exit code 2, or one of ``codes``, is bad."""
+        lines = self.words.splitlines()
+        if self.code not in (0, 2, *codes):
+            raise Bad(f"ended with {self.code}: {self.words[-400:]}")
+        if "Traceback" in self.words or "internal error" in self.words or "Exception ignored" in self.words:
+            raise Bad(f"a traceback: {self.words[-400:]}")
+        told = self.command == "verify" or (len(lines) == 1 and lines[0].startswith("hypogoal: "))
+        if self.code > 0 and not (told and lines and "".join(lines).isprintable()):
+            raise Bad(f"not one line: {self.words[-400:]}")
+        return self.code == 0
+
+
+class Command:
+    """``hypogoal`` in a process of its own, the first of its group: forked from this one, or begun ``anew``."""
+
+    def __init__(self, *arguments: object, anew: bool = False, environment: Mapping[str, str] | None = None):
+        words, environment = [str(argument) for argument in arguments], {**os.environ, **(environment or {})}
+        self.arguments, self.began = words, time.monotonic()
+        self.said, self.log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - as long as this is
+        if anew:
+            command = [sys.executable, "-m", "hypogoal", *words]
+            self.process = subprocess.Popen(
+                command, stdout=self.said, stderr=self.log, env=environment, process_group=0
+            ).pid
+        else:
+            self.process = os.fork() or self._run(words, environment)
+
+    def _run(self, words: list[str], environment: Mapping[str, str]) -> int:
+        code = 70
+        try:
+            os.setpgid(0, 0)
+            os.dup2(self.said.fileno(), 1)
+            os.dup2(self.log.fileno(), 2)
+            os.environ.update(environment)
+            sys.argv = ["hypogoal", *words]
+            from hypogoal.cli import main
+
+            code = main()
+            sys.stdout.flush()
+        except BaseException:  # noqa: BLE001 - that nothing escapes is what is tested
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+
+    def output(self, file: Any = None) -> str:
+        """What it wrote to stdout, or to another file."""
+        file = file or self.said
+        file.seek(0)
+        return str(file.read().decode(errors="replace"))
+
+    def send(self, number: int, group: bool = False) -> None:
+        """Send a signal to the process, or to its whole group as a terminal does."""
+        with suppress(ProcessLookupError):
+            (os.killpg if group else os.kill)(self.process, number)
+
+    def running(self) -> bool:
+        """Whether it has not ended yet, nor been waited for."""
+        return os.waitid(os.P_PID, self.process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+
+    def wait(self, seconds: float = SECONDS) -> Ended:
+        """Wait until it ends; whoever hangs, or leaves processes behind, is killed and bad."""
+        hangs = False
+        while not hangs and self.running():
+            time.sleep(0.002)
+            hangs = time.monotonic() - self.began > WAIT or worked(self.process) > seconds
+        if hangs:
+            self.send(signal.SIGKILL, group=True)
+        _, status, usage = os.wait4(self.process, 0)
+        took = time.monotonic() - self.began
+        if hangs:
+            raise Bad(f"hung: {' '.join(self.arguments)}")
+        until = time.monotonic() + PATIENCE
+        while orphans := group_of(self.process):
+            if time.monotonic() > until:
+                os.killpg(self.process, signal.SIGKILL)
+                raise Bad(f"left processes behind: {orphans}")
+            time.sleep(0.01)
+        words = self.output(self.log) + (self.output() if self.arguments[0] == "verify" else "")
+        return Ended(
+            self.arguments[0], os.waitstatus_to_exitcode(status), words, took, usage.ru_maxrss * 1024 - BASELINE
+        )
+
+
+BASELINE = 0
+
+
+def worked(process: int) -> float:
+    """Seconds of a core that a process has had."""
+    ticks = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+
+
+def group_of(leader: int) -> list[int]:
+    """The processes of a group that are alive."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _parent, group = path.read_text().rpartition(")")[2].split()[:3]
+            if int(group) == leader and state != "Z":
+                found.append(int(path.parent.name))
+    return found
+
+
+def run(*arguments: object, pace: str = "1e9") -> Ended:
+    """A command from its beginning to its end, with a checkpoint every ``pace`` seconds."""
+    return Command(*arguments, environment={PACE: pace}).wait()
+
+
+class Box:
+    """Where cases run: ``run`` is whole, ``whole`` has undisturbed outputs, ``case`` is each case's own."""
+
+    def __init__(self, root: Path):
+        self.root, self.run, self.whole, self.case = root, root / "run", root / "whole", root / "case"
+        self.outside = root / "outside"
+        self.seconds: dict[str, float] = {}
+        shutil.rmtree(self.whole, ignore_errors=True)
+        for folder in (self.run, self.whole, self.outside):
+            folder.mkdir(parents=True, exist_ok=True)
+        (self.outside / "secret").write_text("secret")
+        os.chdir(self.outside)
+        self.look = self._look()
+
+    def ready(self, *names: str, evaluated: bool = False) -> Path:
+        """The run, with the outputs of stages, and its evaluation and report."""
+        for name in needed(names):
+            unbroken(STAGES[name], self.run)
+        for command in (("evaluate", self.run), ("report", self.run)) if evaluated else ():
+            if not run(*command, "-q", "--resume").accepted():
+                raise RuntimeError("the run cannot be evaluated")
+        self.look = self._look()
+        return self.run
+
+    def _look(self) -> dict[str, tuple[int, int]]:
+        ours = (path for part in (self.run, self.outside) for path in part.rglob("*"))
+        return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in ours}
+
+    def fresh(self) -> Path:
+        """An empty folder for a case."""
+        shutil.rmtree(self.case, ignore_errors=True)
+        self.case.mkdir()
+        return self.case
+
+    def check_outside(self) -> None:
+        """Nothing that is not a case's own may have changed."""
+        if self._look() != self.look:
+            changed = {*self._look().items()} ^ {*self.look.items()}
+            self.look = self._look()
+            raise Bad(f"wrote outside its output: {sorted(changed)[:3]}")
+
+    def command(self, stage: Stage, folder: Path) -> tuple[list[str], Path]:
+        """A stage's command and output, in ``folder`` beside the run: relative paths in manifests are the same."""
+        run = self.ready(*(TRAINED if stage in (EVALUATION, REPORT) else stage.needs), evaluated=stage is REPORT)
+        if stage is REPORT:
+            if not (folder / "evaluation").exists():
+                shutil.copytree(run / "evaluation", folder / "evaluation")
+            return ["report", str(folder), "-q"], folder / "report"
+        out = folder / f"{stage.name}{stage.suffix}"
+        words = [word.replace("{run}", str(run)) for word in stage.command]
+        inputs = {name: str(run / f"{name}{STAGES[name].suffix}") for name in stage.needs}
+        return [*(word.format(**inputs) for word in words), "--out", str(out), "-q"], out
+
+    def undisturbed(self, stage: Stage) -> tuple[Path, float]:
+        """The output of a stage that nothing befell, and the seconds it took."""
+        words, out = self.command(stage, self.whole)
+        if stage.name not in self.seconds:
+            ended = run(*words)
+            if not ended.accepted():
+                raise RuntimeError(ended.words)
+            self.seconds[stage.name] = ended.seconds
+        return out, self.seconds[stage.name]
+
+
+def pick(case: int) -> Stage:
+    """The stages in turn."""
+    stages = [*(STAGES[name] for name in TRAINED), EVALUATION, REPORT]
+    return stages[case % len(stages)]
+
+
+def check_whole(out: Path) -> None:
+    """An output that is there is whole."""
+    if out.exists() and not run("verify", out).accepted():
+        raise Bad(f"half an output: {out.name}")
+
+
+def check_resumed(box: Box, stage: Stage, words: list[str], out: Path) -> None:
+    """A stage gone on with to its end gives the bytes of one that nothing befell."""
+    check_whole(out)
+    ended = run(*words, "--resume")
+    if not ended.accepted():
+        raise Bad(f"cannot be gone on with: {ended.words}")
+    differ = differences(box.undisturbed(stage)[0], out)
+    left = [path.name for path in out.parent.iterdir() if path.name.startswith(".")]
+    if differ or left:
+        raise Bad(f"{stage.name}: {differ} differ, {left} are left")
+
+
+@contextmanager
+def disk_of(folder: Path) -> Iterator[Callable[[int | None], None]]:
+    """A disk at ``folder``; yields what leaves so many bytes free of it, or as many as one likes."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "tmpfs", str(folder), "-o"]
+    subprocess.run([*mount, "size=8g"], check=True)
+
+    def leave(free: int | None) -> None:
+        used = shutil.disk_usage(folder).used
+        size = "8g" if free is None else str(max(4096, used + free))
+        subprocess.run([*mount[:1], *mount[-1:], f"remount,size={size}", str(folder)], check=True)
+
+    try:
+        yield leave
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+        folder.rmdir()
+
+
+def disk(box: Box, rng: Rng, case: int) -> bool:
+    """A disk that fills while a stage runs; room is made, and the stage gone on with."""
+    stage = pick(case)
+    _whole, seconds = box.undisturbed(stage)
+    folder = box.root / f"disk{case}"
+    with disk_of(folder) as leave:
+        words, out = box.command(stage, folder)
+        command = Command(*words, environment={PACE: rng.choice(PACES)})
+        moment = time.monotonic() + rng.uniform(0, seconds)
+        while command.running() and time.monotonic() < moment:
+            time.sleep(0.001)
+        leave(rng.choice((0, 0, 0, 4096, 20_480, 102_400, 409_600, 1_048_576)))
+        accepted = command.wait().accepted()
+        leave(None)
+        check_resumed(box, stage, words, out)
+    return accepted
+
+
+ATTACKS = {
+    "TERM": (signal.SIGTERM,),
+    "INT INT": (signal.SIGINT, 0.0, signal.SIGINT),
+    "INT 1ms INT": (signal.SIGINT, 0.001, signal.SIGINT),
+    "INT 30ms INT": (signal.SIGINT, 0.03, signal.SIGINT),
+    "INT 200ms INT": (signal.SIGINT, 0.2, signal.SIGINT),
+    "TSTP CONT": (signal.SIGTSTP, 0.3, signal.SIGCONT),
+    "HUP": (signal.SIGHUP,),
+    "PIPE": (signal.SIGPIPE,),
+    "QUIT": (signal.SIGQUIT,),
+    "TERM INT": (signal.SIGTERM, 0.01, signal.SIGINT),
+}
+DEADLY = [-number for number in (signal.SIGHUP, signal.SIGQUIT, signal.SIGINT, signal.SIGTERM)]  # as they should
+
+
+def signals(box: Box, rng: Rng, case: int) -> bool:
+    """Signals at random moments, to a stage or to all its processes; a few of them, then it is gone on with."""
+    stage, folder = pick(case), box.fresh()
+    _whole, seconds = box.undisturbed(stage)
+    words, out = box.command(stage, folder)
+    for _ in range(rng.choice((1, 2, 3))):
+        name, anew, group = rng.choice([*ATTACKS]), rng.random() < 0.3, rng.random() < 0.5
+        command = Command(*words, "--resume", anew=anew, environment={PACE: rng.choice(PACES)})
+        moment = time.monotonic() + rng.uniform(0, seconds + 2.5 * anew)
+        while command.running() and time.monotonic() < moment:
+            time.sleep(0.001)
+        for what in ATTACKS[name]:
+            if isinstance(what, float):
+                time.sleep(what)
+            else:
+                command.send(what, group)
+        ended = command.wait()
+        try:
+            if ended.code > 0 or ended.words:
+                ended.accepted(128 + signal.SIGINT, 128 + signal.SIGTERM, *DEADLY)
+            check_whole(out)
+        except Bad as bad:
+            raise Bad(f"{stage.name}, {name}{' to all' * group}{', begun anew' * anew}: {bad}") from None
+    check_resumed(box, stage, words, out)
+    return True
+
+
+def clock(box: Box, rng: Rng, case: int) -> bool:
+    """The clock set back and forward while a stage, each fifth time a sweep, runs."""
+    folder, turned = box.fresh(), box.case / "clock"
+    turned.write_text("+0")
+    faked = {"LD_PRELOAD": str(FAKETIME), "FAKETIME_TIMESTAMP_FILE": str(turned), "FAKETIME_NO_CACHE": "1"}
+    faked |= {"FAKETIME_DONT_FAKE_MONOTONIC": "1", PACE: "0.05"}
+    sweeps = case % 5 == 4
+    if sweeps:
+        toy, out, whole = folder / "toy.toml", folder / "sweep", box.whole / "sweep"
+        toy.write_text(TOY)
+        words = ["sweep", str(toy), "--out", str(out), "-q"]
+        if not whole.exists() and not Command("sweep", toy, "--out", whole, "-q", anew=True).wait().accepted():
+            raise RuntimeError("the sweep does not end")
+        seconds = 20.0
+    else:
+        stage = pick(rng.randrange(9))
+        whole, seconds = box.undisturbed(stage)
+        words, out = box.command(stage, folder)
+    command, saved = Command(*words[: None if sweeps else -1], anew=True, environment=faked), set()
+    said = ""
+    after = time.monotonic() + rng.uniform(1, seconds)
+    while command.running():
+        time.sleep(0.01)
+        if time.monotonic() > after:
+            turned.write_text(rng.choice(("+3650d", "-3650d", "+1h", "-1h", "-2s", "-20000d", "+0")))
+            after = time.monotonic() + rng.uniform(0.2, seconds)
+            if sweeps and (out / "sweep.json").exists():
+                status = Command("sweep", "--out", out, "--status", anew=True, environment=faked)
+                status.wait().accepted()
+                said += status.output()
+        for path in draft_folder(out).glob(f"{FOLDER}/*.safetensors"):
+            with suppress(OSError):
+                saved.add(path.stat().st_mtime_ns)
+    ended = command.wait()
+    if (
+        ended.code
+        or "Traceback" in ended.words
+        or "-" in "".join(line.partition("(")[2] for line in ended.words.splitlines() if " left)" in line)
+        or "about -" in said
+    ):
+        raise Bad(f"ended with {ended.code}: {ended.words} {said}")
+    if sweeps:
+        if (out / "results.csv").read_bytes() != (whole / "results.csv").read_bytes():
+            raise Bad("the sweep's results differ")
+        return True
+    if stage.name in ("options", "meta", "ppo", "dqn") and len(saved) < 3:
+        raise Bad(f"{len(saved)} checkpoints of {stage.name}")
+    if differ := differences(whole, out):
+        raise Bad(f"{stage.name}: {differ} differ")
+    return True
+
+
+def entries(folder: Path) -> set[str]:
+    """Everything that is in a folder."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+def read(made: hostile.Made, box: Box) -> bool:
+    """Have every command that reads a hostile file read it; whether none refused."""
+    accepted, before = True, entries(box.case)
+    for words in made.commands:
+        ended = run(*words)
+        if new := sorted(name for name in entries(box.case) ^ before if not name.startswith(made.outputs)):
+            raise Bad(f"{made.name}, {words[0]}: wrote elsewhere: {new[:3]}")
+        with suppress(OSError):
+            for part in sorted({Path(word) for word in map(str, words) if str(word).startswith(str(box.case))}):
+                if part.name.startswith("made") and part.suffix != ".npz" and words[0] != "verify":
+                    check_whole(part)
+        try:
+            accepted &= ended.accepted()
+            if made.size < SMALL and ended.memory > MEMORY:
+                raise Bad(f"took {ended.memory / 1e9:.1f} GB")
+        except Bad as bad:
+            raise Bad(f"{made.name}, {words[0]}: {bad}") from None
+    return accepted
+
+
+def files(make: Callable[[Box, Rng, int], hostile.Made]) -> Callable[[Box, Rng, int], bool]:
+    """A family of hostile files."""
+
+    def family(box: Box, rng: Rng, case: int) -> bool:
+        box.fresh()
+        return read(make(box, rng, case), box)
+
+    return family
+
+
+FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
+    "disk": disk,
+    "signals": signals,
+    "clock": clock,
+    "boards": files(hostile.boards),
+    "minari": files(hostile.minari),
+    "images": files(hostile.images),
+    "arrays": files(hostile.arrays),
+    "hdf5": files(hostile.data_files),
+    "hdf5 in artefacts": files(hostile.stored_arrays),
+    "json": files(hostile.texts),
+    "toml": files(hostile.tables),
+}
+
+
+RUN_FREE = ("boards", "minari", "images", "arrays", "toml")  # families that need no run
+
+
+def attack(box: Box, name: str, cases: range, seed: int) -> dict[str, Any]:
+    """The cases of a family, one after the other."""
+    counts: Counter[str] = Counter()
+    failures, slowest = [], 0.0
+    for case in cases:
+        began = time.monotonic()
+        try:
+            counts["accepted" if FAMILIES[name](box, random.Random(f"{seed} {name} {case}"), case) else "refused"] += 1
+            box.check_outside()
+        except Bad as bad:
+            counts["bad"] += 1
+            failures.append(f"{name} case {case}: {bad}")
+            print(failures[-1], file=sys.stderr, flush=True)
+        slowest = max(slowest, time.monotonic() - began)
+    outcomes = {kind: counts[kind] for kind in ("refused", "accepted", "bad")}
+    return {"family": name, "cases": len(cases), **outcomes, "slowest": round(slowest, 1), "failures": failures}
+
+
+def measure() -> None:
+    """How much memory a command has that does nothing: what it shares with this process is not what it takes."""
+    global BASELINE
+    BASELINE = run("--version").memory
+
+
+def prepare() -> None:
+    """Load what commands load, so that those forked from this process need not."""
+    import torch
+
+    import hypogoal.stages.evaluate
+    import hypogoal.stages.report
+    import hypogoal.stages.train_baseline
+    import hypogoal.stages.train_meta  # noqa: F401
+
+    torch.set_num_threads(1)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    measure()
+
+
+def main() -> int:
+    """Run the attacks; exit code 1 when a case was bad."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--family", action="append", choices=FAMILIES)
+    parser.add_argument("--cases", type=int, default=20, help="of each family")
+    parser.add_argument("--case", type=int, help="this one alone")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="write the rows here too")
+    parser.add_argument("--folder", type=Path, help="where to work; a temporary one where not given")
+    given = parser.parse_args()
+    prepare()
+    folder = (given.folder or Path(tempfile.mkdtemp(prefix="attacks-"))).resolve()
+    box, rows = Box(folder), []
+    print("| family | cases | refused in one line | accepted | bad | slowest |\n" + "|---" * 6 + "|")
+    for name in given.family or FAMILIES:
+        if (name == "disk" and os.geteuid()) or (name == "clock" and FAKETIME is None):
+            continue
+        cases = range(given.cases) if given.case is None else range(given.case, given.case + 1)
+        rows.append(attack(box, name, cases, given.seed))
+        print(f"| {' | '.join(str(value) for key, value in rows[-1].items() if key != 'failures')} s |", flush=True)
+    if given.json:
+        given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    bad = sum(row["bad"] for row in rows)
+    if given.folder is None and not bad:
+        shutil.rmtree(folder)
+    return bad > 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
