@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_input, open_artefact
@@ -40,16 +41,10 @@ def _faults_of_part(path: Path) -> list[str]:
 
 def _data_faults(path: Path) -> Iterator[str]:
     dataset = open_dataset(path)
-    yield from (f"{part} was cut off, the rest was saved" for part in dataset.lost)
-    readers: list[tuple[str, Callable[[], object]]] = [
-        (f"{split}/{sub_goal}", lambda split=split, sub_goal=sub_goal: getattr(dataset, split)(sub_goal))  # type: ignore[misc]
-        for split in SPLITS
-        for sub_goal in dataset.sub_goals
-    ]
-    readers += [("unlabelled", dataset.unlabelled), ("unlabelled", dataset.unlabelled_origins)]
-    for part, read in readers:
-        if not {part, part.partition("/")[0]} & {*dataset.lost}:
-            yield from _fault(read)
+    readers: list[Callable[[], object]] = [dataset.unlabelled, dataset.unlabelled_origins]
+    readers += [partial(getattr(dataset, split), goal) for split in SPLITS for goal in dataset.sub_goals]
+    for read in readers:
+        yield from _fault(read)
 
 
 def _artefact_faults(artefact: Artefact) -> Iterator[str]:
