@@ -44,11 +44,11 @@ def verify(
     path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")],
     as_json: AsJson = False,
 ) -> None:
-    """Check schema, hashes, numbers and inputs; exit code 2 when something is wrong."""
-    from hypogoal.verification import faults_of
+    """Check schema, hashes, numbers and the inputs within PATH; exit code 2 when something is wrong."""
+    from hypogoal.verification import faults_of, notes_of
 
-    faults = faults_of(path)
-    echo({"path": str(path), "faults": faults}, as_json, faults or [f"{path}: whole"])
+    faults, notes = faults_of(path), notes_of(path)
+    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [f"{path}: whole"]), *notes])
     if faults:
         raise typer.Exit(2)
 
