@@ -719,7 +719,6 @@ def data_files(box: Any, rng: Rng, case: int) -> Made:
     commands: list[list[object]] = [
         ["verify", path],
         ["show", path],
-        ["verify", copy, "--repair"],
         ["train-ensemble", path, "--out", box.case / "made", *few],
         ["export", path, "--out", box.case / "made.npz"],
     ]

@@ -39,9 +39,9 @@ from hypogoal.core.kinds import DATA
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 ATTRIBUTES = (
-    "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete", "lost",
+    "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete",
 )  # fmt: skip
-AGAIN, REPAIR = "Collect it again.", "hypogoal verify --repair"
+AGAIN = "Collect it again."
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
 
@@ -170,7 +170,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
             group["observations"] = first["observations"]
             if "origin" in first:
                 group["origin"] = first["origin"]
-        write_column(group, "labels", labels[:, index])
+        _write_column(group, "labels", labels[:, index])
 
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
@@ -182,7 +182,7 @@ def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
     group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
 
 
-def write_column(group: Any, name: str, values: NDArray[Any]) -> None:
+def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
     """One value for each state, with checksums: unlike compressed states, a label that was flipped is still a label."""
     if not len(values):
         group.create_dataset(name, data=values)  # no chunk is as small as that
@@ -193,15 +193,11 @@ def write_column(group: Any, name: str, values: NDArray[Any]) -> None:
 
 def _write_origins(group: Any, origins: Mapping[str, NDArray[np.int64]]) -> None:
     for name, values in origins.items():
-        write_column(group, f"origin/{name}", values)
+        _write_column(group, f"origin/{name}", values)
 
 
 class Dataset:
-    """A complete data file, opened for reading. Use :func:`open_dataset`.
-
-    Attributes:
-        lost: parts (``heldout``, ``labelled/<sub-goal>``) that ``verify --repair`` found cut off; reading them fails.
-    """
+    """A complete data file, opened for reading. Use :func:`open_dataset`."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -214,13 +210,14 @@ class Dataset:
                 raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
             if version < DATA_FORMAT:
                 raise UserError(f"format {version} is that of an earlier hypogoal", path, AGAIN)
+            if attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal saved what was whole of a cut file
+                raise UserError("a part of the data file was cut off", path, AGAIN)
             self.attributes = {name: attribute(file, name) for name in ATTRIBUTES}
         if not self.attributes["complete"]:
-            raise UserError("the data file is not complete", path, f"{AGAIN} Or save what is whole: {REPAIR} {path}")
+            raise UserError("the data file is not complete", path, AGAIN)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
         self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
         self.config: dict[str, Any] = self._json("config", dict)
-        self.lost: tuple[str, ...] = tuple(map(str, self._json("lost", list))) if self.attributes["lost"] else ()
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
         names = plain_names(self.sub_goals)
@@ -246,15 +243,13 @@ class Dataset:
             return self._origins(file, "unlabelled", len(self._found(file, "unlabelled/observations")))
 
     def counts(self) -> dict[str, Any]:
-        """Numbers of states and positives, without reading the observations; of what was lost, none."""
+        """Numbers of states and positives, without reading the observations."""
         with self._file() as file:
-            lost = "unlabelled" in self.lost
-            rows: dict[str, Any] = {"unlabelled": 0 if lost else len(self._found(file, "unlabelled/observations"))}
+            rows: dict[str, Any] = {"unlabelled": len(self._found(file, "unlabelled/observations"))}
             for split in SPLITS:
                 rows[split] = {}
                 for goal in self.sub_goals:
-                    gone = {split, f"{split}/{goal}"} & {*self.lost}
-                    labels = np.zeros(0, np.bool_) if gone else self._labels(file, f"{split}/{goal}")
+                    labels = self._labels(file, f"{split}/{goal}")
                     rows[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
         return rows
 
@@ -318,7 +313,7 @@ class Dataset:
     @contextlib.contextmanager
     def _file(self) -> Iterator[Any]:
         """The file, opened; what it should not hold becomes one line."""
-        with open_hdf5(self.path, "the data file", f"{AGAIN} Or save what is whole: {REPAIR} {self.path}") as file:
+        with open_hdf5(self.path, "the data file", AGAIN) as file:
             try:
                 yield file
             except Foreign as error:

@@ -35,7 +35,6 @@ def _describe_part(path: Path) -> dict[str, Any]:
             **about,
             "config": dataset.config,
             "counts": dataset.counts(),
-            "lost": list(dataset.lost) or None,
         }
     artefact = open_artefact(path)
     keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")

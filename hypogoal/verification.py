@@ -1,18 +1,22 @@
 """Is it whole: the answers of ``hypogoal verify`` (Spec A8, G2).
 
-Everything is read: schema, sizes, sha256, numbers, and whether the inputs recorded are still what they were.
+Everything is read: schema, sizes, sha256, numbers, and whether the inputs recorded are still what they were. Nothing
+outside the folder that was asked for is looked at.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_input, open_artefact
+from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_text
 from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+from hypogoal.core.manifests import UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.inspection import parts_of
@@ -23,16 +27,37 @@ AGAIN = "Make the artefact again."
 def faults_of(path: Path) -> list[str]:
     """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
     try:
-        run = path.is_dir() and not (path / MANIFEST).is_file()
-        return [fault for part in (parts_of(path) if run else [path]) for fault in _faults_of_part(part)]
+        return [fault for part in _parts(path) for fault in _faults_of_part(part, path)]
     except UserError as error:
         return [str(error)]
 
 
-def _faults_of_part(path: Path) -> list[str]:
+def notes_of(path: Path) -> list[str]:
+    """One line for each thing in it that is no fault, and that only whoever asks can judge."""
+    with contextlib.suppress(UserError):
+        return [note for part in _parts(path) if part.is_dir() for note in _notes_of_part(part, path)]
+    return []
+
+
+def _parts(path: Path) -> list[Path]:
+    return parts_of(path) if path.is_dir() and not (path / MANIFEST).is_file() else [path]
+
+
+def _notes_of_part(path: Path, folder: Path) -> Iterator[str]:
+    with contextlib.suppress(UserError):
+        artefact = open_artefact(path)
+        if artefact.manifest["format"] == UNSEALED:
+            yield f"{path}: written by an earlier hypogoal, its manifest has no checksum"
+        yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
+        for entry in artefact.manifest["inputs"]:
+            if not _lies_in(folder, artefact, entry):
+                yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not looked at"
+
+
+def _faults_of_part(path: Path, folder: Path) -> list[str]:
     """Those of one data file or artefact; a manifest that is a folder or a device is a fault of its own."""
     try:
-        faults = _artefact_faults(open_artefact(path)) if path.is_dir() else _data_faults(path)
+        faults = _artefact_faults(open_artefact(path), folder) if path.is_dir() else _data_faults(path)
         return [f"{path}: {fault}" for fault in faults]
     except UserError as error:
         return [str(error)]
@@ -40,31 +65,33 @@ def _faults_of_part(path: Path) -> list[str]:
 
 def _data_faults(path: Path) -> Iterator[str]:
     dataset = open_dataset(path)
-    yield from (f"{part} was cut off, the rest was saved" for part in dataset.lost)
-    readers: list[tuple[str, Callable[[], object]]] = [
-        (f"{split}/{sub_goal}", lambda split=split, sub_goal=sub_goal: getattr(dataset, split)(sub_goal))  # type: ignore[misc]
-        for split in SPLITS
-        for sub_goal in dataset.sub_goals
-    ]
-    readers += [("unlabelled", dataset.unlabelled), ("unlabelled", dataset.unlabelled_origins)]
-    for part, read in readers:
-        if not {part, part.partition("/")[0]} & {*dataset.lost}:
-            yield from _fault(read)
+    readers: list[Callable[[], object]] = [dataset.unlabelled, dataset.unlabelled_origins]
+    readers += [partial(getattr(dataset, split), goal) for split in SPLITS for goal in dataset.sub_goals]
+    for read in readers:
+        yield from _fault(read)
 
 
-def _artefact_faults(artefact: Artefact) -> Iterator[str]:
-    for name, digest in artefact.manifest["files"].items():
-        fault = file_fault(artefact.path, name, digest)
-        if fault:
-            yield f"{name}: {fault}"
-        elif (check := CONTENTS.get(Path(name).suffix)) is not None:
-            yield from _fault(lambda name=name, check=check: check(artefact.path / name))  # type: ignore[misc]
+def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
+    faults = file_faults(artefact)
+    yield from (f"{name}: {fault}" for name, fault in faults.items())
+    for name in artefact.manifest["files"]:
+        if name not in faults and (check := CONTENTS.get(Path(name).suffix)) is not None:
+            yield from _fault(partial(check, artefact.path / name))
     if artefact.kind == "ensemble":
-        yield from (fault for sub_goal in artefact.config["sub_goals"] for fault in _member_faults(artefact, sub_goal))
+        whole = [name for name in artefact.config["sub_goals"] if f"{name}.safetensors" not in faults]
+        yield from (fault for sub_goal in whole for fault in _member_faults(artefact, sub_goal))
     for entry in artefact.manifest["inputs"]:
-        path, fault = find_input(artefact.path, entry)
-        if path is None:
+        fault = find_input(artefact.path, entry, beside=True)[1] if _lies_in(folder, artefact, entry) else ""
+        if fault:
             yield f"its input {entry['path']} ({entry['kind']}) is {fault}"
+
+
+def _lies_in(folder: Path, artefact: Artefact, entry: dict[str, str]) -> bool:
+    """Whether the place beside the artefact that an input is to have lies in the folder, links followed."""
+    try:
+        return (artefact.path / entry["relative"]).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # links that lead in a circle
+        return False
 
 
 def _member_faults(artefact: Artefact, sub_goal: str) -> Iterator[str]:

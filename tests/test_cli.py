@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from toy_data import reseal
 
 import hypogoal
 from hypogoal.cli import main
@@ -209,8 +210,7 @@ def test_mistakes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     truncated.write_bytes((made / "data.h5").read_bytes()[:5000])
     newer = tmp_path / "newer"
     shutil.copytree(made / "ensemble", newer)
-    manifest = json.loads((newer / "manifest.json").read_text())
-    (newer / "manifest.json").write_text(json.dumps(manifest | {"format": 2}))
+    reseal(newer, format=3)
     cases = [
         (["train-ensemble", str(tmp_path / "none.h5"), "--out", out], "no such data file"),
         (["train-ensemble", ensemble, "--out", out], "a folder where a data file is needed"),

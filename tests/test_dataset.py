@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import set_attribute
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
@@ -49,6 +50,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
         ("format", "x", "not a hypogoal data file"),
         ("format", 1, "earlier"),
         ("complete", False, "not complete"),
+        ("lost", '["unlabelled"]', r"a part of the data file was cut off: .*data\.h5\. Collect it again"),
         ("domain", None, "not a hypogoal data file"),
         ("sub_goals", "{", "not a hypogoal data file"),
         ("observation_shape", '"x"', "not a hypogoal data file"),
@@ -59,7 +61,7 @@ def test_foreign_and_damaged_attributes(tmp_path: Path, attribute: str, value: A
     """Spec G2: one clear line."""
     path = write(tmp_path / "data.h5")
     with h5py.File(path, "a") as file:
-        del file.attrs[attribute]
+        file.attrs.pop(attribute, None)
         if value is not None:
             set_attribute(file, attribute, value)
     with pytest.raises(UserError, match=words) as caught:
@@ -77,6 +79,29 @@ def test_missing_parts_and_other_files(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("hello")
     with pytest.raises(UserError, match="truncated or not HDF5"):
         open_dataset(tmp_path / "text.h5")
+
+
+def test_a_file_that_was_cut_off_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: wherever it ends, one line says to collect it again."""
+    path = write(tmp_path / "data.h5")
+    data = path.read_bytes()
+    for length in np.random.default_rng(0).integers(0, len(data), size=40):
+        path.write_bytes(data[:length])
+        assert main(["verify", str(path)]) == 2
+        said = capsys.readouterr()
+        assert said.err == "" and said.out.endswith(f"is truncated or not HDF5: {path}. Collect it again.\n")
+
+
+def test_a_file_that_is_open_elsewhere_is_not_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: nothing is known to be wrong with it, so nobody is told to collect it again."""
+    fcntl = pytest.importorskip("fcntl")
+    path = write(tmp_path / "data.h5")
+    with path.open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)  # as HDF5 does for who writes
+        assert main(["show", str(path)]) == 2
+        line = capsys.readouterr().err
+        assert "is open in another program" in line and "Collect" not in line
+    assert main(["verify", str(path)]) == 0
 
 
 @pytest.mark.parametrize("name", ["labelled/two/labels", "labelled/one/origin/layout_seed", "heldout/one/observations"])

@@ -1,9 +1,15 @@
-"""A small data file in the real format."""
+"""A small data file in the real format, and manifests that somebody edited."""
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hypogoal.core.hdf5 import create_hdf5
+from hypogoal.core.kinds import files_of
+from hypogoal.core.manifests import MANIFEST, sealed
 from hypogoal.dataset import Collected, States, write_dataset
 
 SHAPE = (4, 5, 3)
@@ -20,3 +26,19 @@ def write(path: Path, states: int = 7, domain: str = "toy") -> Path:
     collected = Collected(SHAPE, ("one", "two"), some(states), some(states), some(states))
     write_dataset(path, collected, domain=domain, config={"a": 1}, seed=3)
     return path
+
+
+def fill(artefact: Path, kind: str, config: Mapping[str, Any]) -> None:
+    """Empty files in place of those that an artefact of a kind must have and a test does not read."""
+    for name in files_of(kind, config) or ():
+        if name.endswith(".h5") and not (artefact / name).exists():
+            with create_hdf5(artefact / name):
+                continue
+        (artefact / name).touch()
+
+
+def reseal(artefact: Path, **changes: Any) -> dict[str, Any]:
+    """Change keys of an artefact's manifest, and its checksum with them; returns the manifest."""
+    manifest = json.loads((artefact / MANIFEST).read_bytes()) | changes
+    (artefact / MANIFEST).write_bytes(sealed(manifest))
+    return manifest

@@ -43,22 +43,12 @@ def show(
 def verify(
     path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")],
     as_json: AsJson = False,
-    repair: Annotated[
-        bool, typer.Option("--repair", help="Of a data file that was cut off: keep its whole groups.")
-    ] = False,
 ) -> None:
-    """Check schema, hashes, numbers and inputs; exit code 2 when something is wrong."""
-    from hypogoal.verification import faults_of
+    """Check schema, hashes, numbers and the inputs within PATH; exit code 2 when something is wrong."""
+    from hypogoal.verification import faults_of, notes_of
 
-    about: dict[str, object] = {"path": str(path)}
-    if repair:
-        from hypogoal.repair import repair as save
-
-        saved = save(path)
-        about |= {"kept": saved.kept, "lost": saved.lost, "original": str(saved.original)}
-        typer.echo(f"saved {', '.join(saved.kept)}; the file as it was is {saved.original}", err=True)
-    faults = faults_of(path)
-    echo({**about, "faults": faults}, as_json, faults or [f"{path}: whole"])
+    faults, notes = faults_of(path), notes_of(path)
+    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [f"{path}: whole"]), *notes])
     if faults:
         raise typer.Exit(2)
 

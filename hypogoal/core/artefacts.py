@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import platform
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +18,7 @@ from typing import Any
 
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import (
+    PARTIAL,
     check_complete,
     check_free,
     check_replaceable,
@@ -28,9 +28,9 @@ from hypogoal.core.drafts import (
     unfinished,
 )
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MAX_NAME_BYTES, inside
-from hypogoal.core.kinds import check_kind
-from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, check_writable, read_manifest
+from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file
+from hypogoal.core.kinds import check_kind, files_of
+from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, check_writable, read_manifest, sealed
 
 PACKAGES = (
     "hypogoal",
@@ -109,8 +109,12 @@ class Settings(dict[str, Any]):
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a file, as hexadecimal digits."""
-    with path.open("rb") as file:
+    """The sha256 of a file, as hexadecimal digits.
+
+    Raises:
+        UserError: it is no regular file, or cannot be opened.
+    """
+    with open_file(path, "the file is", AGAIN) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -221,7 +225,7 @@ def create_artefact(
             if file.is_file()
         }
         manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
-        (work.files / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        (work.files / MANIFEST).write_bytes(sealed(manifest))
         put_in_place(work.files, out)
 
 
@@ -278,8 +282,29 @@ def find_artefacts(run: Path, kind: str, depth: int = 3) -> list[Artefact]:
 
 def check_files(artefact: Artefact) -> list[str]:
     """One line for each file of the artefact that is missing or changed; none when it is whole."""
-    faults = ((name, file_fault(artefact.path, name, digest)) for name, digest in artefact.manifest["files"].items())
-    return [f"{name}: {fault}" for name, fault in faults if fault]
+    return [f"{name}: {fault}" for name, fault in file_faults(artefact).items()]
+
+
+def file_faults(artefact: Artefact) -> dict[str, str]:
+    """What is wrong with an artefact's files, by name: its manifest says which it has, its kind which it must have."""
+    listed, wanted = artefact.manifest["files"], files_of(artefact.kind, artefact.manifest["config"])
+    if wanted is None:
+        return {MANIFEST: f"of a kind that this hypogoal does not know ({artefact.kind!r})"}
+    faults = dict.fromkeys(sorted(wanted - listed.keys()), "missing, and not in the manifest")
+    faults |= {name: file_fault(artefact.path, name, digest) for name, digest in listed.items()}
+    return {name: fault for name, fault in faults.items() if fault}
+
+
+def extra_files(artefact: Artefact) -> list[str]:
+    """What lies in the artefact's folder and is none of its files; artefacts and drafts within are no part of it."""
+    known, found = {MANIFEST, *artefact.manifest["files"]}, []
+    for place, folders, names in os.walk(artefact.path):
+        folder = Path(place)
+        inner = [name for name in folders if not (folder / name / MANIFEST).exists() and not name.endswith(PARTIAL)]
+        folders[:] = sorted(name for name in inner if not (folder / name).is_symlink())
+        links = [name for name in inner if (folder / name).is_symlink()]
+        found += [(folder / name).relative_to(artefact.path).as_posix() for name in sorted([*names, *links])]
+    return [name for name in found if name not in known]
 
 
 def file_fault(folder: Path, name: str, digest: str) -> str:
@@ -292,20 +317,21 @@ def file_fault(folder: Path, name: str, digest: str) -> str:
     return "" if sha256_of(path) == digest else "changed since it was written"
 
 
-def find_input(folder: Path, entry: dict[str, str]) -> tuple[Path | None, str]:
+def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> tuple[Path | None, str]:
     """Where an input is that a manifest in ``folder`` records, or None and what is wrong.
 
+    It is looked for beside the artefact, and unless it is to be there (``beside``) where it was once.
     The path is a stranger's word: it is only ever read from, and nothing is looked at but what has the sha256 recorded.
     """
     fault = "gone"
-    for candidate in (folder / entry["relative"], Path(entry["path"])):
+    for candidate in (folder / entry["relative"], *(() if beside else (Path(entry["path"]),))):
         target = candidate / MANIFEST if entry["kind"] != "data" else candidate
         try:
             if not target.is_file():
                 continue
             if sha256_of(target) == entry["sha256"]:
                 return candidate.resolve(), ""
-        except OSError:
+        except (OSError, UserError):
             continue
         fault = "changed since"
     return None, fault

@@ -218,8 +218,8 @@ def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str
 
 
 def _that_matters(about: dict[str, Any]) -> dict[str, Any]:
-    """What results depend on: not on how many processes there are."""
-    config = about.get("config")
+    """What results depend on: not on how many processes there are, nor on how their manifest is written."""
+    about, config = {key: value for key, value in about.items() if key != "format"}, about.get("config")
     return about if not isinstance(config, dict) else {**about, "config": {**config, "workers": None}}
 
 

@@ -1,6 +1,7 @@
 """Files that others wrote: what they hold is data to check, never to trust (Spec G2).
 
-Sizes are looked at before anything is read, names before anything is opened. Devices, pipes and folders are no files.
+Sizes are looked at before anything is read, names before anything is opened. Devices, pipes and folders are no files:
+all that is not read by a library of its own is opened with :func:`open_file`, which never waits.
 """
 
 from __future__ import annotations
@@ -10,14 +11,17 @@ import io
 import json
 import os
 import re
+import stat
 import tomllib
 from collections.abc import Iterable, Sequence
+from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, TypeGuard
 
 from hypogoal.core.errors import UserError, printable
 
 MAX_TEXT_BYTES = 64 * 2**20
+END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
 MAX_JSON_DEPTH = 32
 MAX_NAME_BYTES = 200
 MOST_DOTS = 256  # in a line of TOML
@@ -46,8 +50,26 @@ def require_file(path: Path, what: str, do: str) -> int:
     raise UserError(f"{what} not a regular file" if there else f"{what} missing", path, do)
 
 
-def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file of at most ``limit`` bytes of UTF-8.
+def open_file(path: Path, what: str, do: str) -> BufferedReader:
+    """A regular file, or a link to one, opened for reading bytes; see :func:`require_file`.
+
+    What lies there may be exchanged for a pipe at any time: opening does not wait for its other end, and what was
+    opened is looked at once more.
+    """
+    require_file(path, what, do)
+    flags = [getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY", "O_NOINHERIT")]
+    try:
+        file = os.fdopen(os.open(path, os.O_RDONLY | sum(flags)), "rb")
+    except OSError as error:
+        raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise UserError(f"{what} not a regular file", path, do)
+    return file
+
+
+def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
+    """A file of at most ``limit`` bytes.
 
     Args:
         path: the file.
@@ -56,17 +78,42 @@ def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> st
         limit: bytes.
 
     Raises:
-        UserError: missing, no regular file, larger, not readable or not UTF-8.
+        UserError: missing, no regular file, larger or not readable.
     """
-    size = require_file(path, what, do)
-    if size > limit:
-        raise UserError(f"{what} too large ({size} bytes, at most {limit} are read)", path, do)
+    with open_file(path, what, do) as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            data = b"" if size > limit else file.read(limit + 1)  # it may have grown since
+        except OSError as error:
+            raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
+    if max(size, len(data)) > limit:
+        raise UserError(f"{what} too large ({max(size, len(data))} bytes, at most {limit} are read)", path, do)
+    return data
+
+
+def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
+    """The text of a file of at most ``limit`` bytes of UTF-8, its lines ended by a line feed; see :func:`read_bytes`.
+
+    Raises:
+        UserError: it is not UTF-8 either.
+    """
     try:
-        return path.read_text(encoding="utf-8")
+        text = read_bytes(path, what, do, limit).decode()
     except UnicodeDecodeError:
         raise UserError(f"{what} not text in UTF-8", path, do) from None
-    except OSError as error:
-        raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_end(path: Path, limit: int = END_BYTES) -> list[str]:
+    """The last lines of a log that may still be written, ``limit`` bytes at most; none where it cannot be read."""
+    try:
+        with open_file(path, "the log is", "") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - limit - 1))
+            cut, data = file.tell() > 0, file.read(limit + 1)
+    except (UserError, OSError):
+        return []
+    lines = data.decode(errors="replace").splitlines()
+    return lines[1:] if cut else lines
 
 
 def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> Any:

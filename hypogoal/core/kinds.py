@@ -1,16 +1,19 @@
-"""What stands at an output's place: ``--force`` replaces only what the stage itself makes there (Spec A6, G2).
+"""The kinds of outputs: which files each must have, and what ``--force`` replaces (Spec A6, A8, G2).
 
-A wrong ``--out`` is one slip of the hand; what it hits may be months of work, or nothing of ours.
+It is only what the stage itself makes there. A wrong ``--out`` is one slip of the hand; what it hits may be months of
+work, or nothing of ours.
 """
 
 from __future__ import annotations
 
 import contextlib
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json
+from hypogoal.core.files import open_file, read_json
 from hypogoal.core.hdf5 import Busy, open_hdf5
 from hypogoal.core.manifests import MANIFEST, MAX_MANIFEST_BYTES
 
@@ -18,6 +21,28 @@ DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and
 HDF5 = b"\x89HDF\r\n\x1a\n"
 FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
+
+
+LOG, EPISODES, LAYOUT, OPTIONS = "metrics.jsonl", "episodes.csv", "layout.json", "options.safetensors"
+
+
+def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
+    """The files that an artefact must have by its kind and settings, besides its manifest; None of an unknown kind.
+
+    What it may have and its settings do not say (figures, videos, ``executions.csv``) only its manifest knows.
+    """
+    if kind in ("options", "meta"):
+        played = {LOG, EPISODES, LAYOUT, OPTIONS, "choices.csv", "terminations.h5"}
+        played |= {"initiation.safetensors"} if config.get("initiation") == "learned" else set()
+        played |= {"visited.h5"} if config.get("save_visited") else set()
+        return played | ({"meta.safetensors"} if (kind, config.get("chooser")) == ("meta", "ppo") else set())
+    return {
+        "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
+        "baseline": {LOG, EPISODES, LAYOUT, "policy.safetensors"},
+        "evaluation": {"metrics.json", "arrays.h5"},
+        "report": {"index.html"},
+        "comparison": {"index.html", "metrics.json"},
+    }.get(kind)
 
 
 def check_kind(out: Path, kind: str) -> None:
@@ -54,7 +79,7 @@ def _is_data(path: Path) -> bool:
     Raises:
         Busy: another program writes it.
     """
-    with path.open("rb") as raw:
+    with open_file(path, "what stands there is", AWAY) as raw:
         begin = raw.read(FRONT)
     if not begin.startswith(HDF5):
         return False
@@ -69,7 +94,7 @@ def _is_data(path: Path) -> bool:
 
 def _is_arrays(path: Path) -> bool:
     try:
-        with zipfile.ZipFile(path) as file:
+        with open_file(path, "what stands there is", AWAY) as raw, zipfile.ZipFile(raw) as file:
             return "observations.npy" in file.namelist()
     except (OSError, zipfile.BadZipFile):
         return False

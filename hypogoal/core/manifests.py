@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, parse_json, plain_name, plain_names, read_json
+from hypogoal.core.files import MOST_INTEGER, parse_json, plain_name, plain_names, read_bytes
 
-FORMAT_VERSION = 1
+FORMAT_VERSION, UNSEALED = 2, 1  # the latter had no checksum
+CHECKSUM = "sha256"
 MANIFEST = "manifest.json"
 MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
@@ -20,9 +22,34 @@ def read_manifest(path: Path) -> dict[str, Any]:
     """The manifest in a file, every key that all artefacts have checked, and the settings that other stages read.
 
     Raises:
-        UserError: not JSON, of a newer format, or a key or setting is missing or malformed.
+        UserError: not JSON, of a newer format, changed since it was written, or a key or setting is missing or
+            malformed.
     """
-    return _checked(read_json(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES), path)
+    data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
+    manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
+    if not isinstance(manifest, dict):
+        raise UserError("the manifest is not a JSON object", path, AGAIN)
+    version = manifest.get("format")
+    if type(version) is int and version > FORMAT_VERSION:
+        do = "Upgrade hypogoal."
+        raise UserError(f"format {version} is newer than this hypogoal reads ({FORMAT_VERSION})", path, do)
+    if (version != UNSEALED or CHECKSUM in manifest) and data != sealed(manifest):
+        raise UserError("the manifest was changed since it was written, its checksum does not fit", path, AGAIN)
+    manifest.pop(CHECKSUM, None)
+    return _checked(manifest, path)
+
+
+def sealed(manifest: Mapping[str, Any]) -> bytes:
+    """What a manifest's file holds: one text for each content, its last key the checksum of the text without that key.
+
+    Against accidents, not against forgers: who writes another manifest can seal it, too.
+    """
+    bare = {key: value for key, value in manifest.items() if key != CHECKSUM}
+    return _text({**bare, CHECKSUM: hashlib.sha256(_text(bare)).hexdigest()})
+
+
+def _text(manifest: Mapping[str, Any]) -> bytes:
+    return (json.dumps(manifest, indent=1, allow_nan=False) + "\n").encode()
 
 
 def check_writable(manifest: dict[str, Any], out: Path) -> None:
@@ -38,15 +65,7 @@ def check_writable(manifest: dict[str, Any], out: Path) -> None:
         raise UserError(f"this could not be read again ({error.what})", out, do) from None
 
 
-def _checked(manifest: Any, path: Path) -> dict[str, Any]:
-    if not isinstance(manifest, dict):
-        raise UserError("the manifest is not a JSON object", path, AGAIN)
-    if type(manifest.get("format")) is int and manifest["format"] > FORMAT_VERSION:
-        raise UserError(
-            f"format {manifest['format']} is newer than this hypogoal reads ({FORMAT_VERSION})",
-            path,
-            "Upgrade hypogoal.",
-        )
+def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
     for key, fits in WANTED.items():
         if key not in manifest or not fits(manifest[key]):
             raise UserError(f"the manifest's {key!r} is missing or malformed", path, AGAIN)
@@ -56,7 +75,7 @@ def _checked(manifest: Any, path: Path) -> dict[str, Any]:
     return manifest
 
 
-def _text(value: Any) -> bool:
+def _is_text(value: Any) -> bool:
     return isinstance(value, str) and "\0" not in value and len(value) < 4096
 
 
@@ -69,11 +88,11 @@ def _list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 
 def _input(value: Any) -> bool:
-    return isinstance(value, dict) and all(_text(value.get(key)) for key in ("path", "relative", "kind", "sha256"))
+    return isinstance(value, dict) and all(_is_text(value.get(key)) for key in ("path", "relative", "kind", "sha256"))
 
 
 def _files(value: Any) -> bool:
-    return isinstance(value, dict) and all(_text(name) and _text(digest) for name, digest in value.items())
+    return isinstance(value, dict) and all(_is_text(name) and _is_text(digest) for name, digest in value.items())
 
 
 def _size(value: Any) -> bool:
@@ -98,6 +117,6 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), _count),
     **dict.fromkeys(
         ("domain", "network", "setting", "agent", "termination", "chooser", "start", "view", "localiser", "diversity"),
-        _text,
+        _is_text,
     ),
 }

@@ -10,7 +10,6 @@ from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
-from hypogoal.core.errors import UserError
 from hypogoal.core.kinds import DATA
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
@@ -51,9 +50,6 @@ def collect(
     about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
     if resume and out.exists() and not unfinished(out):
         found = open_dataset(out)
-        if found.lost:
-            do = "Give --force and no --resume to collect it again."
-            raise UserError(f"the data file has lost {', '.join(found.lost)}", out, do)
         before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
         raise check_complete(before, about, given)
     size = domain.collected_bytes(config)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import claim, create_artefact
+from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
@@ -106,7 +106,7 @@ def unlabelled_file(path: Path, dataset: Dataset) -> Path:
         UserError: there is none, or it is of another domain or shape than ``dataset``.
     """
     file = path / VISITED if path.is_dir() else path
-    if path.is_dir() and not file.is_file():
+    if path.is_dir() and VISITED not in open_artefact(path, ("options", "meta")).whole().manifest["files"]:
         raise UserError("no visited states", path, "Make it with --set save_visited=N.")
     found = open_dataset(file)
     for what, here, there in (

@@ -1,6 +1,5 @@
 """Artefacts: complete or absent, and refused when they are not what is needed (Spec A8, G2)."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -8,17 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from toy_data import reseal
 
 from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import create_hdf5
+from hypogoal.core.kinds import files_of
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import load_tensors, save_tensors
 
 
 def make(out: Path, kind: str = "meta", inputs: tuple[Path, ...] = (), force: bool = False) -> Path:
     with create_artefact(out, kind=kind, config={"steps": 3}, seed=7, inputs=inputs, force=force) as folder:
-        (folder / "episodes.csv").write_text("step\n1\n")
+        for name in files_of(kind, {}):
+            (folder / name).write_text("step\n1\n")
     return out
 
 
@@ -28,7 +30,7 @@ def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
     artefact = open_artefact(make(tmp_path / "meta", inputs=(first,)), "meta")
     assert artefact.config == {"steps": 3} and artefact.seed == 7
     assert artefact.input("ensemble") == first.resolve()
-    assert set(artefact.manifest["files"]) == {"episodes.csv"}
+    assert set(artefact.manifest["files"]) == files_of("meta", {})
     assert {"python", "torch", "numpy"} <= set(artefact.manifest["versions"])
     assert check_files(artefact) == []
 
@@ -164,9 +166,10 @@ def test_force_never_replaces_an_input(tmp_path: Path, monkeypatch: pytest.Monke
 def test_damaged_and_newer_manifests(tmp_path: Path, change: object, words: str) -> None:
     """Spec G2."""
     out = make(tmp_path / "meta")
-    path = out / "manifest.json"
-    text = json.dumps(json.loads(path.read_text()) | change) if isinstance(change, dict) else change or "{"
-    path.write_text(str(text))
+    if isinstance(change, dict):
+        reseal(out, **change)
+    else:
+        (out / "manifest.json").write_text(str(change or "{"))
     with pytest.raises(UserError, match=words):
         open_artefact(out)
 
@@ -178,10 +181,8 @@ def test_changed_missing_and_foreign_files_are_found(tmp_path: Path) -> None:
     assert check_files(open_artefact(out)) == ["episodes.csv: changed since it was written"]
     (out / "episodes.csv").unlink()
     assert check_files(open_artefact(out)) == ["episodes.csv: missing"]
-    manifest = json.loads((out / "manifest.json").read_text())
-    manifest["files"] = {"../../etc/passwd": "0"}
-    (out / "manifest.json").write_text(json.dumps(manifest))
-    assert check_files(open_artefact(out)) == ["../../etc/passwd: outside the artefact"]
+    reseal(out, files={"../../etc/passwd": "0"})
+    assert check_files(open_artefact(out))[-1] == "../../etc/passwd: outside the artefact"
 
 
 def test_damaged_weights(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Spec G1, G2: what a stage works on is its own, is gone on with only by what began it, and is never lost."""
 
-import json
 import os
 import signal
 import subprocess
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from toy_data import reseal
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
@@ -106,11 +106,7 @@ def test_what_other_versions_completed_is_complete(tmp_path: Path) -> None:
     """Spec G1: nothing is gone on with; settings that only one version has do not make it another one's."""
     out = tmp_path / "meta"
     finish(out)
-    path = out / "manifest.json"
-    manifest = json.loads(path.read_text())
-    manifest["versions"]["torch"] = "0.1"
-    manifest["config"] = {"steps": 3, "gone": 1}
-    path.write_text(json.dumps(manifest))
+    reseal(out, format=1, versions={"torch": "0.1"}, config={"steps": 3, "gone": 1})
     with pytest.raises(Complete, match=r"complete already \(made with torch 0.1\)"):
         finish(out, resume=True)
     with pytest.raises(UserError, match="was made with steps=3, not 4"):

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from toy_data import fill
 
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.seeding import rng_for, torch_generator
@@ -102,6 +103,7 @@ def write_members(out: Path, data: Path, groups: int, method: str, seed: int, **
     ensemble = Ensemble("montezuma", SHAPE, members, torch_generator(seed, method))
     with create_artefact(out, kind="ensemble", config=config, seed=seed, inputs=[data]) as folder:
         write_ensemble(folder, SUB_GOAL, ensemble)
+        fill(folder, "ensemble", config)
 
 
 def write_options(out: Path, source: Path, ladder: str, seed: int, rows, members: int, **more) -> None:
@@ -122,6 +124,7 @@ def write_options(out: Path, source: Path, ladder: str, seed: int, rows, members
         write_table(folder / "executions.csv", COLUMNS, rows)
         facts = {"layout_seed": 0, "shortest_path": None, "random_success": None, "random_episodes": 0}
         (folder / "layout.json").write_text(json.dumps(facts), encoding="utf-8")
+        fill(folder, "options", config)
 
 
 def executions(option: int, distances, *, inside: int = 0, died: int = 0, timed_out: int = 0, room: int = 1) -> list:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from ladder_run import ROOMS, STATES_PER_ROOM, SUB_GOAL, executions, write_data, write_members, write_options, write_run
 from rich.console import Console
+from toy_data import reseal
 
 from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
@@ -304,9 +305,8 @@ def test_a_table_of_executions_that_is_not_there(run, tmp_path):
     source = tmp_path / "copy/ensemble/dbat/groups-2-seed-0"
     silent = tmp_path / "copy/options/dbat/groups-2-ladder-1L-seed-0"
     write_options(silent, source, "1L", 0, [], 2)
-    manifest = json.loads((silent / "manifest.json").read_text())
-    del manifest["files"]["executions.csv"]
-    (silent / "manifest.json").write_text(json.dumps(manifest))
+    files = open_artefact(silent).manifest["files"]
+    reseal(silent, files={name: digest for name, digest in files.items() if name != "executions.csv"})
     metrics = evaluate(tmp_path / "copy", tmp_path / "copy/evaluation", **QUIET)
     assert (
         "no executions.csv in options/dbat/groups-2-ladder-1L-seed-0: its domain tells no distance"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import shutil
@@ -20,10 +19,11 @@ from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN
+from toy_data import reseal
 
 import hypogoal
 from hypogoal.cli import main
-from hypogoal.core.artefacts import find_artefacts
+from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.env import Options
@@ -125,11 +125,10 @@ def test_options_are_held_back_by_what_was_learned_of_them(run: Path, options: O
 def test_options_are_masked_as_they_were_trained(run: Path, options: Options) -> None:
     """Spec D6: with mask_reached=false options are offered where their sub-goals hold, to other agents too."""
     shutil.copytree(run / "options", run / "unmasked")
-    manifest = json.loads((run / "unmasked" / "manifest.json").read_text(encoding="utf-8"))
+    config = open_artefact(run / "unmasked").config
 
     def unmasked(value: Any) -> Options:
-        manifest["config"]["mask_reached"] = value
-        (run / "unmasked" / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+        reseal(run / "unmasked", config={**config, "mask_reached": value})
         return hypogoal.load_options(run / "unmasked")
 
     for known, masks in ((options, [False, False, True, True]), (unmasked(False), [True] * 4)):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from corridor import LongCorridor
+from toy_data import fill
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
@@ -57,6 +58,7 @@ def ensemble_of(folder: Path, domain, members: int, network: str = "montezuma") 
     with create_artefact(folder, kind="ensemble", config=config, seed=0, inputs=[]) as place:
         for number, sub_goal in enumerate(domain.sub_goals):
             write_ensemble(place, sub_goal, Ensemble(network, shape, members, torch.Generator().manual_seed(number)))
+        fill(place, "ensemble", config)
     return folder
 
 

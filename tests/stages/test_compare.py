@@ -6,9 +6,10 @@ import shutil
 
 import numpy as np
 import pytest
+from toy_data import fill, reseal
 
 from hypogoal.cli import main
-from hypogoal.core.artefacts import MANIFEST, create_artefact, open_artefact, sha256_of
+from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.comparing import labels_of, on_grid
 from hypogoal.options.recording import write_table
@@ -28,6 +29,7 @@ def write_baseline(run, agent, layout, seed, length, steps=STEPS, **more):
         write_table(out / "episodes.csv", ("step", "length", "reward", "terminated"), rows)
         facts = {"layout_seed": layout, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
         (out / "layout.json").write_text(json.dumps(facts), encoding="utf-8")
+        fill(out, "baseline", config)
 
 
 @pytest.fixture(scope="module")
@@ -113,9 +115,7 @@ def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
         metrics = json.loads(path.read_text(encoding="utf-8"))
         change(metrics)
         path.write_text(json.dumps(metrics), encoding="utf-8")
-        manifest = json.loads((path.parent / MANIFEST).read_text(encoding="utf-8"))
-        manifest["files"][path.name] = sha256_of(path)
-        (path.parent / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
+        reseal(path.parent, files={**open_artefact(path.parent).manifest["files"], path.name: sha256_of(path)})
         return tmp_path / name
 
     assert "two different runs or more" in refused(slow)
