@@ -53,7 +53,7 @@ controls = ["random"]
 baselines = []
 [collect]
 heldout_layouts = 1
-unlabelled_seeds = 1
+unlabelled_seeds = [1]
 [train-ensemble]
 steps = 6
 members = 2

@@ -136,11 +136,11 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
             yield Draft(folder / FILES, begun["command"])
         except BaseException as error:
             if not unfinished(out):
-                shutil.rmtree(folder, ignore_errors=True)
+                _clear(folder)
             elif isinstance(error, KeyboardInterrupt | NumericalError | Killed):
                 error.add_note(f"the last checkpoint is kept: {GO_ON}")
             raise
-        shutil.rmtree(folder, ignore_errors=True)
+        _clear(folder)
 
 
 def put_in_place(made: Path, out: Path) -> None:
@@ -163,6 +163,14 @@ def _settle(out: Path) -> None:
     if old.exists() and not out.exists():
         old.rename(out)
     _remove(old)
+
+
+def _clear(folder: Path) -> None:
+    """Remove a draft, its lock last: whoever gets that finds nothing of this one, and loses nothing to it."""
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.iterdir(), key=lambda path: path.name == LOCK):
+            _remove(path)
+        folder.rmdir()
 
 
 def _remove(path: Path) -> None:
@@ -278,7 +286,7 @@ def _locked(out: Path) -> Iterator[None]:
                 finally:
                     with contextlib.suppress(OSError):  # unless it is another's by now, who made it anew
                         if _is_there(file, folder / LOCK) and os.listdir(folder) == [LOCK]:
-                            shutil.rmtree(folder)
+                            _clear(folder)
                 return
             file.seek(0)
             owner = file.read(200) or "another process"

@@ -12,7 +12,7 @@ from toy_data import reseal
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
-from hypogoal.core.drafts import check_complete, draft, draft_folder, unfinished
+from hypogoal.core.drafts import LOCK, check_complete, draft, draft_folder, unfinished
 from hypogoal.core.errors import Complete, NumericalError, UserError
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "chooser": "ppo"}, "seed": 7}
@@ -196,6 +196,24 @@ def test_who_is_refused_leaves_no_draft(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="exists already"), draft(out, {}):
         raise AssertionError
     assert [*tmp_path.iterdir()] == [out]
+
+
+def test_the_lock_goes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1: who gets it while the rest is still being removed would lose what it has just begun."""
+    gone: list[str] = []
+    unlink = os.unlink
+
+    def noted(path: Any, **more: Any) -> None:
+        gone.append(Path(path).name)
+        unlink(path, **more)
+
+    monkeypatch.setattr("os.unlink", noted)
+    with draft(tmp_path / "out", {}) as work:
+        checkpoint = checkpoints_of(work.files)
+        for number in range(9):
+            (work.files / str(number)).touch()
+            checkpoint.save({"a": number})
+    assert len(gone) >= 12 and gone[-1] == LOCK and not draft_folder(tmp_path / "out").exists()
 
 
 def test_an_output_that_is_a_link_is_made_where_it_leads(tmp_path: Path) -> None:
