@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import corridor_env
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -57,6 +58,10 @@ def choosing(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=lambda env, observation, rng: value)
 
 
+class Spaceless(gymnasium.Env[Any, int]):
+    """It says nothing of its observations."""
+
+
 def short(self: CorridorEnv, action: int) -> Any:
     observation, reward, over, _, info = CorridorEnv.step(self, action)
     return observation, reward, over, info  # old gym's
@@ -86,6 +91,7 @@ LIES: list[tuple[GymnasiumDomain, str]] = [
     ),
     (GymnasiumDomain(lying(reset=lambda self, **_: (1, {})), SUB_GOALS), "the environment gave another observation"),
     (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none, but a NoneType"),  # type: ignore[arg-type, return-value]
+    (GymnasiumDomain(Spaceless, SUB_GOALS), "the environment has no spaces: AttributeError: "),
     *((labelling(value), "a sub-goal's function gave the label ") for value in [*ENDS, object()]),
     *(
         (choosing(value), "the domain's policy gave the action ")

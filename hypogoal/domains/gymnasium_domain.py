@@ -27,6 +27,7 @@ from hypogoal.domains.gymnasium_engine import (
     as_image,
     begun,
     labels_of,
+    made,
     make_checked,
     shape_of,
     stepped,
@@ -114,7 +115,7 @@ class GymnasiumDomain(Domain):
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: settings of its own, the defaults of those that are not there."""
-        return self.make(**{**self._own, **arguments})
+        return made(self.make, **{**self._own, **arguments})
 
     def label(self, env: gymnasium.Env) -> NDArray[np.bool_]:
         """Which sub-goals hold in an environment's current state, bool (G,)."""

@@ -21,16 +21,27 @@ MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames to
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
 
+def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
+    """What a function of the user's own makes.
+
+    Raises:
+        UserError: it fails, or makes no environment.
+    """
+    with UsersCode("the environment", make, failed="cannot be made:") as code:
+        env: Any = make(**arguments)
+        if not isinstance(env, gymnasium.Env):
+            code.refuse(f"is none, but a {type(env).__name__}", "Give a function that returns a gymnasium.Env.")
+        return env
+
+
 def make_checked(make: MakeEnv) -> gymnasium.Env:
     """An environment whose observations and actions hypogoal can work with.
 
     Raises:
         UserError: it cannot be made, its observations are no uint8 images, or its actions are not ``Discrete``.
     """
-    with UsersCode("the environment", make, failed="cannot be made:") as code:
-        env = make()
-        if not isinstance(env, gymnasium.Env):
-            code.refuse(f"is none, but a {type(env).__name__}", "Give a function that returns a gymnasium.Env.")
+    env = made(make)
+    with UsersCode("the environment", env, failed="has no spaces:"):
         space, actions = env.observation_space, env.action_space
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
         do = "Wrap it so that it gives images, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
