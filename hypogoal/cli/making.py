@@ -21,9 +21,9 @@ from hypogoal.cli.common import (
     domain_of,
     print_counts,
     print_outcome,
-    print_table,
     resolve_for,
 )
+from hypogoal.core.terminal import draw, give, say
 
 
 @app.command()
@@ -45,7 +45,7 @@ def collect(
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
     counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
     print_counts(counts, quiet)
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-ensemble")
@@ -85,7 +85,7 @@ def train_ensemble(
         own_code.require_trust(config.network, "network")
     others = tuple(unlabelled or ())
     stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-options")
@@ -110,7 +110,7 @@ def train_options(
     print_outcome(
         stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
     )
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-meta")
@@ -139,7 +139,7 @@ def train_meta(
         ),
         quiet,
     )
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-baseline")
@@ -163,7 +163,7 @@ def train_baseline(
     given = {"agent": agent, "layout_seed": layout_seed}
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given, own=True)
     print_outcome(stage(domain, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet)
-    typer.echo(out)
+    give(out)
 
 
 @app.command()
@@ -181,8 +181,8 @@ def evaluate(
     out = out or run / "evaluation"
     metrics = stage(run, out, force=force, resume=resume, quiet=quiet)
     if not quiet:
-        print_table(summary_table(metrics))
-    typer.echo(out)
+        draw(summary_table(metrics), 100)
+    give(out)
 
 
 @app.command()
@@ -213,15 +213,15 @@ def report(
         raise UserError(f"{what} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
         try:
-            typer.echo(stage(run, videos=videos, force=force, resume=resume))
+            give(stage(run, videos=videos, force=force, resume=resume))
         except Complete as complete:
             raise Complete(run / "report" / "index.html", complete.note) from None
         return
     written, missing = draw_figures(run, figures, format_ or "svg", force=force)
     for line in missing:
-        typer.echo(line, err=True)
+        say(line, err=True)
     for path in written:
-        typer.echo(path)
+        give(path)
 
 
 @app.command()
@@ -235,4 +235,4 @@ def compare(
     """Evaluated runs side by side: what differs, curves, tables, who wins seed by seed."""
     from hypogoal.stages.compare import compare as stage
 
-    typer.echo(stage(runs, out, force=force))
+    give(stage(runs, out, force=force))

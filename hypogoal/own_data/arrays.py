@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import zipfile
 from collections.abc import Iterable
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import require_file
+from hypogoal.core.files import open_file
 from hypogoal.core.preflight import free_memory, human
 from hypogoal.dataset import Dataset
 from hypogoal.own_data.parts import Parts, as_images
@@ -88,15 +89,20 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
 
 def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
     """The arrays of a file that have known names; ``others``: it may hold more."""
-    require_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.")
+    with open_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.") as raw:
+        return _read(raw, path, others=others)
+
+
+def _read(raw: BufferedReader, path: Path, *, others: bool) -> dict[str, NDArray[Any]]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(raw) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
     except (zipfile.BadZipFile, OSError):
         raise UserError("this is no .npz file", path, "Write it with numpy.savez.") from None
     _require_memory(size, path)
+    raw.seek(0)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(raw, allow_pickle=False) as archive:
             if not others:
                 _require_known(archive.files, path)
             return {name: archive[name] for name in archive.files if name in KNOWN}

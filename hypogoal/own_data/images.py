@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import open_file, require_file
 from hypogoal.own_data.parts import Parts
 
 if TYPE_CHECKING:
@@ -84,11 +85,12 @@ def read_image(file: Path) -> NDArray[np.uint8]:
 
     try:
         if file.suffix == ARRAY:
+            require_file(file, "the state is", DO)
             values = np.load(file, mmap_mode="r", allow_pickle=False)
             if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
             return np.array(values)
-        with PIL.Image.open(file) as image:
+        with open_file(file, "the image is", DO) as raw, PIL.Image.open(raw) as image:
             values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
     except (OSError, ValueError, SyntaxError, EOFError, PIL.Image.DecompressionBombError):
         raise UserError("this is no image, or a damaged one", file, DO) from None

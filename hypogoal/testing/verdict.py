@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hypogoal.core.errors import UserError, printable
+from hypogoal.core.errors import UserError
+from hypogoal.core.terminal import printable
 
 Test = tuple[str, Callable[[], str]]
 
