@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hypogoal.core.artefacts import MANIFEST, open_artefact
-from hypogoal.core.errors import UserError, printable
+from hypogoal.core.errors import UserError
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
@@ -69,28 +69,13 @@ def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
     from hypogoal.evaluation.summary import summary_table
 
     try:
-        return summary_table(_plain(numbers))
+        return summary_table(numbers)
     except (LookupError, TypeError, ValueError, AttributeError):
         raise UserError("the evaluation is damaged", path, "Evaluate the run again.") from None
 
 
-def _plain(value: Any) -> Any:
-    """The same, with texts that a table shows as they are: without control characters, brackets no markup."""
-    from rich.markup import escape
-
-    if isinstance(value, str):
-        return escape(printable(value))
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list) else value
-
-
 def lines(about: dict[str, Any]) -> list[str]:
-    """A description as text, a line a fact, without control characters."""
-    return [printable(line) for line in _lines(about)]
-
-
-def _lines(about: dict[str, Any]) -> list[str]:
+    """A description as text, a line a fact."""
     if about["kind"] == "run":
         return [f"{part['path']}: {part['kind']}" for part in about["artefacts"]]
     text = [f"{about['path']}: {about['kind']}"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
@@ -21,7 +19,8 @@ from hypogoal.core.boards import Boards
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, plain_name
+from hypogoal.core.files import MOST_INTEGER, plain_name, read_end
+from hypogoal.core.terminal import draw, screen
 
 LOG = "metrics.jsonl"
 SHARES = ("success", "reached")  # of episodes or executions, drawn from 0 to 1
@@ -72,7 +71,7 @@ def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> Non
     Raises:
         UserError: there is no such folder, or nothing in it that logs.
     """
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    console = screen()
 
     def look() -> list[Progressing]:
         rows = read_progress(run)
@@ -82,7 +81,7 @@ def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> Non
 
     rows = look()
     if once or not console.is_terminal or finished(run):
-        console.print(view(rows))
+        draw(view(rows), WIDTH)
         return
     try:
         with Live(view(rows, console.height - 3), console=console, screen=False, auto_refresh=False) as live:
@@ -145,12 +144,8 @@ def _read(log: Path, run: Path) -> Progressing:
 
 def _lines(log: Path) -> list[dict[str, Any]]:
     """The lines of a log that say a step; one that is only half written yet, or damaged, is left out."""
-    try:
-        text = log.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return []
     found = []
-    for line in text.splitlines():
+    for line in read_end(log):
         try:
             value = json.loads(line)
         except (ValueError, RecursionError):

@@ -17,6 +17,7 @@ import typer
 from hypogoal.cli import making, sweeping, showing, bringing  # isort: skip  # so --help has the stages first
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import Complete, NumericalError, UserError
+from hypogoal.core.terminal import Unprinted, give, open_streams, say
 
 __all__ = ["app", "bringing", "main", "making", "showing", "sweeping"]
 
@@ -25,7 +26,7 @@ def _version(value: bool) -> None:
     if value:
         from hypogoal import __version__
 
-        typer.echo(f"hypogoal {__version__}")
+        say(f"hypogoal {__version__}")
         raise typer.Exit
 
 
@@ -46,17 +47,13 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
     if arguments is None:
         signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
-        _print_anything()
+        open_streams()
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     try:
-        code = app(args=given, standalone_mode=False, prog_name="hypogoal")
-        return code if isinstance(code, int) else 0
-    except Complete as complete:
-        typer.echo(str(complete), err=True)
-        typer.echo(complete.path)
-        return 0
+        os.getcwd()  # which may have been deleted
+        return _called(given)
     except UserError as error:
         if debug:
             raise
@@ -65,6 +62,9 @@ def main(arguments: list[str] | None = None) -> int:
         if debug:
             raise
         return _fail("; ".join([f"training stopped: {error}", *notes_of(error)]), 1)
+    except Unprinted as error:
+        # Not 0: whoever reads the output has not got it. Nor 2: the command was right.
+        return _fail(f"the output is complete, but could not be printed ({error.strerror})", 1)
     except OSError as error:
         if debug:
             raise
@@ -75,10 +75,10 @@ def main(arguments: list[str] | None = None) -> int:
         number = cause.args[0] if cause.args else signal.SIGINT
         return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)
     except (Exception, SystemExit) as error:
-        code = getattr(error, "exit_code", None)
-        if code is not None:
+        ended = getattr(error, "exit_code", None)
+        if ended is not None:
             message = getattr(error, "format_message", lambda: "")()
-            return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(code)
+            return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(ended)
         message, code = _internal(error)
         if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a pipe that nobody reads any more
             raise
@@ -95,6 +95,16 @@ def _internal(error: BaseException) -> tuple[str, int]:
     return f"internal error: {type(error).__name__}: {first}. Run again with --debug for the traceback.", 1
 
 
+def _called(given: list[str]) -> int:
+    try:
+        code: object = app(args=given, standalone_mode=False, prog_name="hypogoal")
+    except Complete as complete:
+        say(complete, err=True)
+        give(complete.path)
+        return 0
+    return code if isinstance(code, int) else 0
+
+
 def _refused(error: OSError) -> tuple[str, int]:
     """What to tell, and the exit code, when the system will not read or write a file."""
     known = {
@@ -106,6 +116,8 @@ def _refused(error: OSError) -> tuple[str, int]:
         errno.EPERM: "Choose another --out, or ask for permission.",
         errno.ENAMETOOLONG: "Choose a shorter name.",
     }
+    if not _homed():
+        return "the current folder is not there any more. Change to another one.", 2
     # HDF5 tells the number in its text only: "... errno = 28, error message = ..."
     told = re.search(r"errno = (\d+)", str(error))
     code = error.errno or (int(told[1]) if told else 0)
@@ -115,6 +127,13 @@ def _refused(error: OSError) -> tuple[str, int]:
     if code in known:
         return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
     return _internal(error)
+
+
+def _homed() -> bool:
+    try:
+        return bool(os.getcwd())
+    except OSError:
+        return False
 
 
 def _may_read(name: str | bytes) -> bool:
@@ -132,19 +151,12 @@ def notes_of(error: BaseException) -> list[str]:
     return list(dict.fromkeys(getattr(error, "__notes__", [])))
 
 
-def _print_anything() -> None:
-    """Signs that a pipe or terminal does not take (cp1252 has no block of a curve) become '?' and end nothing."""
-    for stream in (sys.stdout, sys.stderr):
-        if getattr(stream, "errors", "") == "strict" and hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")
-
-
 def _stop(signum: int, _frame: object) -> None:
     raise KeyboardInterrupt(signum)
 
 
 def _fail(message: str, code: int) -> int:
-    typer.echo(f"hypogoal: {message}", err=True)
+    say(f"hypogoal: {' '.join(message.split())}", err=True)
     return code
 
 

@@ -10,6 +10,7 @@ import typer
 
 from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
 from hypogoal.core.files import MOST_INTEGER
+from hypogoal.core.terminal import give, say
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
@@ -53,7 +54,7 @@ def import_(
             force=force,
         )  # fmt: skip
     print_counts(counts, quiet)
-    typer.echo(out)
+    give(out)
 
 
 @app.command()
@@ -74,12 +75,12 @@ def export(
 
         steps = export_episodes(source, out, episodes=episodes, seed=seed, force=force, quiet=quiet)
         if not quiet:
-            typer.echo(f"{episodes} episodes, {steps} steps")
+            say(f"{episodes} episodes, {steps} steps")
     else:
         from hypogoal.stages.import_data import export_data as stage
 
         stage(source, out, force=force)
-    typer.echo(out)
+    give(out)
 
 
 @app.command()
@@ -114,10 +115,10 @@ def label(
             source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout, fps=fps,
             resume=resume,
         )  # fmt: skip
-    typer.echo(", ".join(f"{count} {kind}" for kind, count in counts.items()))
+    say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
     if all(counts.values()):
-        typer.echo(f"next: hypogoal import {out} --out {out.with_suffix('.h5')}")
-    typer.echo(out)
+        say(f"next: hypogoal import {out} --out {out.with_suffix('.h5')}")
+    give(out)
 
 
 def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
@@ -160,7 +161,7 @@ def check(
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
         for verdict in _verdicts(domain, diversity, network, set_ or [], seed, layout_seed):
             for line in verdict.lines:
-                typer.echo(line)
+                say(line)
             kept &= verdict.ok
     if not kept:
         raise typer.Exit(2)

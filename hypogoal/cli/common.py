@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from hypogoal.core.files import MOST_INTEGER
+from hypogoal.core.terminal import give, say
 
 T = TypeVar("T")
 
@@ -107,8 +108,8 @@ def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
         return
     for split in ("labelled", "heldout"):
         for sub_goal, row in counts[split].items():
-            typer.echo(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
-    typer.echo(f"unlabelled                     {counts['unlabelled']:7d} states")
+            say(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
+    say(f"unlabelled                     {counts['unlabelled']:7d} states")
 
 
 def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
@@ -118,23 +119,14 @@ def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
         text = ", ".join(
             f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in known.items()
         )
-        typer.echo(text)
-
-
-def print_table(table: Any) -> None:
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=100)
-    console.print(table)
+        say(text)
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:
     import json
 
     if as_json:
-        typer.echo(json.dumps(value, indent=1))
+        give(json.dumps(value, indent=1))
     else:
         for line in text:
-            typer.echo(line)
+            say(line)

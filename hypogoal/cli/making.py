@@ -21,10 +21,10 @@ from hypogoal.cli.common import (
     domain_of,
     print_counts,
     print_outcome,
-    print_table,
     resolve_for,
     values_of,
 )
+from hypogoal.core.terminal import draw, give, say
 
 
 @app.command()
@@ -46,7 +46,7 @@ def collect(
     config: Any = resolve_for(domain, found.config_class, "collect", preset, set_, own=True)
     counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
     print_counts(counts, quiet)
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-ensemble")
@@ -83,7 +83,7 @@ def train_ensemble(
     others = tuple(unlabelled or ())
     with own_code.given(diversity or "", *values_of(set_)), own_code.vouched(*own):  # and not what a preset says
         stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-options")
@@ -108,7 +108,7 @@ def train_options(
     print_outcome(
         stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
     )
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-meta")
@@ -137,7 +137,7 @@ def train_meta(
         ),
         quiet,
     )
-    typer.echo(out)
+    give(out)
 
 
 @app.command("train-baseline")
@@ -165,7 +165,7 @@ def train_baseline(
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given, own=True)
     numbers = stage(domain, config, out, data=data, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     print_outcome(numbers, quiet)
-    typer.echo(out)
+    give(out)
 
 
 @app.command()
@@ -183,8 +183,8 @@ def evaluate(
     out = out or run / "evaluation"
     metrics = stage(run, out, force=force, resume=resume, quiet=quiet)
     if not quiet:
-        print_table(summary_table(metrics))
-    typer.echo(out)
+        draw(summary_table(metrics), 100)
+    give(out)
 
 
 @app.command()
@@ -215,15 +215,15 @@ def report(
         raise UserError(f"{what} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
         try:
-            typer.echo(stage(run, videos=videos, force=force, resume=resume))
+            give(stage(run, videos=videos, force=force, resume=resume))
         except Complete as complete:
             raise Complete(run / "report" / "index.html", complete.note) from None
         return
     written, missing = draw_figures(run, figures, format_ or "svg", force=force)
     for line in missing:
-        typer.echo(line, err=True)
+        say(line, err=True)
     for path in written:
-        typer.echo(path)
+        give(path)
 
 
 @app.command()
@@ -237,4 +237,4 @@ def compare(
     """Evaluated runs side by side: what differs, curves, tables, who wins seed by seed."""
     from hypogoal.stages.compare import compare as stage
 
-    typer.echo(stage(runs, out, force=force))
+    give(stage(runs, out, force=force))

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from hypogoal.cli.common import AsJson, app, echo, print_table
+from hypogoal.cli.common import AsJson, app, echo
 from hypogoal.core.errors import UserError
+from hypogoal.core.terminal import draw, give, say
 
 
 @app.command()
@@ -29,14 +30,14 @@ def show(
     try:
         numbers = numbers_of(path)
     except UserError as error:  # what it is can be told all the same
-        typer.echo(f"hypogoal: {error}", err=True)
+        say(f"hypogoal: {error}", err=True)
     if as_json:
         echo(about if numbers is None else {**about, "metrics": numbers}, True, [])
     elif numbers is not None:
-        print_table(summary_of(numbers, path))
+        draw(summary_of(numbers, path), 100)
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
-            typer.echo(sheet, err=as_json)
+            give(sheet, err=as_json)
 
 
 @app.command()
@@ -86,5 +87,5 @@ def config(
     for row in rows:
         default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple) else row["default"]
         unit = f" {row['unit']}" if row["unit"] else ""
-        typer.echo(f"{row['name']} = {default}{unit}" + (f"   ({row['allowed']})" if row["allowed"] else ""))
-        typer.echo(f"    {row['meaning']}" + (f" [{row['source']}]" if row["source"] else ""))
+        say(f"{row['name']} = {default}{unit}" + (f"   ({row['allowed']})" if row["allowed"] else ""))
+        say(f"    {row['meaning']}" + (f" [{row['source']}]" if row["source"] else ""))

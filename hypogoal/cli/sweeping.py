@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, print_table, values_of
+from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, values_of
+from hypogoal.core.terminal import draw, give, say
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")]
 SLURM = "Slurm (with --engine slurm)"
@@ -27,12 +28,10 @@ def run(
     dry_run: DryRun = False,
 ) -> None:
     """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
-    import json
-
     from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.core.drafts import place_of
-    from hypogoal.stages.evaluate import summary_table
+    from hypogoal.inspection import numbers_of, summary_of
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
@@ -46,10 +45,10 @@ def run(
         stage(planned, out, force=force, resume=resume, quiet=quiet)
     metrics = out / "evaluation" / "metrics.json"
     if not metrics.is_file():
-        typer.echo(out / "results.csv")
+        give(out / "results.csv")
         return
-    print_table(summary_table(json.loads(metrics.read_text(encoding="utf-8"))))
-    typer.echo(out / "report" / "index.html")
+    draw(summary_of(numbers_of(out) or {}, metrics), 100)
+    give(out / "report" / "index.html")
 
 
 @app.command()
@@ -111,7 +110,7 @@ def sweep(
     if cancel:
         from hypogoal.experiments.engines.slurm import cancel as end
 
-        typer.echo(f"{end(out)} jobs ended; the same command as before goes on", err=True)
+        say(f"{end(out)} jobs ended; the same command as before goes on", err=True)
         return
 
     from hypogoal.core import own_code
@@ -121,7 +120,7 @@ def sweep(
     from hypogoal.stages import sweep as stage
 
     if gather:
-        typer.echo(stage.gather(out))
+        give(stage.gather(out))
         return
     if experiment is None:
         raise UserError("which experiment?", "hypogoal sweep", "See 'hypogoal sweep --help'.")
@@ -135,23 +134,23 @@ def sweep(
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
         with own_code.given(*values_of(set_)):
-            typer.echo(stage.sweep(planned, out, quiet=quiet, confirm=ask))
+            give(stage.sweep(planned, out, quiet=quiet, confirm=ask))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
     with own_code.given(*values_of(set_)):
         jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask)
     for job in jobs:
-        typer.echo(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
-    typer.echo(out)
+        say(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
+    give(out)
 
 
 def _list(planned: Any) -> None:
     from hypogoal.experiments.costs import cost_lines, machine_factor
 
     for cell in planned.cells:
-        typer.echo(cell.text)
+        say(cell.text)
     for line in cost_lines(planned.cells, planned.workers, machine_factor()):
-        typer.echo(line, err=True)
+        say(line, err=True)
 
 
 def _confirm(cost: str) -> None:

@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import socket
+import stat
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -22,7 +23,7 @@ from typing import Any, TextIO
 
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.errors import Complete, Killed, NumericalError, UserError
-from hypogoal.core.files import parse_json, replace_text, sync
+from hypogoal.core.files import parse_json, read_json, replace_text, sync
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -189,9 +190,9 @@ def _begin(folder: Path, begun: dict[str, Any]) -> None:
 
 def _begun(folder: Path) -> dict[str, Any]:
     try:
-        begun = json.loads((folder / BEGUN).read_text(encoding="utf-8"))
+        begun = read_json(folder / BEGUN, "what was begun is", "Give --force to begin anew.")
         return {"identity": dict(begun["identity"]), "command": [str(word) for word in begun["command"]]}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (KeyError, TypeError, ValueError):
         raise UserError("what was begun is damaged", folder / BEGUN, "Give --force to begin anew.") from None
 
 
@@ -271,6 +272,7 @@ def _locked(out: Path) -> Iterator[None]:
     folder = draft_folder(out)
     until = time.monotonic() + PATIENCE_SECONDS
     while True:
+        _check_own(folder)
         folder.mkdir(parents=True, exist_ok=True)
         try:
             file = (folder / LOCK).open("a+", encoding="utf-8")
@@ -293,6 +295,16 @@ def _locked(out: Path) -> Iterator[None]:
         if time.monotonic() >= until:
             raise UserError(f"{owner} is writing this", out, "Wait until it is done, or choose another --out.")
         time.sleep(0.05)
+
+
+def _check_own(folder: Path) -> None:
+    """Refuse a draft with links, pipes or devices in it: no stage makes any, and writing would go where they lead."""
+    inside = ((place, name) for place, folders, names in os.walk(folder) for name in (*folders, *names))
+    for path in (folder, *(Path(place, name) for place, name in inside)):
+        with contextlib.suppress(FileNotFoundError):  # its owner removes it
+            mode = path.lstat().st_mode
+            if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
+                raise UserError("what was begun holds a link, pipe or device, which no stage makes", path, "Remove it.")
 
 
 def _try_lock(file: TextIO) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from hypogoal.core.terminal import printable
+
 
 class UserError(Exception):
     """A mistake the user can mend. The command line prints it as one line and exits with code 2.
@@ -34,11 +36,6 @@ class Complete(UserError):
     def __init__(self, path: object, note: str = ""):
         super().__init__(f"{path} is complete already" + (f" ({note})" if note else ""))
         self.path, self.note = path, note
-
-
-def printable(text: str) -> str:
-    """A text that may quote a stranger's file: a terminal must not obey it, nor fail to print it."""
-    return "".join(sign if sign.isprintable() else "?" for sign in text)
 
 
 class NumericalError(Exception):

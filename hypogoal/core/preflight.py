@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 from hypogoal.core.drafts import unfinished
 from hypogoal.core.errors import UserError
+from hypogoal.core.terminal import say
 
 CGROUP = Path("/sys/fs/cgroup")
 
@@ -42,7 +42,7 @@ def preflight(stage: str, out: Path, needs: tuple[float, float], *, resume: bool
     if disk > space:
         raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
     if not quiet:
-        print(text, file=sys.stderr, flush=True)
+        say(text, err=True)
 
 
 def free_disk(path: Path) -> int:

@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from hypogoal.core.terminal import printable, say, screen
+
 PLAIN_INTERVAL_SECONDS = 10.0
 
 
@@ -26,20 +28,19 @@ class Progress:
 
     def __enter__(self) -> Progress:
         if not self.quiet and sys.stderr.isatty():
-            from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bar
 
             columns = (
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=16),
                 MofNCompleteColumn(),
-                TextColumn("{task.fields[numbers]}"),
+                TextColumn("{task.fields[numbers]}", markup=False),
                 TimeRemainingColumn(),
             )
-            self._bar = Bar(*columns, console=Console(stderr=True))
+            self._bar = Bar(*columns, console=screen(err=True))
             self._bar.start()
-            self._task = self._bar.add_task(self.title, total=self.total, numbers="")
+            self._task = self._bar.add_task(printable(self.title), total=self.total, numbers="")
         return self
 
     def __exit__(
@@ -82,11 +83,7 @@ class Progress:
         rate = (self.done - self._before) / seconds
         left = max(self.total - self.done, 0) / rate if rate > 0 else 0.0
         tail = f", {text}" if text else ""
-        print(
-            f"{self.title}: {self.done}/{self.total} ({rate:.0f}/s, {left:.0f} s left){tail}",
-            file=sys.stderr,
-            flush=True,
-        )
+        say(f"{self.title}: {self.done}/{self.total} ({rate:.0f}/s, {left:.0f} s left){tail}", err=True)
 
 
 class MetricsLog:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.files import require_file
+from hypogoal.core.files import open_file
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -43,9 +44,8 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    size = require_file(path, "the weights are", AGAIN)
-    with path.open("rb") as file:
-        header = int.from_bytes(file.read(8), "little")
+    with open_file(path, "the weights are", AGAIN) as file:
+        header, size = int.from_bytes(file.read(8), "little"), file.seek(0, os.SEEK_END)
     if header > min(size - 8, MAX_HEADER_BYTES):
         raise UserError(f"the weights are damaged (a header of {header} bytes in a file of {size})", path, AGAIN)
     try:

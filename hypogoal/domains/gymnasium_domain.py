@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
@@ -17,6 +16,7 @@ from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
+from hypogoal.core.terminal import say
 from hypogoal.dataset import Collected, States, digest
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_engine import (
@@ -208,10 +208,8 @@ class GymnasiumDomain(Domain):
                 do = "Give --set steps=N with more steps, other labelled_seeds, or the domain a policy that gets there."
                 raise UserError(f"{sub_goal} {what} holds in the labelled states", f"steps={config.steps}", do)
             if len(np.unique(heldout.labels[:, index])) < 2:
-                print(
-                    f"hypogoal: {sub_goal} has one class only in the held-out states, so it cannot be judged by them",
-                    file=sys.stderr,
-                )
+                what = f"{sub_goal} has one class only in the held-out states, so it cannot be judged by them"
+                say(f"hypogoal: {what}", err=True)
 
 
 _Met = tuple[NDArray[np.uint8], int, int, int]  # a state's picture, layout seed, episode, step

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 from hypogoal.core.config import STAGES, parse_assignments, preset_digest
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import path_part, read_json, replace_text
+from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
 from hypogoal.experiments.cells import DERIVED, Cell, Cost, Plan, moved
 
 fcntl: Any  # on POSIX a module, elsewhere None
@@ -62,11 +62,8 @@ def log_of(run: Path, cell: Cell) -> Path:
 
 def last_line(log: Path) -> str:
     """What a cell said last."""
-    try:
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return ""
-    return lines[-1] if lines else "started"
+    lines = read_end(log)
+    return lines[-1] if lines else "started" if log.is_file() else ""
 
 
 def read_record(run: Path, cell: Cell) -> Record:
@@ -113,6 +110,8 @@ def open_log(run: Path, cell: Cell) -> BinaryIO:
     """
     path = log_of(run, cell)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.parent.is_symlink() or path.is_symlink() or (path.exists() and not path.is_file()):
+        raise UserError("the cell's log is a link, or no regular file", path, "Remove it.")
     log = path.open("ab", buffering=0)
     until = time.monotonic() + PATIENCE_SECONDS  # for those that are just dying, or only look
     while not _lock(log, shared=False):
@@ -130,12 +129,12 @@ def is_running(run: Path, cell: Cell) -> bool:
     Where the file system cannot lock, a cell that was started and has not ended counts as running.
     """
     try:
-        with log_of(run, cell).open("rb") as log:
+        with open_file(log_of(run, cell), "the log is", AGAIN) as log:
             return not _lock(log, shared=True)
     except _NoLocks:
         record = read_record(run, cell)
         return record.attempts > 0 and record.code is None
-    except OSError:
+    except (OSError, UserError):
         return False
 
 

@@ -6,6 +6,7 @@ import difflib
 import zipfile
 import zlib
 from collections.abc import Iterable
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import require_file
+from hypogoal.core.files import open_file
 from hypogoal.dataset import Dataset
 from hypogoal.own_data.parts import Parts, as_images, require_memory
 
@@ -93,17 +94,22 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
 
 def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
     """The arrays of a file that have known names; ``others``: it may hold more."""
-    require_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.")
+    with open_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.") as raw:
+        return _read(raw, path, others=others)
+
+
+def _read(raw: BufferedReader, path: Path, *, others: bool) -> dict[str, NDArray[Any]]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(raw) as archive:
             entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, NotImplementedError, ValueError):
         raise UserError("this is no .npz file", path, "Write it with numpy.savez.") from None
     if any(entry.compress_type not in PACKED or entry.flag_bits & ENCRYPTED for entry in entries):
         raise UserError("the arrays are packed as numpy does not pack them", path, "Write it with numpy.savez.")
     require_memory(sum(entry.file_size for entry in entries), path)
+    raw.seek(0)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(raw, allow_pickle=False) as archive:
             if not others:
                 _require_known(archive.files, path)
             return {name: archive[name] for name in archive.files if name in KNOWN}

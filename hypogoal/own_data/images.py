@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import require_file
+from hypogoal.core.files import open_file, require_file
 from hypogoal.own_data.parts import Parts, require_memory
 
 if TYPE_CHECKING:
@@ -92,11 +92,13 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     require_file(file, "the image is", DO)
     try:
         if file.suffix == ARRAY:
+            require_file(file, "the state is", DO)
             values = np.load(file, mmap_mode="r", allow_pickle=False)
             if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
             return np.array(values)
-        with warnings.catch_warnings(action="ignore"), PIL.Image.open(file, formats=FORMATS) as image:
+        quiet = warnings.catch_warnings(action="ignore")
+        with quiet, open_file(file, "the image is", DO) as raw, PIL.Image.open(raw, formats=FORMATS) as image:
             if (pixels := image.width * image.height) > MOST_PIXELS:
                 raise UserError(f"the image has {pixels:,} pixels, at most {MOST_PIXELS:,} are read", file, DO)
             if getattr(image, "is_animated", False):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.kinds import ARRAYS, DATA
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
+from hypogoal.core.terminal import say
 from hypogoal.dataset import open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data import MAIN_FILE, collected_of, read_arrays, read_images, read_minari, write_arrays
@@ -66,7 +66,7 @@ def import_data(
     collected, warned = collected_of(parts, sub_goals, share=share, seed=seed)
     warned += _too_small(domain, collected.observation_shape)
     for line in warned:
-        print(f"hypogoal: {line}", file=sys.stderr)
+        say(f"hypogoal: {line}", err=True)
     config = {"source": source.name, **({"labels": dict(labels)} if labels else {})}
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -20,6 +19,7 @@ from hypogoal.core.config import TABLES, as_dict, parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
+from hypogoal.core.terminal import say
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import defaults_of, load_domain
 from hypogoal.experiments import doorkey, montezuma_ladders
@@ -372,4 +372,4 @@ def gather(out: Path) -> Path:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    say(text, err=True)

@@ -6,8 +6,9 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from hypogoal.core.errors import UserError, printable
+from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
+from hypogoal.core.terminal import printable
 
 Test = tuple[str, Callable[[], str]]
 

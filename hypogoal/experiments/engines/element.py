@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 from types import FrameType
 
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
+from hypogoal.core.terminal import say
 from hypogoal.experiments.cells import Cell
 from hypogoal.experiments.engines.local import reason
 from hypogoal.experiments.engines.running import Running, start
@@ -80,7 +80,7 @@ def _queue_again(cell: Cell) -> None:
     # By array and element: the last element's own number is the array's too, and would queue all of them again.
     names = ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID")
     job = "_".join(os.environ.get(name, "") for name in names)
-    print(f"{cell.name}: saved, queued again (job {job})", file=sys.stderr, flush=True)
+    say(f"{cell.name}: saved, queued again (job {job})", err=True)
     done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=False)
     if done.returncode:
         raise UserError(f"Slurm does not queue it again ({done.stderr.strip()})", cell.name, "Start the sweep again.")
