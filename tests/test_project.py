@@ -309,10 +309,9 @@ def test_one_way_to_print_and_one_to_open() -> None:
     printing = re.compile(r"typer\.echo\(|(?<![\w.])print\(|Console\(|sys\.std(out|err)\.write")
     opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
     own = {
-        "core/files.py", "core/terminal.py", "core/drafts.py", "core/progress.py", "core/checkpoints.py",
-        "core/preflight.py", "core/config.py", "options/recording.py", "own_data/arrays.py", "own_data/images.py",
-        "evaluation/page/__init__.py", "evaluation/page/explorer.py", "stages/train_ensemble.py",
-        "stages/train_baseline.py", "experiments/records.py",
+        "core/boards.py", "core/config.py", "core/drafts.py", "core/files.py", "core/preflight.py", "core/progress.py",
+        "core/terminal.py", "evaluation/page/__init__.py", "experiments/records.py", "own_data/arrays.py",
+        "own_data/images.py", "stages/train_ensemble.py",
     }  # fmt: skip
     found = set()
     for path in sorted((ROOT / "hypogoal").rglob("*.py")):
