@@ -8,7 +8,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.evaluated import AGAIN, read_evaluation
+from hypogoal.evaluation.run import AGAIN, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
 
@@ -29,8 +29,9 @@ def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = Fa
         UserError: the run was not evaluated, the evaluation is damaged, the report exists, or there are to be videos
             and there is no agent.
     """
-    from hypogoal.evaluation.figures import to_png
-    from hypogoal.evaluation.page import Material, render
+    from hypogoal.evaluation.page import Material
+    from hypogoal.evaluation.plots import to_png
+    from hypogoal.evaluation.questions import render
 
     out = run / "report"
     found = read_evaluation(run)
@@ -103,15 +104,15 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
     Raises:
         UserError: no such kind, the run was not evaluated, or a file is there already.
     """
-    from hypogoal.evaluation.figures import to_file
     from hypogoal.evaluation.page import Material
-    from hypogoal.evaluation.page.paper import paper_figures
+    from hypogoal.evaluation.plots import to_file
+    from hypogoal.evaluation.questions import paper_figures
 
     if kind not in KINDS:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(KINDS)}.")
     found = read_evaluation(run)
     drawn, missing = paper_figures(Material(found.metrics, found.arrays))
-    files = {folder / f"{one.name}.{kind}": one for one in drawn}
+    files = {folder / f"{one.stem}.{kind}": one for one in drawn}
     captions = folder / "captions.md"
     for path in (*files, captions):
         if path.exists() and not force:
@@ -119,7 +120,8 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path, one in files.items():
-            path.write_bytes(to_file(one.figure, one.name, kind))
+            if one.figure is not None:
+                path.write_bytes(to_file(one.figure, one.stem, kind))
         text = [f"## {path.name}\n\n{one.caption}\n" for path, one in files.items()]
         captions.write_text("\n".join([*text, *(f"{line}\n" for line in missing)]), encoding="utf-8")
     except OSError as error:

@@ -10,7 +10,7 @@ from browser import document_of, needs_browser, title_of
 
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
-from hypogoal.evaluation.browsing import MOST_EXPLAINED, MOST_STATES
+from hypogoal.evaluation.explorer import MOST_EXPLAINED, MOST_STATES
 from hypogoal.stages.collect import collect
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import report
@@ -40,7 +40,7 @@ def run(tmp_path_factory):
 def metrics(run):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in FEW.items():
-            patch.setattr(f"hypogoal.evaluation.browsing.{name}", value)
+            patch.setattr(f"hypogoal.evaluation.explorer.{name}", value)
         return evaluate(run, run / "evaluation", **QUIET)
 
 
