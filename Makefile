@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slurm check bench docs clean
+.PHONY: help setup demo test kernels slurm check bench docs clean
 
 help: ## what one can make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,6 +34,13 @@ demo: $(STAMP) ## three-key DoorKey from nothing to a report, in runs/demo
 
 test: $(STAMP) ## the tests, without those marked slow or slurm
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(TESTS)
+
+# Other processors round otherwise: the oldest kernels, then (tests/uneven.py) any that depend on the batch around a state.
+NUMERIC := tests/hypotheses tests/options/test_verdicts.py tests/options/test_start_states.py tests/meta/test_resuming.py
+OLDEST := ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 ONEDNN_MAX_CPU_ISA=SSE41
+kernels: $(STAMP) ## the tests of what is computed, as on other processors
+	$(OLDEST) $(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(NUMERIC)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -p tests.uneven $(NUMERIC)
 
 slurm: $(STAMP) ## the test of sweeps on a real Slurm, where there is one (some minutes)
 	$(BIN)/python -m pytest -m slurm tests/experiments/test_slurm.py

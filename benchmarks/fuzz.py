@@ -302,8 +302,8 @@ def fuzz_tables(box: Sandbox, rng: Rng, case: int) -> bool:
 
 
 def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
-    from hypogoal.core.config import resolve
-    from hypogoal.stages.sweep import EXPERIMENTS, STAGES, config_class_of, plan
+    from hypogoal.core.config import STAGES, resolve
+    from hypogoal.stages.sweep import EXPERIMENTS, config_class_of, plan
 
     path = box.case / "own.toml"
     text = toml_of(tree_changed(PRESET, rng, box.odd), rng).encode(errors="surrogatepass")

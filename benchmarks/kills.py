@@ -2,7 +2,9 @@
 
 ``python -m benchmarks.kills [--kills 50] [--stages train-meta ...] [--seed 0] [--folder DIR]`` prints a table: stage,
 kills, how many of them came while a checkpoint was written, runs that ended, files that differ, losses. A loss is a
-resumed stage that fails, or a checkpoint that cannot be read after a kill.
+resumed stage that fails, or a checkpoint that cannot be read after a kill. With ``--pairs`` nothing is killed: two
+processes work on one ``--out`` at once, so many times; how many were refused stands in the second column, and
+a loss is a pair of which none made it, or one that was not refused in one line.
 
 A stage runs as a process of its own, forked from this one so that it need not load its libraries again, and gets
 SIGKILL. It saves a checkpoint every few milliseconds (``HYPOGOAL_CHECKPOINT_SECONDS``).
@@ -186,6 +188,34 @@ def broken(stage: Stage, folder: Path, kills: int, seconds: float, rng: random.R
     return tally
 
 
+def paired(stage: Stage, folder: Path, pairs: int, seconds: float, rng: random.Random) -> Tally:
+    """Start a stage twice at once on one output, ``pairs`` times; arguments else as of :func:`broken`."""
+    tally = Tally()
+    whole, out = (folder / f"{name}{stage.suffix}" for name in (stage.name, f"pair-{stage.name}"))
+    logs = [folder / f"pair-{stage.name}-{number}.log" for number in range(2)]
+    for _ in range(pairs):
+        processes = []
+        for log in logs:
+            log.write_text("", encoding="utf-8")
+            how = rng.choice(([], ["--resume"], ["--force"]))
+            processes.append(begin([*stage.arguments(folder), "--out", str(out), "-q", *how], log, rng.choice(PACES)))
+            time.sleep(rng.choice((0.0, rng.uniform(0, seconds))))
+        codes = [os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in processes]
+        words = [log.read_text(encoding="utf-8") for log in logs]
+        refused = [text for text, code in zip(words, codes, strict=True) if code]
+        fine = sorted(codes) in ([0, 0], [0, 2]) and all(text.count("\n") == 1 for text in refused)
+        differ = differences(whole, out) if out.exists() else [str(out)]
+        if not fine or differ:
+            print(f"{stage.name}: {codes} {words} {differ}", file=sys.stderr)
+        tally.kills += 1
+        tally.writing += len(refused)
+        tally.ended += codes.count(0)
+        tally.differences += len(differ)
+        tally.losses += not fine or draft_folder(out).exists()
+        _remove(out)
+    return tally
+
+
 def half_written(out: Path) -> bool:
     """Whether a checkpoint is being written, or was when its process was killed."""
     return any(draft_folder(out).glob(f"{FOLDER}/*.new"))
@@ -248,6 +278,7 @@ def main() -> int:
     """The long version."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50, help="of each stage")
+    parser.add_argument("--pairs", type=int, default=0, help="of each stage, instead of kills")
     parser.add_argument("--stages", nargs="*", choices=[*STAGES], default=[*STAGES])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, help="where to work; a temporary one where not given")
@@ -260,13 +291,15 @@ def main() -> int:
     torch.set_num_threads(1)
     folder = given.folder or Path(tempfile.mkdtemp(prefix="kills-"))
     folder.mkdir(parents=True, exist_ok=True)
-    print(f"{'stage':12s} {'kills':>6s} {'writing':>8s} {'ended':>6s} {'differences':>12s} {'losses':>7s}")
+    columns = ("pairs", "refused") if given.pairs else ("kills", "writing")
+    print(f"{'stage':12s} {columns[0]:>6s} {columns[1]:>8s} {'ended':>6s} {'differences':>12s} {'losses':>7s}")
+    attack, count = (paired, given.pairs) if given.pairs else (broken, given.kills)
     bad = 0
     for name in needed(given.stages):
         seconds = unbroken(STAGES[name], folder)
         if name not in given.stages:
             continue
-        t = broken(STAGES[name], folder, given.kills, seconds, random.Random(f"{given.seed} {name}"))
+        t = attack(STAGES[name], folder, count, seconds, random.Random(f"{given.seed} {name}"))
         print(f"{name:12s} {t.kills:6d} {t.writing:8d} {t.ended:6d} {t.differences:12d} {t.losses:7d}", flush=True)
         bad += t.differences + t.losses
     if given.folder is None and not bad:

@@ -29,13 +29,13 @@ from hypogoal.core.config import resolve  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey import DoorKeyEngine  # noqa: E402
 from hypogoal.learners.replay import PrioritisedReplay  # noqa: E402
+from hypogoal.meta.config import TrainOptionsConfig  # noqa: E402
 from hypogoal.options.choosers import RandomChooser  # noqa: E402
 from hypogoal.options.execution import OptionLoop  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
 from hypogoal.options.recurrent import RecurrentLearner  # noqa: E402
 from hypogoal.options.verdicts import Verdicts  # noqa: E402
-from hypogoal.stages.train_options import TrainOptionsConfig  # noqa: E402
 
 LAYOUT = 100
 MEMBERS = (1, 5, 15, 30)

@@ -29,9 +29,9 @@ def command_line() -> str:
 
 def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
-    from hypogoal.core.config import describe
+    from hypogoal.core.config import TABLES, describe
     from hypogoal.domains.base import BUILT_IN, defaults_of
-    from hypogoal.stages.sweep import STAGES, config_class_of
+    from hypogoal.stages.sweep import config_class_of
 
     lines = [
         "# Settings",
@@ -41,7 +41,7 @@ def settings() -> str:
         "",
     ]
     for domain in BUILT_IN:
-        for stage in STAGES:
+        for stage in TABLES:
             rows = describe(config_class_of(stage, domain), defaults_of(domain, stage, given=True))
             lines += [f"## {stage}, {domain}", "", "| setting | default | meaning | source |", "|---|---|---|---|"]
             lines += [_row(row) for row in rows]

@@ -7,7 +7,6 @@ from pathlib import Path
 from hypogoal.core.artefacts import MANIFEST, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import AGAIN, load_tensors
-from hypogoal.domains.doorkey_registration import register
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
@@ -18,8 +17,6 @@ from hypogoal.options.initiation import Narrowed
 from hypogoal.options.policies import make_policies
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
-
-register()
 
 
 def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
@@ -76,4 +73,14 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     masked = config["mask_reached"]
     if not isinstance(masked, bool):
         raise UserError("the manifest's setting 'mask_reached' is malformed", artefact.path / MANIFEST, AGAIN)
-    return Options(goals, members, ensembles, policies, config["option_timeout"], initiation, masked)
+    return Options(
+        goals,
+        members,
+        ensembles,
+        policies,
+        config["option_timeout"],
+        initiation,
+        masked,
+        domain=config["domain"],
+        domain_config=config["domain_config"],
+    )

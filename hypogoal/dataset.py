@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import parse_json, plain_name
+from hypogoal.core.files import parse_json, plain_name, replace_file
 from hypogoal.core.hdf5 import (
     Foreign,
     attribute,
@@ -147,7 +147,7 @@ def write_dataset(
             write_observations(group, collected.unlabelled.observations)
             _write_origins(group, collected.unlabelled.origins)
             file.attrs.modify("complete", True)
-        partial.replace(path)
+        replace_file(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 

@@ -152,7 +152,8 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
 
 def kinds_of(domain: str) -> Sequence[str]:
     """What the values of the origin ``kind`` mean in a domain; nothing where it is not installed or has no kinds."""
-    return getattr(installed_domain(domain), "kinds", ())
+    found = installed_domain(domain)
+    return found.kinds if found else ()
 
 
 def parts_of(run: Path) -> list[Path]:

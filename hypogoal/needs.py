@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.meta.playing import PlayConfig, frames_kept
+from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
+from hypogoal.meta.playing import frames_kept
 from hypogoal.options.recording import STOPS_KEPT
 
 BASE = 450e6
@@ -56,11 +57,11 @@ def ensemble_disk(sub_goals: int, members: int) -> float:
     return sub_goals * (members * MEMBER + training) + CHECKPOINTS * training + LOGS
 
 
-def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Needs:
+def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
     """``train-options`` and ``train-meta``.
 
     Args:
-        domain: where they play; one with named starts remembers a frame of each step as far back as replays reach.
+        domain: where they play.
         about: the ensemble manifest's configuration.
         config: how options are learned.
     """
@@ -70,10 +71,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: PlayConfig) -> Nee
     paper = config.network == "paper"
     replays = options if paper else 1
     weights = options * PAPER_POLICY if paper else 8e6
-    frames = frames_kept(config, options) * prod(domain.observation_shape[:2])
-    kept = frames if getattr(domain, "starts", ()) else 0
-    if hasattr(domain, "played_bytes"):
-        kept = domain.played_bytes(getattr(config, "steps", 0))
+    kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
     members = len(about["sub_goals"]) * about["members"] * (MEMBER + WINDOWS)

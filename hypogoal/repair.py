@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import parse_json, require_file
+from hypogoal.core.files import parse_json, replace_file, require_file
 from hypogoal.core.hdf5 import (
     Busy,
     Foreign,
@@ -73,7 +73,7 @@ def repair(path: Path) -> Repaired:
         open_dataset(fresh).counts()
         original = _aside(path)
         path.rename(original)
-        fresh.rename(path)
+        replace_file(fresh, path)
     finally:
         fresh.unlink(missing_ok=True)
     return Repaired(tuple(kept), tuple(lost), original)
@@ -180,8 +180,6 @@ def _write(
                 else:
                     write_column(place, name, values.astype(np.bool_) if name == "labels" else values)
                 written.setdefault(id(values), place[name])
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def _aside(path: Path) -> Path:

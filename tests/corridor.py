@@ -5,12 +5,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hypogoal.domains.base import Step
+from hypogoal.domains.base import Engine, Step
 
 LENGTH = 6
 
 
-class Corridor:
+class Corridor(Engine):
     """Cells 0..5, start at 2; action 0 goes left, 1 right; the task ends at the right end with reward 1.
 
     Sub-goals: be at the left end, be at the right end. The image shows the agent's cell as white, unless ``blind``,
@@ -18,12 +18,13 @@ class Corridor:
     """
 
     n_actions = 2
+    n_states = LENGTH
     observation_shape = (16, 64, 3)
+    resumes = True
     sub_goals = ("left-end", "right-end")
 
     def __init__(self, count: int, max_steps: int = 30):
         self.count, self.max_steps = count, max_steps
-        self.n_states = LENGTH
         self.reset()
 
     def reset(self) -> np.ndarray:
@@ -74,6 +75,8 @@ class LongCorridor(Corridor):
     """
 
     n_actions = 4
+    position_names = ("room", "x", "y")
+    restarts = True
     observation_shape = (20, 84, 4)  # not made of cells
     action_sets: ClassVar[dict[str, tuple[int, ...]]] = {"moves": (2, 3)}
     cells: ClassVar[dict[str, int]] = {"middle": 2, "left": 0}

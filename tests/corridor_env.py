@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+from hypogoal.core.config import setting
+from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 
 LENGTH, SHAPE = 6, (48, 48, 3)
 
@@ -118,3 +120,29 @@ TWICE = GymnasiumDomain(CorridorEnv, {"End": at_left, "end": at_right})
 FLOATS, STEERED, RESTLESS, LYING = (GymnasiumDomain(env, SUB_GOALS) for env in (Floats, Steered, Restless, Lying))
 NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: False})
 ALWAYS = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "somewhere": lambda env: True})
+
+
+@dataclass(frozen=True)
+class MirroredConfig(GymnasiumConfig):
+    """A setting of the domain's own."""
+
+    mirrored: bool = setting(False, "action 0 goes right, 1 left")
+
+
+class Mirrored(CorridorEnv):
+    """Keeps a list of in which worlds episodes were played."""
+
+    played: ClassVar[list[bool]] = []
+
+    def __init__(self, mirrored: bool):
+        self.mirrored = mirrored
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        self.played.append(self.mirrored)
+        return super().reset(seed=seed)
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return super().step(1 - action if self.mirrored else action)
+
+
+MIRRORED = GymnasiumDomain(Mirrored, SUB_GOALS, config_class=MirroredConfig)

@@ -8,6 +8,7 @@ from corridor import LENGTH, Corridor
 
 from hypogoal.core.config import setting
 from hypogoal.dataset import Collected, States
+from hypogoal.domains.base import Domain
 
 
 class TallCorridor(Corridor):
@@ -23,14 +24,13 @@ class CorridorConfig:
     copies: int = setting(8, "copies of each cell", low=1)
 
 
-class CorridorDomain:
+class CorridorDomain(Domain):
     """The corridor with its two ends as sub-goals."""
 
     name = "own_domain:DOMAIN"
     sub_goals = Corridor.sub_goals
     observation_shape = TallCorridor.observation_shape
     config_class = CorridorConfig
-    env_id = ""
 
     def collect(self, config: CorridorConfig, seed: int, progress: Any) -> Collected:
         engine = TallCorridor(1)

@@ -1,6 +1,7 @@
 """The command line end to end on a toy scale, and each mistake's one line (Spec A1-A8, G2)."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import pytest
 
 import hypogoal
 from hypogoal.cli import main
+from hypogoal.core.config import describe
 from hypogoal.dataset import open_dataset
+from hypogoal.settings import CONFIGS
+from hypogoal.stages.sweep import config_class_of
 
 SMALL = ["--set", "heldout_layouts=1", "--set", "unlabelled_seeds=1"]
 QUICK = [
@@ -267,6 +271,15 @@ def test_a_failed_force_keeps_the_old_artefact(made: Path, tmp_path: Path, capsy
     shutil.copytree(made / "ensemble", copy)
     one_line(capsys, ["train-ensemble", str(tmp_path / "none.h5"), "--out", str(copy), "--force"])
     assert main(["verify", str(copy)]) == 0
+
+
+@pytest.mark.parametrize("stage", ["collect", *CONFIGS, "run"])
+@pytest.mark.parametrize("domain", ["doorkey", "montezuma"])
+def test_sources_of_settings_are_those_that_a_reader_can_look_up(stage: str, domain: str) -> None:
+    """The paper's tables and sections, not numbers of our requirements."""
+    rows = describe(config_class_of(stage, domain))
+    assert rows
+    assert not [row["source"] for row in rows if re.search(r"\bSpec\b|\b[A-H][1-9]\b", row["source"])]
 
 
 def test_config_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:

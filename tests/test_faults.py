@@ -16,6 +16,7 @@ from corridor import Corridor
 import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.errors import NumericalError
+from hypogoal.core.files import replace_text
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import Step
 from hypogoal.meta.config import MetaConfig
@@ -169,6 +170,20 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(tmp_path: Path) -> Non
     out.write_text("old")
     assert limited("collect", "own_domain:DOMAIN", "--out", str(out), "--force", "-q").returncode == 2
     assert [path.name for path in tmp_path.iterdir()] == ["data.h5"] and out.read_text() == "old"
+
+
+def test_a_file_has_its_name_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1: a power failure leaves what was there before, or what replaced it: the file, its name, the folder."""
+    path, seen, sync = tmp_path / "a.json", [], os.fsync
+    path.write_text("before")
+
+    def noted(file: int) -> None:
+        seen.append((os.fstat(file).st_ino, path.read_text()))
+        sync(file)
+
+    monkeypatch.setattr("os.fsync", noted)
+    replace_text(path, "after")
+    assert seen == [(path.stat().st_ino, "before"), (tmp_path.stat().st_ino, "after")]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

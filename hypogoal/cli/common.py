@@ -82,6 +82,14 @@ def resolve_for(
     )
 
 
+def values_of(assignments: Iterable[str] | None) -> list[str]:
+    """What the user typed behind the ``=`` of each ``--set``: one value, or several with commas between."""
+    from hypogoal.core.config import parse_assignments
+
+    texts = parse_assignments(assignments or ()).values()
+    return [value.strip() for text in texts for value in text.split(",")]
+
+
 def domain_of(artefact: Path, kind: str) -> str:
     """The domain of a data file (kind ``data``) or of an artefact."""
     if kind == "data":

@@ -23,6 +23,7 @@ from hypogoal.cli.common import (
     print_outcome,
     print_table,
     resolve_for,
+    values_of,
 )
 
 
@@ -72,19 +73,16 @@ def train_ensemble(
     """Train an ensemble of diverse classifiers for each sub-goal."""
     from hypogoal.core import own_code
     from hypogoal.domains.base import defaults_of
-    from hypogoal.stages.train_ensemble import TrainEnsembleConfig
+    from hypogoal.hypotheses.config import TrainEnsembleConfig
     from hypogoal.stages.train_ensemble import train_ensemble as stage
 
     given = {"diversity": diversity, "members": members}
     domain = domain_of(data, "data")
     config = resolve_for(domain, TrainEnsembleConfig, "train-ensemble", preset, set_, given)
-    typed = [diversity or "", *(text.partition("=")[2] for text in set_ or ())]
     own = [value for value in defaults_of(domain, "train-ensemble").values() if isinstance(value, str)]
-    with own_code.given(*typed, *own):  # and not what a preset says, which may be a stranger's file
-        own_code.require_trust(config.diversity, "diversity objective")
-        own_code.require_trust(config.network, "network")
     others = tuple(unlabelled or ())
-    stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
+    with own_code.given(diversity or "", *values_of(set_)), own_code.vouched(*own):  # and not what a preset says
+        stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
     typer.echo(out)
 
 
@@ -102,7 +100,7 @@ def train_options(
     quiet: Quiet = False,
 ) -> None:
     """Learn an option policy for every member, options chosen at random."""
-    from hypogoal.stages.train_options import TrainOptionsConfig
+    from hypogoal.meta.config import TrainOptionsConfig
     from hypogoal.stages.train_options import train_options as stage
 
     given = {"layout_seed": layout_seed}
@@ -128,7 +126,7 @@ def train_meta(
     quiet: Quiet = False,
 ) -> None:
     """Learn which options to choose, by the environment's reward."""
-    from hypogoal.stages.train_meta import TrainMetaConfig
+    from hypogoal.meta.config import TrainMetaConfig
     from hypogoal.stages.train_meta import train_meta as stage
 
     given = {"layout_seed": layout_seed}
@@ -147,6 +145,9 @@ def train_baseline(
     domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
     out: Out,
     agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="States of the domain: play in the world that they are of (keyring=false, say).")
+    ] = None,
     layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
@@ -157,12 +158,13 @@ def train_baseline(
     quiet: Quiet = False,
 ) -> None:
     """Train PPO or DQN on the primitive actions, for comparison."""
-    from hypogoal.stages.train_baseline import BaselineConfig
+    from hypogoal.learners.baselines.settings import BaselineConfig
     from hypogoal.stages.train_baseline import train_baseline as stage
 
     given = {"agent": agent, "layout_seed": layout_seed}
     config = resolve_for(domain, BaselineConfig, "train-baseline", preset, set_, given, own=True)
-    print_outcome(stage(domain, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet)
+    numbers = stage(domain, config, out, data=data, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
+    print_outcome(numbers, quiet)
     typer.echo(out)
 
 

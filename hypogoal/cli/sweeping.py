@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, print_table
+from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, print_table, values_of
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")]
 SLURM = "Slurm (with --engine slurm)"
@@ -29,6 +29,7 @@ def run(
     """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
     import json
 
+    from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.core.drafts import place_of
     from hypogoal.stages.evaluate import summary_table
@@ -41,7 +42,8 @@ def run(
         _list(planned)
         return
     prepare(device)
-    stage(planned, out, force=force, resume=resume, quiet=quiet)
+    with own_code.given(*values_of(set_)):
+        stage(planned, out, force=force, resume=resume, quiet=quiet)
     metrics = out / "evaluation" / "metrics.json"
     if not metrics.is_file():
         typer.echo(out / "results.csv")
@@ -112,6 +114,7 @@ def sweep(
         typer.echo(f"{end(out)} jobs ended; the same command as before goes on", err=True)
         return
 
+    from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.core.errors import UserError
     from hypogoal.experiments.engines.slurm import Options
@@ -131,10 +134,13 @@ def sweep(
     ask = None if yes or not sys.stdin.isatty() else _confirm
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
-        typer.echo(stage.sweep(planned, out, quiet=quiet, confirm=ask))
+        with own_code.given(*values_of(set_)):
+            typer.echo(stage.sweep(planned, out, quiet=quiet, confirm=ask))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
-    for job in stage.submit(planned, out, options, quiet=quiet, confirm=ask):
+    with own_code.given(*values_of(set_)):
+        jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask)
+    for job in jobs:
         typer.echo(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)
     typer.echo(out)
 

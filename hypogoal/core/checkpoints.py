@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import replace_file
 
 if TYPE_CHECKING:
     import torch
@@ -128,9 +129,7 @@ class Checkpoints:
             self.path.parent.mkdir(exist_ok=True)
             parts = {**arrays, **tensors, JSON_PART: text}
             save_file({**parts, SUM_PART: _checksum(parts)}, fresh)
-            sync(fresh)
-            fresh.replace(self.path)
-            sync(self.path.parent)
+            replace_file(fresh, self.path)
         except (OSError, SafetensorError) as error:
             fresh.unlink(missing_ok=True)
             raise UserError(
@@ -215,17 +214,3 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None
     """Continue from an ``optimiser_snapshot`` of one of the same parameters."""
     state = {int(number): known for number, known in snapshot.items()}
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-
-
-def sync(path: Path) -> None:
-    """Have what was written to a file, or to a folder's list of files, on the disk itself.
-
-    Windows opens no folders, and syncs only what was opened for writing.
-    """
-    if os.name == "nt" and path.is_dir():
-        return
-    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

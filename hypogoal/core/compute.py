@@ -20,8 +20,8 @@ def prepare(device: str = "auto") -> str:
     """Use one torch thread without denormal numbers, and refuse a device that cannot be used.
 
     One thread per process is as fast on small networks, does not suffer from busy neighbours, and makes results
-    the same bytes again on the same machine. Denormal numbers (below 1e-38, where Adam's moments of weights that are
-    not used end) count as 0: arithmetic with them takes many times as long.
+    the same bytes again on the same machine; other processors round otherwise. Denormal numbers (below 1e-38, where
+    Adam's moments of weights that are not used end) count as 0: arithmetic with them takes many times as long.
 
     Args:
         device: of ``DEVICES``; ``auto`` is the CPU (decision 26).

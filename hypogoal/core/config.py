@@ -26,7 +26,8 @@ from hypogoal.core.files import MOST_INTEGER, read_text
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
 MAX_RANGE = 10_000  # integers that one range may stand for
-STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "run")  # tables of presets
+STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")  # that have settings
+TABLES = (*STAGES, "run")  # of presets
 DOMAIN = "doorkey"  # whose presets and defaults hold where no domain is said
 
 
@@ -81,8 +82,8 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str,
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"the preset is not valid TOML ({str(error)[:200]})", name, "Mend the file.") from None
     for key in table:
-        if key not in (*STAGES, stage):
-            do = f"{_meant(key, STAGES)}A preset has tables for {', '.join(STAGES)}."
+        if key not in (*TABLES, stage):
+            do = f"{_meant(key, TABLES)}A preset has tables for {', '.join(TABLES)}."
             raise UserError("no such table in a preset", f"{key} in {name}", do)
     values = table.get(stage, {})
     if not isinstance(values, dict):

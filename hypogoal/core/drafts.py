@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from hypogoal.core.checkpoints import FOLDER, sync
+from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.errors import Complete, Killed, NumericalError, UserError
-from hypogoal.core.files import parse_json
+from hypogoal.core.files import parse_json, replace_text, sync
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -87,10 +87,7 @@ def sole_writer(out: Path) -> Iterator[None]:
         UserError: another process does.
     """
     with _locked(out):
-        try:
-            yield
-        finally:
-            shutil.rmtree(draft_folder(out), ignore_errors=True)
+        yield
 
 
 def unfinished(out: Path) -> bool:
@@ -179,11 +176,7 @@ def _begin(folder: Path, begun: dict[str, Any]) -> None:
     for name in (BEGUN, FOLDER, FILES):
         _remove(folder / name)
     (folder / FILES).mkdir()
-    fresh = folder / f"{BEGUN}.new"
-    fresh.write_text(json.dumps(begun) + "\n", encoding="utf-8")
-    sync(fresh)
-    fresh.replace(folder / BEGUN)
-    sync(folder)
+    replace_text(folder / BEGUN, json.dumps(begun) + "\n")
 
 
 def _begun(folder: Path) -> dict[str, Any]:
@@ -266,7 +259,7 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Hold the lock on the draft of ``out``, whose folder is made where there is none."""
+    """Hold the lock on the draft of ``out``, whose folder is made where there is none and removed if it stays empty."""
     folder = draft_folder(out)
     until = time.monotonic() + PATIENCE_SECONDS
     while True:
@@ -280,7 +273,12 @@ def _locked(out: Path) -> Iterator[None]:
                 file.truncate(0)
                 file.write(f"process {os.getpid()} on {socket.gethostname()}")
                 file.flush()
-                yield
+                try:
+                    yield
+                finally:
+                    with contextlib.suppress(OSError):  # unless it is another's by now, who made it anew
+                        if _is_there(file, folder / LOCK) and os.listdir(folder) == [LOCK]:
+                            shutil.rmtree(folder)
                 return
             file.seek(0)
             owner = file.read(200) or "another process"

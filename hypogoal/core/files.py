@@ -104,9 +104,30 @@ def replace_text(path: Path, text: str) -> None:
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         fresh.write_text(text, encoding="utf-8")
-        fresh.replace(path)
+        replace_file(fresh, path)
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def replace_file(fresh: Path, path: Path) -> None:
+    """Give a file its name when all of it is on the disk: a power failure leaves it, or what was there before."""
+    sync(fresh)
+    fresh.replace(path)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Have what was written to a file, or to a folder's list of files, on the disk itself.
+
+    Windows opens no folders, and syncs only what was opened for writing.
+    """
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def plain_name(name: object) -> bool:

@@ -3,6 +3,9 @@
 ``module:object`` is code that will run. It is loaded where the user gave that name, not because a data file, a manifest
 or a preset, which may be a stranger's, has it in it: then the user allows it by the environment variable
 ``HYPOGOAL_TRUST`` (several names with commas between). What is installed needs no permission.
+
+Here alone is it decided whose word a name is. The command of a sweep's cell comes from a file, however it is spelt: the
+process that runs it is told so (:func:`environment_of_children`), and in it nothing is the user's but what is allowed.
 """
 
 from __future__ import annotations
@@ -22,17 +25,37 @@ from typing import Any
 from hypogoal.core.errors import UserError
 
 TRUST = "HYPOGOAL_TRUST"
+OF_FILE = "HYPOGOAL_COMMAND_OF_FILE"  # in the environment: this process runs a command that the user did not type
 _given: ContextVar[frozenset[str]] = ContextVar("_given", default=frozenset())
 
 
+def given(*names: str) -> contextlib.AbstractContextManager[None]:
+    """Within the block these names are the user's own words: ``module:object`` among them may be loaded.
+
+    Without effect where the command is a file's.
+    """
+    return vouched(*([] if os.environ.get(OF_FILE) else names))
+
+
 @contextlib.contextmanager
-def given(*names: str) -> Iterator[None]:
-    """Within the block these names are the user's own words: ``module:object`` among them may be loaded."""
+def vouched(*names: str) -> Iterator[None]:
+    """Within the block these names may be loaded: code that runs already says them, such as a domain its network."""
     token = _given.set(_given.get() | set(names))
     try:
         yield
     finally:
         _given.reset(token)
+
+
+def allowed() -> frozenset[str]:
+    """The ``module:object`` that may be loaded here: what the user gave, and what ``HYPOGOAL_TRUST`` names."""
+    names = {*_given.get(), *os.environ.get(TRUST, "").split(",")}
+    return frozenset(name.strip() for name in names if ":" in name)
+
+
+def environment_of_children() -> dict[str, str]:
+    """For a process whose command is a file's: what is allowed here is allowed there, whatever its own words are."""
+    return {TRUST: ",".join(sorted(allowed())), OF_FILE: "1"}
 
 
 def require_trust(name: str, what: str) -> None:
@@ -45,8 +68,7 @@ def require_trust(name: str, what: str) -> None:
     Raises:
         UserError: see above.
     """
-    allowed = {entry.strip() for entry in os.environ.get(TRUST, "").split(",")}
-    if ":" in name and name not in _given.get() and name not in allowed:
+    if ":" in name and name not in allowed():
         raise UserError(f"a file names code of its own as its {what}", name, f"Do you trust it? Set {TRUST}={name}")
 
 

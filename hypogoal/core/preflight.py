@@ -78,37 +78,27 @@ def _system() -> int | None:
 
 
 def _groups() -> list[int]:
-    """What each control group that we are in leaves (a container's, a cluster job's), of either version."""
+    """What each control group that we are in leaves: a container's, a cluster job's."""
     left = []
-    for folder, names in _folders():
+    for folder in _folders():
         try:
-            limit, used = (int((folder / name).read_text(encoding="ascii")) for name in names[:2])
-            rows = (line.split() for line in (folder / "memory.stat").read_text(encoding="ascii").splitlines())
-            cache = next((int(row[1]) for row in rows if row[0] == names[2]), 0)
+            limit, used = (int((folder / f"memory.{name}").read_text("ascii")) for name in ("max", "current"))
+            rows = (line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines())
+            cache = next((int(row[1]) for row in rows if row[0] == "file"), 0)
         except (OSError, ValueError, IndexError):  # no such file, or "max": no limit
             continue
         left.append(max(0, limit - (used - cache)))  # the cache of files is given up when memory is asked for
     return left
 
 
-def _folders() -> list[tuple[Path, tuple[str, str, str]]]:
-    """The folders of our control groups and of those above them, and how three things are called there."""
+def _folders() -> list[Path]:
+    """The folders of our control group and of those above it (version 2)."""
     try:
         lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError):
         return []
-    folders = []
-    for line in lines:
-        number, controllers, path = line.split(":", 2)
-        if number == "0":
-            base, names = CGROUP, ("memory.max", "memory.current", "file")
-        elif "memory" in controllers.split(","):
-            base, names = CGROUP / "memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_cache")
-        else:
-            continue
-        own = base / path.lstrip("/")
-        folders += [(folder, names) for folder in (own, *own.parents) if folder.is_relative_to(base)]
-    return folders
+    own = [CGROUP / line[3:].lstrip("/") for line in lines if line.startswith("0::")]
+    return [folder for place in own for folder in (place, *place.parents) if folder.is_relative_to(CGROUP)]
 
 
 def human(amount: float) -> str:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
+from hypogoal.core import own_code
 from hypogoal.core.errors import Killed
 
 T = TypeVar("T")
+SAFE_PATH = "PYTHONSAFEPATH"
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
 KILLED = 9  # SIGKILL, which Windows has no name for
+PYTHON = (sys.executable, "-P")  # a Python that does not run a random.py of the current folder in place of its own
 PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
 
 
@@ -40,6 +44,8 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
 
     When a task fails, or at Ctrl-C, those that run get SIGTERM and are waited for: who saves checkpoints saves one.
 
+    Own code that is allowed here is allowed there.
+
     Args:
         tasks: what to run; more than one at once, they and their results go from process to process.
         workers: processes.
@@ -55,9 +61,12 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     before = set(multiprocessing.active_children())
     # Started anew rather than forked: a fork takes along whatever threads and locks the caller has.
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
+    with _safe_path():
+        pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
-        futures = {pool.submit(_guarded, task): number for number, task in enumerate(tasks)}
+        own = own_code.allowed()
+        with _safe_path():
+            futures = {pool.submit(_guarded, task, own): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
@@ -69,6 +78,18 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _safe_path() -> Iterator[None]:
+    """Have Pythons that others start within the block be as ``PYTHON`` is."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[SAFE_PATH]
+        os.environ.update({} if before is None else {SAFE_PATH: before})
 
 
 def _begin(parent: int) -> None:
@@ -84,8 +105,9 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, KILLED)
 
 
-def _guarded(task: Callable[[], T]) -> T:
+def _guarded(task: Callable[[], T], own: frozenset[str]) -> T:
     try:
-        return task()
+        with own_code.vouched(*own):
+            return task()
     except KeyboardInterrupt:  # the pool would give this process the next task
         os._exit(128 + signal.SIGTERM)

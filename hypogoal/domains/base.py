@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core import own_code
+from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import Collected
+
+if TYPE_CHECKING:
+    import gymnasium
 
 BUILT_IN = {
     "doorkey": "hypogoal.domains.doorkey:DOMAIN",
@@ -19,12 +24,6 @@ BUILT_IN = {
 }
 ENTRY_POINTS = "hypogoal.domains"
 IMPORTED = "imported"  # what states are of where 'hypogoal import' was not told
-CONFIGS = {  # of the stages that train: their settings, some of which a domain may have other defaults for
-    "train-ensemble": "hypogoal.stages.train_ensemble:TrainEnsembleConfig",
-    "train-options": "hypogoal.stages.train_options:TrainOptionsConfig",
-    "train-meta": "hypogoal.stages.train_meta:TrainMetaConfig",
-    "train-baseline": "hypogoal.stages.train_baseline:BaselineConfig",
-}
 
 
 class Step(NamedTuple):
@@ -43,11 +42,24 @@ class Step(NamedTuple):
     truncated: NDArray[np.bool_]
 
 
-class Engine(Protocol):
+class Engine(ABC):
     """Many environments of one layout, stepped together; every distinct state has an integer id.
 
-    It may also have ``snapshot`` (all that it is, nested dicts of arrays and JSON values) and ``restore``, which on an
-    engine made with the same arguments continues from one; without them what is played on it cannot be resumed.
+    What each engine must have comes first; below it what an engine may have besides, with what holds where it has not.
+
+    Attributes:
+        n_actions: primitive actions are 0 .. n_actions - 1.
+        count: environments (E).
+        observation_shape: (H, W, C).
+        max_steps: steps after which an episode is truncated.
+        ids: int64 (E,), the current state of each environment.
+        elapsed: int64 (E,), steps since its episode began.
+        memory: how many states, at least, it can still draw; the frames of older ones are forgotten. None: all.
+        starts: its start states, whose ids are 0 .. S - 1 and which are never forgotten, each with ``on_the_way``;
+            empty where all episodes begin alike.
+        action_sets: by name, actions that a policy may be restricted to.
+        position_names: of the columns of :meth:`positions`; empty where it does not know where the agent is.
+        restarts, resumes: it has :meth:`restart`; it has :meth:`snapshot` and :meth:`restore`.
     """
 
     n_actions: int
@@ -56,54 +68,178 @@ class Engine(Protocol):
     max_steps: int
     ids: NDArray[np.int64]
     elapsed: NDArray[np.int64]
+    memory: int | None = None
+    starts: Sequence[Any] = ()
+    action_sets: Mapping[str, tuple[int, ...]] = MappingProxyType({})
+    position_names: tuple[str, ...] = ()
+    restarts = resumes = False
 
     @property
+    @abstractmethod
     def n_states(self) -> int:
         """Ids known so far are 0 .. n_states - 1."""
 
+    @abstractmethod
     def reset(self) -> NDArray[np.int64]:
         """Put every environment at the start of an episode; returns the ids."""
 
+    @abstractmethod
     def step(self, actions: NDArray[np.int64]) -> Step:
         """Step every environment; where an episode ends, ``ids`` is a start state again afterwards."""
 
+    @abstractmethod
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, *observation_shape) of known states."""
+        """Observations uint8 (n, *observation_shape) of known states, into ``out`` where given."""
 
+    @abstractmethod
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """True sub-goal predicates, bool (n, G): the oracle that only evaluation and the upper bound may see."""
 
+    def restart(self, where: NDArray[np.bool_]) -> None:
+        """Begin a new episode now in the environments ``where``, bool (E,); where ``restarts``."""
+        raise UserError("this domain's engine cannot begin an episode when asked", None, "Leave that to its episodes.")
 
-@runtime_checkable
-class Domain(Protocol):
+    def snapshot(self) -> dict[str, Any]:
+        """All that it is, nested dicts of arrays and JSON values; where ``resumes``."""
+        raise UserError("this domain's engine cannot be saved", None, "Train on it without --resume.")
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of an engine made with the same arguments; where ``resumes``."""
+        raise UserError("this domain's engine cannot be gone on with", None, "Begin anew with --force.")
+
+    @property
+    def oldest(self) -> int:
+        """Ids below this one, but for start states', are forgotten: they cannot be drawn any more."""
+        return 0
+
+    def remembers(self, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Whether these states (...,) can still be drawn."""
+        return (ids >= self.oldest) | (ids < len(self.starts))
+
+    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Where the agent is, int64 (n, ``position_names``); of forgotten states too."""
+        raise UserError("this domain's engine does not know where the agent is", None, "Train it with view=full.")
+
+    @property
+    def tiles(self) -> NDArray[np.uint8] | None:
+        """What each cell code looks like, uint8 (codes, height, width, C), where pictures are made of cells."""
+        return None
+
+    def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """The cell codes of states, uint8 (n, cells); where there are ``tiles``."""
+        raise UserError("this domain's pictures are not made of cells", None, "Ask for images.")
+
+    def reachable(self) -> NDArray[np.int64] | None:
+        """Ids of all states that can be reached, one for each image; None where nobody knows them."""
+        return None
+
+    def shortest_path(self) -> int | None:
+        """Primitive steps to the end of the task, at least; None where nobody knows them."""
+        return None
+
+    def random_success(self, episodes: int, rng: np.random.Generator) -> float | None:
+        """Share of episodes of uniformly random actions that solve the task; None where it is not measured."""
+        return None
+
+
+class Domain(ABC):
     """What hypogoal needs to know of a domain; :class:`hypogoal.GymnasiumDomain` makes one of an environment.
 
-    ``hypogoal check`` tests it. It may also have
+    ``hypogoal check`` tests it. What a domain may have besides follows what it must have.
 
-    - ``env_id``: its Gymnasium environment;
-    - ``defaults``: settings of stages that suit it, see ``defaults_of``;
-    - ``collected_bytes``: config -> bytes of observations that ``collect`` will make, at the most;
-    - ``played_bytes``: steps -> bytes of pictures that an engine keeps while it plays them, at the most;
-    - ``resumes``: true where ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which
-      the part of that name is kept until all are there;
-    - ``kinds``: names of the values of the origin ``kind``;
-    - ``starts``: names of places where episodes begin, one of which ``make_engine`` takes as ``start``;
-    - ``distance``: positions (n, 3) of an engine that has ``positions`` -> int (n,), to the nearest place where a
-      sub-goal holds;
-    - ``picture``: room -> uint8 (height, width, 3), ``pixel``: positions -> column and row in that picture (n, 2),
-      ``rooms_of``: start -> the rooms to draw.
+    Attributes:
+        name: for messages.
+        sub_goals: their names (G).
+        config_class: what ``collect`` can be told, a frozen dataclass of ``core.config.setting`` fields.
+        engine_settings: the names of those that are the world's own: who plays in it later is told them too.
+        defaults: settings of stages that suit it, by stage.
+        env_id: its Gymnasium environment, where it has a registered one.
+        resumes: ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which the part of
+            that name is kept until all are there.
+        kinds: names of the values of the origin ``kind``.
+        starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
+        measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has
+            :meth:`agent_pixels`.
     """
 
     name: str
     sub_goals: tuple[str, ...]
-    observation_shape: tuple[int, ...]
     config_class: type
+    engine_settings: tuple[str, ...] = ()
+    defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+    env_id: str = ""
+    resumes = False
+    kinds: Sequence[str] = ()
+    starts: tuple[str, ...] = ()
+    measures = pictures = sees_agent = False
 
+    @property
+    @abstractmethod
+    def observation_shape(self) -> tuple[int, ...]:
+        """(H, W, C)."""
+
+    @abstractmethod
     def collect(self, config: Any, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states."""
 
+    @abstractmethod
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Engine:
-        """An engine of ``count`` environments of one layout."""
+        """An engine of ``count`` environments of one layout; ``arguments``: ``engine_settings``, and ``start``."""
+
+    @property
+    def has_env(self) -> bool:
+        """Whether there is a Gymnasium environment of it."""
+        return bool(self.env_id)
+
+    def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
+        """Its Gymnasium environment."""
+        import gymnasium
+
+        if not self.has_env:
+            raise UserError("this domain has no Gymnasium environment", self.name, "Name an environment instead.")
+        return gymnasium.make(self.env_id, **arguments)
+
+    def world(self, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Of the settings that states were collected with those that are the engine's, checked.
+
+        Args:
+            config: ``domain_config`` of an artefact, or ``config`` of a data file; what it does not say is as
+                ``make_engine`` has it.
+
+        Raises:
+            UserError: a value that ``collect`` would not take.
+        """
+        known = {name: config[name] for name in self.engine_settings if name in config}
+        checked: Any = from_values(self.config_class, known, "collect") if known else None
+        return {name: getattr(checked, name) for name in known}
+
+    def collected_bytes(self, config: Any) -> int:
+        """Bytes of observations that ``collect`` will make, at the most; 0 where nobody knows."""
+        return 0
+
+    def played_bytes(self, steps: int, frames: int) -> int:
+        """Bytes of pictures that an engine keeps while it plays ``steps``, of which replays need ``frames``."""
+        return 0
+
+    def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """From positions of an engine to the nearest place where a sub-goal holds, int (n,); where ``measures``."""
+        raise UserError("this domain measures no distances", self.name, "Leave them out.")
+
+    def rooms_of(self, start: str) -> tuple[int, ...]:
+        """The rooms to draw of a start."""
+        return ()
+
+    def picture(self, room: int) -> NDArray[np.uint8]:
+        """A room, uint8 (height, width, 3); where ``pictures``."""
+        raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
+
+    def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Column and row in that picture, (n, 2), of positions; where ``pictures``."""
+        raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
+
+    def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Row and column of the agent's middle in an observation, (n, 2), of positions; where ``sees_agent``."""
+        raise UserError("this domain does not say where in an observation the agent is", self.name, "Set view=full.")
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:
@@ -127,7 +263,7 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
         do = f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file."
         raise UserError("nobody said which domain these imported states are of", name, do) from None
     if not isinstance(domain, Domain):
-        raise UserError("the object is not a domain", name, "See hypogoal.domains.base.Domain for what it needs.")
+        raise UserError("the object is not a domain", name, "Derive it from hypogoal.domains.base.Domain.")
     return domain
 
 
@@ -137,19 +273,12 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
     Raises:
         UserError: the name is code that the user did not allow (see :func:`load_domain`).
     """
-    if not given:
+    with own_code.given(*([name] if given else [])):
         own_code.require_trust(name, "domain")
-    try:
-        return load_domain(name, given=given)
-    except UserError:
-        return None
-
-
-def stage_config(stage: str) -> type:
-    """The settings of one of the stages in ``CONFIGS``."""
-    module, _, name = CONFIGS[stage].partition(":")
-    found: type = getattr(importlib.import_module(module), name)
-    return found
+        try:
+            return load_domain(name)
+        except UserError:
+            return None
 
 
 def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str, Any]:
@@ -158,5 +287,5 @@ def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str,
     Raises:
         UserError: see :func:`installed_domain`.
     """
-    defaults: Mapping[str, Mapping[str, Any]] = getattr(installed_domain(domain, given=given), "defaults", {})
-    return defaults.get(stage, {})
+    found = installed_domain(domain, given=given)
+    return found.defaults.get(stage, {}) if found else {}

@@ -1,7 +1,7 @@
 """DoorKey with three keys (Spec B1-B3): the domain as the stages see it, and how its states are collected.
 
 The parts: ``doorkey_env`` (the Gymnasium environment and the sub-goals), ``doorkey_states`` (states and rules
-of one layout), ``doorkey_engine`` (many environments, fast), ``doorkey_registration`` (the Gymnasium id).
+of one layout), ``doorkey_engine`` (many environments, fast).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, leave_out
-from hypogoal.domains.doorkey_engine import DoorKeyEngine, SingleDoorKey, draw
+from hypogoal.domains.base import Domain
+from hypogoal.domains.doorkey_engine import DoorKeyEngine, draw
 from hypogoal.domains.doorkey_env import (
     DOOR_LABELS,
     MAX_STEPS,
@@ -30,23 +31,17 @@ from hypogoal.domains.doorkey_env import (
     Layout,
     layout_of,
 )
-from hypogoal.domains.doorkey_registration import ENV_ID, register
 from hypogoal.domains.doorkey_states import DoorKeyStates
 
 __all__ = [
     "DOMAIN",
-    "ENV_ID",
     "SUB_GOALS",
     "DoorKeyConfig",
     "DoorKeyEngine",
     "DoorKeyEnv",
     "DoorKeyGrid",
-    "SingleDoorKey",
     "collect",
-    "register",
 ]
-
-register()
 
 
 @dataclass(frozen=True)
@@ -56,7 +51,7 @@ class DoorKeyConfig:
     regime: str = setting(
         "fixed",
         "labelled states: 'fixed', the layout as it lies; 'shuffled', keys re-drawn within its walls",
-        source="Spec B3",
+        source="paper, MiniGrid experiment",
         choices=("fixed", "shuffled"),
     )
     draws: int = setting(20, "key placements of the regime 'shuffled'", source="own choice", low=1, high=1000)
@@ -69,14 +64,14 @@ class DoorKeyConfig:
         "first held-out layout seed; seeds whose grid is a training layout's or came before are passed over",
         low=0,
     )
-    heldout_layouts: int = setting(20, "held-out layouts", source="Spec B3", low=1, high=500)
+    heldout_layouts: int = setting(20, "held-out layouts", source="paper, MiniGrid experiment", low=1, high=500)
     door_label: str = setting(
         "open",
         "open-red-door holds when the door is 'open', or when the agent is also 'in-front', facing it",
-        source="Spec B2",
+        source="in-front: paper; open: the authors' code",
         choices=DOOR_LABELS,
     )
-    keyring: bool = setting(True, "several keys can be held", source="Spec B1")
+    keyring: bool = setting(True, "several keys can be held", source="the authors' code")
 
 
 @dataclass(frozen=True)
@@ -188,14 +183,15 @@ def _states_of(sweeps: Sequence[_Sweep], keep: NDArray[np.int64] | None = None) 
     return States(np.concatenate(images), np.concatenate(labels), joined)
 
 
-class DoorKeyDomain:
-    """Spec B6: three-key DoorKey behind the interface of ``hypogoal.domains.base.Domain``."""
+class DoorKeyDomain(Domain):
+    """Spec B6: three-key DoorKey."""
 
     name = "doorkey"
-    sub_goals: tuple[str, ...] = SUB_GOALS
-    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    sub_goals = SUB_GOALS
+    observation_shape = OBSERVATION_SHAPE
     config_class = DoorKeyConfig
-    env_id = ENV_ID
+    engine_settings = ("keyring", "door_label")
+    env_id = "hypogoal/DoorKey-8x8-v0"
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:
         """Observations of a collection, at the most: a layout has some 1,640 states (seed 0), others up to 2,500."""

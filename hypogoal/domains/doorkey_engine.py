@@ -1,7 +1,7 @@
-"""The fast DoorKey engines for training: exact to ``DoorKeyEnv``, which they are tested against step by step.
+"""The fast DoorKey engine for training: exact to ``DoorKeyEnv``, which it is tested against step by step.
 
-Drawing is 99 % of MiniGrid's cost. Here a step is a few table look-ups for all environments together, and an
-image is brought up to date by redrawing the cells that changed (two at most, but for a new episode).
+Drawing is 99 % of MiniGrid's cost. Here a step is a few table look-ups for all environments together, and an image is
+64 tiles that were drawn once.
 """
 
 from __future__ import annotations
@@ -12,25 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.domains.base import Step
+from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.doorkey_env import MAX_STEPS, OBSERVATION_SHAPE, SIZE, TILE, layout_of
-from hypogoal.domains.doorkey_states import (
-    AGENT_ON,
-    AHEAD,
-    CELLS,
-    FORWARD,
-    MAY_CHANGE,
-    MOVE_AS,
-    MOVES,
-    N_ACTIONS,
-    START,
-    DoorKeyStates,
-    tiles,
-)
+from hypogoal.domains.doorkey_states import N_ACTIONS, START, DoorKeyStates, tiles
 
-# Plain lists: one look-up in them is several times faster than in an array.
-_AHEAD, _MOVES, _MOVE_AS = AHEAD.tolist(), MOVES.tolist(), MOVE_AS.tolist()
-_MAY_CHANGE, _AGENT_ON = MAY_CHANGE.tolist(), AGENT_ON.tolist()
 _ROW_OF_TILE = np.dtype(f"V{TILE * 3}")  # a tile's pixel row moved as one item: twice as fast as 24 bytes
 
 
@@ -56,8 +41,8 @@ def draw(codes: NDArray[np.uint8], out: NDArray[np.uint8] | None = None) -> NDAr
     return out
 
 
-class DoorKeyEngine:
-    """Many environments of one layout, stepped together; see ``hypogoal.domains.base.Engine``.
+class DoorKeyEngine(Engine):
+    """Many environments of one layout, stepped together.
 
     Args:
         layout_seed: the layout, as ``DoorKeyEnv(layout_seed=...)``.
@@ -73,7 +58,8 @@ class DoorKeyEngine:
     """
 
     n_actions = N_ACTIONS
-    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    observation_shape = OBSERVATION_SHAPE
+    resumes = True
 
     def __init__(
         self,
@@ -87,12 +73,6 @@ class DoorKeyEngine:
     ):
         self.count, self.max_steps = count, max_steps
         self.states = states or DoorKeyStates(layout_of(layout_seed), keyring, door_label)
-        self._tiles = _tile_rows()
-        self._canvas = draw(np.repeat(self.states.codes(np.array([START])), count, axis=0))
-        self._canvas_rows = _cells_of(self._canvas).reshape(-1)
-        cell = np.arange(count * CELLS)  # and where in the canvas each one's first pixel row is
-        self._first_rows = cell // SIZE * (SIZE * TILE) + cell % SIZE
-        self._drawn = self.states.codes(np.full(count, START))  # the codes that the canvas shows
         self.ids = np.full(count, START, np.int64)
         self.elapsed = np.zeros(count, np.int64)
 
@@ -122,30 +102,6 @@ class DoorKeyEngine:
         self.ids = np.where(ended, START, next_ids)
         self.elapsed = np.where(ended, 0, elapsed)
         return Step(next_ids, terminated.astype(np.float32), terminated, truncated)
-
-    def observe(self, out: NDArray[np.uint8] | None = None, copy: bool = True) -> NDArray[np.uint8]:
-        """The image of every environment's current state, uint8 (E, 64, 64, 3).
-
-        Only the cells that changed since the last call are drawn. After ``step`` has ended an episode this is
-        the next one's first image; the last one's is ``images(step.next_ids)``.
-
-        Args:
-            out: where to copy the images to; None, a new array.
-            copy: False, no copy: the engine's own buffer, read-only, drawn over at the next call.
-        """
-        codes = self.states.codes(self.ids)
-        changed = (codes != self._drawn).ravel().nonzero()[0]
-        where = self._first_rows.take(changed)[:, None] + np.arange(TILE) * SIZE
-        self._canvas_rows[where] = self._tiles.take(codes.ravel().take(changed), axis=0)
-        self._drawn = codes
-        if not copy:
-            shown = self._canvas.view()
-            shown.flags.writeable = False
-            return shown
-        if out is None:
-            return self._canvas.copy()
-        np.copyto(out, self._canvas)
-        return out
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
         """Observations uint8 (n, 64, 64, 3) of any known states, into ``out`` where given."""
@@ -178,17 +134,11 @@ class DoorKeyEngine:
         """Ids of all states reachable from the start, one for each image; see ``DoorKeyStates.reachable``."""
         return self.states.reachable(drop)
 
-    def shortest_path(self) -> int:
-        """Primitive steps from the start to the goal, at least.
-
-        Raises:
-            ValueError: the goal cannot be reached without ``drop`` (only without the key ring).
-        """
+    def shortest_path(self) -> int | None:
+        """Primitive steps from the start to the goal, at least; None where a key must be dropped (no key ring)."""
         ids, steps = self.states.distances()
         at_goal = self.states.at_goal(ids)
-        if not at_goal.any():
-            raise ValueError("the goal cannot be reached without dropping a key")
-        return int(steps[at_goal].min())
+        return int(steps[at_goal].min()) if at_goal.any() else None
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float:
         """Spec F5: share of ``episodes`` of uniformly random actions that reach the goal in ``max_steps``."""
@@ -197,56 +147,3 @@ class DoorKeyEngine:
             ids = self.states.step(ids, rng.integers(N_ACTIONS, size=len(ids)))
             ids = ids[~self.states.at_goal(ids)]
         return 1.0 - len(ids) / episodes
-
-
-class SingleDoorKey:
-    """One environment with its image, in plain Python: for one, this is faster than NumPy's vectors.
-
-    Args: as ``DoorKeyEngine``, without ``count``. After an episode's end call ``reset``.
-    """
-
-    def __init__(self, layout_seed: int, *, keyring: bool = True, max_steps: int = MAX_STEPS, door_label: str = "open"):
-        self.states = DoorKeyStates(layout_of(layout_seed), keyring, door_label)
-        self.max_steps = max_steps
-        layout = self.states.layout
-        self._goal = layout.goal
-        self._start = layout.start * 4 + layout.direction
-        self._first_image = draw(self.states.codes(np.array([START])))[0]
-        self._canvas = self._first_image.copy()
-        cells = _cells_of(self._canvas[None])[0]
-        self._cells = [cells[cell // SIZE, :, cell % SIZE] for cell in range(CELLS)]
-        self._tiles = list(_tile_rows())
-        self._rewind()
-
-    def _rewind(self) -> None:
-        self.elapsed = 0
-        self._pose = self._start
-        self._configuration = 0  # the start's
-        self._row = self.states.rows[0]
-
-    def reset(self) -> NDArray[np.uint8]:
-        """A new episode; returns the image, uint8 (64, 64, 3), the caller's to keep."""
-        self._rewind()
-        np.copyto(self._canvas, self._first_image)
-        return self._canvas.copy()
-
-    def step(self, action: int) -> tuple[NDArray[np.uint8], float, bool, bool]:
-        """Play ``action`` (0 .. 6): (image uint8 (64, 64, 3) to keep, reward, terminated, truncated)."""
-        pose, row = self._pose, self._row
-        front = _AHEAD[pose]
-        at_goal = False
-        if action <= FORWARD:
-            moved = _MOVES[_MOVE_AS[action][row[front]]][pose]
-            if moved != pose:
-                before, cell = pose >> 2, moved >> 2
-                if before != cell:
-                    self._cells[before][...] = self._tiles[row[before]]
-                    at_goal = cell == self._goal
-                self._cells[cell][...] = self._tiles[_AGENT_ON[row[cell]] + (moved & 3)]
-                self._pose = moved
-        elif _MAY_CHANGE[action][row[front]]:
-            self._configuration = self.states.change(self._configuration, front, action)
-            self._row = self.states.rows[self._configuration]
-            self._cells[front][...] = self._tiles[self._row[front]]
-        self.elapsed += 1
-        return self._canvas.copy(), float(at_goal), at_goal, self.elapsed >= self.max_steps

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
 from math import prod
 from typing import Any
 
@@ -13,11 +13,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, digest
+from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_engine import (
     MEMORY,
     RESET,
@@ -39,10 +40,17 @@ Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 class GymnasiumConfig:
     """What ``hypogoal collect`` can be told about such a domain."""
 
-    labelled_seeds: tuple[int, ...] = setting((0,), "layout seeds of the labelled states", source="Spec B3", low=0)
-    unlabelled_seeds: tuple[int, ...] = setting((1, 2), "layout seeds of the unlabelled states", source="B3", low=0)
+    labelled_seeds: tuple[int, ...] = setting(
+        (0,), "layout seeds of the labelled states", source="as the paper's MiniGrid experiment", low=0
+    )
+    unlabelled_seeds: tuple[int, ...] = setting(
+        (1, 2), "layout seeds of the unlabelled states", source="as the paper's MiniGrid experiment", low=0
+    )
     heldout_seeds: tuple[int, ...] = setting(
-        tuple(range(1000, 1010)), "layout seeds of the held-out states", source="Spec B3", low=0
+        tuple(range(1000, 1010)),
+        "layout seeds of the held-out states",
+        source="as the paper's MiniGrid experiment",
+        low=0,
     )
     steps: int = setting(3_000, "steps that are played on each layout", unit="steps", low=1)
     states: int = setting(
@@ -52,24 +60,25 @@ class GymnasiumConfig:
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)
 
 
-class GymnasiumDomain:
+class GymnasiumDomain(Domain):
     """Spec B6: all that hypogoal needs to know of a problem, from a Gymnasium environment.
 
     Args:
         make: makes an environment: observations uint8 (H, W, C) or (H, W), actions ``Discrete``. What ``seed`` of
-            ``reset`` fixes is the layout: the same seed and actions give the same episode.
+            ``reset`` fixes is the layout: the same seed and actions give the same episode. Its arguments are the
+            domain's own settings, see ``config_class``.
         sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state.
         policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: distinct states that training keeps pictures of, see ``GymnasiumEngine``.
         name: for messages; artefacts name the domain as the user named it to ``collect``.
+        config_class: a frozen dataclass that adds settings of its own to ``GymnasiumConfig``: ``make`` gets them, in
+            collection, training, baselines and evaluation alike.
 
     Example, a domain that ``hypogoal collect my_module:DOMAIN`` knows::
 
         DOMAIN = GymnasiumDomain(make, {"key": lambda env: env.unwrapped.carrying is not None})
     """
-
-    config_class = GymnasiumConfig
 
     def __init__(
         self,
@@ -80,8 +89,13 @@ class GymnasiumDomain:
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = MEMORY,
         name: str = "own",
+        config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
         self.make, self.policy, self.memory, self.name = make, policy, memory, name
+        self.config_class = config_class
+        generic = {field.name for field in fields(GymnasiumConfig)}
+        self._own = {field.name: field.default for field in fields(config_class) if field.name not in generic}
+        self.engine_settings = tuple(self._own)
         self.sub_goals = tuple(sub_goals)
         self._labels = tuple(sub_goals.values())
         self.defaults = dict(defaults or {})
@@ -89,25 +103,35 @@ class GymnasiumDomain:
     @cached_property
     def observation_shape(self) -> tuple[int, ...]:
         """(H, W, C)."""
-        env = make_checked(self.make)
+        env = make_checked(self.make_env)
         env.close()
         return shape_of(env)
+
+    @property
+    def has_env(self) -> bool:
+        """Always."""
+        return True
+
+    def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
+        """An environment; ``arguments``: settings of its own, the defaults of those that are not there."""
+        return self.make(**{**self._own, **arguments})
 
     def label(self, env: gymnasium.Env) -> NDArray[np.bool_]:
         """Which sub-goals hold in an environment's current state, bool (G,)."""
         return labels_of(env, self._labels)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
-        """An engine of ``count`` environments of one layout; ``arguments``: ``memory``."""
-        settings = {"memory": self.memory, **arguments}
-        return GymnasiumEngine(self.make, self._labels, layout_seed, count, max_steps=max_steps, **settings)
+        """An engine of ``count`` environments of one layout; ``arguments``: ``memory``, and settings of its own."""
+        memory = arguments.pop("memory", self.memory)
+        make = partial(self.make_env, **arguments)
+        return GymnasiumEngine(make, self._labels, layout_seed, count, max_steps=max_steps, memory=memory)
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         """Observations of a collection, at the most."""
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)
         return layouts * min(config.states, config.steps) * prod(self.observation_shape)
 
-    def played_bytes(self, steps: int) -> int:
+    def played_bytes(self, steps: int, frames: int) -> int:
         """Pictures that training for so many steps keeps, at the most."""
         return min(2 * self.memory, steps) * prod(self.observation_shape)
 
@@ -123,7 +147,7 @@ class GymnasiumDomain:
         """
         kinds = (config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds)
         progress.expect(sum(map(len, kinds)) * config.steps)
-        env = make_checked(self.make)
+        env = make_checked(partial(self.make_env, **self.world(as_dict(config))))
         seen: set[bytes] = set()
         sets = []
         for kind, seeds in enumerate(kinds):

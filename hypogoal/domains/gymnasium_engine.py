@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.domains.base import Step
+from hypogoal.domains.base import Engine, Step
 
-MakeEnv = Callable[[], gymnasium.Env]
+MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 STEP, RESET = UsersCode("the environment's step"), UsersCode("the environment's reset")
 MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
@@ -87,8 +87,8 @@ def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
         return np.array([bool(label(env)) for label in labels], dtype=np.bool_)
 
 
-class GymnasiumEngine:
-    """Environments of one layout, stepped one after the other; see ``hypogoal.domains.base.Engine``.
+class GymnasiumEngine(Engine):
+    """Environments of one layout, stepped one after the other.
 
     Every episode begins with ``reset(seed=layout_seed)``. States are told apart by what is seen and by their labels:
     the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
@@ -103,6 +103,8 @@ class GymnasiumEngine:
         memory: distinct states, see above.
     """
 
+    restarts = resumes = True
+
     def __init__(
         self,
         make: MakeEnv,
@@ -113,7 +115,8 @@ class GymnasiumEngine:
         max_steps: int,
         memory: int = MEMORY,
     ):
-        self.count, self.max_steps, self.memory, self.layout_seed = count, max_steps, memory, layout_seed
+        self.count, self.max_steps, self.layout_seed = count, max_steps, layout_seed
+        self.memory: int = memory
         self._envs = [make_checked(make) for _ in range(count)]
         self._label_functions = tuple(labels)
         self.observation_shape = shape_of(self._envs[0])

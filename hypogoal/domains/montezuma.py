@@ -2,7 +2,7 @@
 
 The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezuma_ladders`` (where the ladders are),
 ``montezuma_rollouts`` and ``montezuma_states`` (what is collected), ``montezuma_pictures`` (rooms), ``montezuma_env``
-and ``montezuma_engine`` (one game and many, from the top of a ladder on), ``montezuma_registration`` (its id).
+and ``montezuma_engine`` (one game and many, from the top of a ladder on).
 """
 
 from __future__ import annotations
@@ -21,28 +21,24 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States
+from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS, MontezumaLadder
 from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
-from hypogoal.domains.montezuma_pictures import picture, pixel
-from hypogoal.domains.montezuma_registration import ENV_ID, register
+from hypogoal.domains.montezuma_pictures import observed_pixel, picture, pixel
 from hypogoal.domains.montezuma_rollouts import PLAYS
 from hypogoal.domains.montezuma_states import KINDS, RoomStates, emulator_of_process, gather, labels_of, origins_of
 
 __all__ = [
     "DOMAIN",
-    "ENV_ID",
     "SUB_GOALS",
     "MontezumaConfig",
     "MontezumaDomain",
     "MontezumaEngine",
     "MontezumaLadder",
     "collect",
-    "register",
 ]
-
-register()
 
 # The unlabelled rooms where none are given: the first of these ladder rooms that has no labels, and a room without a
 # ladder; where all have labels, two without.
@@ -92,7 +88,7 @@ class MontezumaConfig:
     unlabelled_from: str = setting(
         "expert",
         "who plays in the unlabelled rooms: the labelled states' expert, or uniformly random actions from their sides",
-        source="Spec B7",
+        source="the paper's suggestion",
         choices=PLAYS,
     )
     workers: int = setting(0, "rooms played in at once, each by a process; 0 for one per core", low=0, high=1024)
@@ -207,8 +203,8 @@ def _states_of(states: RoomStates) -> States:
     return States(states.observations, labels_of(states.ram)[:, None], origins_of(states))
 
 
-class MontezumaDomain:
-    """Spec B6: the ladders of Montezuma's Revenge behind the interface of ``hypogoal.domains.base.Domain``.
+class MontezumaDomain(Domain):
+    """Spec B6: the ladders of Montezuma's Revenge.
 
     Attributes:
         starts: the ladders at whose tops episodes can begin.
@@ -218,14 +214,14 @@ class MontezumaDomain:
     """
 
     name = "montezuma"
-    sub_goals: tuple[str, ...] = SUB_GOALS
-    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    sub_goals = SUB_GOALS
+    observation_shape = OBSERVATION_SHAPE
     config_class = MontezumaConfig
-    env_id = ENV_ID
-    starts: tuple[str, ...] = tuple(ladder.name for ladder in LADDERS)
+    env_id = "hypogoal/MontezumaLadder-v0"
+    starts = tuple(ladder.name for ladder in LADDERS)
     kinds = KINDS
-    resumes = True
-    defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    resumes = measures = pictures = sees_agent = True
+    defaults = MappingProxyType(
         {
             "train-ensemble": {
                 "network": "montezuma",
@@ -253,6 +249,10 @@ class MontezumaDomain:
         """Observations of a collection, at the most: every room labelled, unlabelled and held out."""
         each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
         return ROOMS * each * math.prod(self.observation_shape)
+
+    def played_bytes(self, steps: int, frames: int) -> int:
+        """A frame of each step, as far back as replays reach."""
+        return frames * math.prod(self.observation_shape[:2])
 
     def collect(
         self, config: MontezumaConfig, seed: int, progress: Any, kept: Callable[[str], Checkpoints] | None = None
@@ -296,6 +296,10 @@ class MontezumaDomain:
     def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
         """Where in that picture the agent's middle is, at positions (n, 3): column, row (n, 2)."""
         return pixel(positions)
+
+    def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Where in an observation it is: row, column (n, 2)."""
+        return observed_pixel(positions)
 
 
 DOMAIN = MontezumaDomain()

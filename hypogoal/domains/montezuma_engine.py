@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Step
+from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.montezuma_emulator import (
     N_ACTIONS,
     OBSERVATION_SHAPE,
@@ -26,15 +26,15 @@ from hypogoal.domains.montezuma_emulator import (
     stack_frames,
     state_from_bytes,
 )
-from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, draw_start, labels_of, make_starts
+from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, draw_start, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import ladder_named
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and what is not yet in it
 ROOM, X, Y, DYING = (RAM[name] for name in ("room", "x", "y", "dying"))
 
 
-class MontezumaEngine:
-    """Many games that begin at one ladder, stepped together; see ``hypogoal.domains.base.Engine``.
+class MontezumaEngine(Engine):
+    """Many games that begin at one ladder, stepped together.
 
     Ids 0 .. S-1 are the S start states, for ever; every step of every environment gets a new one. The images of the
     newest ``memory`` of these can be had, positions, labels and who is alive of all.
@@ -59,7 +59,9 @@ class MontezumaEngine:
     """
 
     n_actions = N_ACTIONS
-    observation_shape: tuple[int, ...] = OBSERVATION_SHAPE
+    observation_shape = OBSERVATION_SHAPE
+    position_names = ("room", "x", "y")
+    restarts = resumes = True
 
     def __init__(
         self,
@@ -80,12 +82,12 @@ class MontezumaEngine:
                 "Give one environment or more, and memory for each.",
             )
         self.count, self.max_steps, self.along, self.end_at_death = count, max_steps, along, end_at_death
-        self.memory = memory
+        self.memory: int = memory
         self._arguments = json.dumps(
             [start, count, max_steps, start_states, along, end_at_death, memory, seed]
         ).encode()
         self._emulators = [Emulator(seed + number) for number in range(count)]
-        self.starts = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
+        self.starts: list[Start] = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
         self._rng = rng_for(seed, "start-of-episode")
         self._seen: list[Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))

@@ -6,7 +6,15 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma_emulator import EDGE_Y, LEFT_EDGE, NOOP, RIGHT_EDGE, Emulator
+from hypogoal.domains.montezuma_emulator import (
+    EDGE_Y,
+    LEFT_EDGE,
+    NOOP,
+    OBSERVATION_SHAPE,
+    RIGHT_EDGE,
+    SCREEN,
+    Emulator,
+)
 from hypogoal.domains.montezuma_ladders import SHAFT_ENTRY, SHAFT_EXIT
 
 # The agent is drawn in columns x - 1 .. x + 6 and rows 308 - y .. 327 - y, where x and y are the RAM's: read off the
@@ -26,6 +34,14 @@ def pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
     columns = positions[:, 1] + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2
     rows = SPRITE_TOP - positions[:, 2] + (SPRITE_HEIGHT - 1) / 2
     return np.stack([columns, rows], axis=1)
+
+
+def observed_pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The same in an 84x84 observation, which is that picture made smaller: row, column (n, 2).
+
+    Where the agent is in an observation, a test reads off the emulator.
+    """
+    return (pixel(positions)[:, ::-1] + 0.5) * (np.array(OBSERVATION_SHAPE[:2]) / SCREEN) - 0.5
 
 
 def picture(emulator: Emulator, room: int) -> NDArray[np.uint8]:

@@ -276,7 +276,7 @@ def numbers(work: Work) -> dict[str, Any]:
     names = {artefact.config["domain"] for artefact in found.ladders}
     domain = installed_domain(names.pop()) if len(names) == 1 else None
     used = {row["ladder"] for row in options}
-    starts = [start for start in getattr(domain, "starts", ()) if start in used]
+    starts = [start for start in (domain.starts if domain else ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
     stops = show_stops(options, ladders, executions, domain, work.arrays)
     return {"distance": {"options": options, **distance_tables(options, ladders), "shown": stops}}
@@ -337,7 +337,7 @@ def show_stops(
     Returns:
         Per figure ladder, groups, seed, rooms and columns; none where the domain has no pictures.
     """
-    if domain is None or not (hasattr(domain, "picture") and hasattr(domain, "pixel")):
+    if domain is None or not domain.pictures:
         return []
     first = min((row["seed"] for row in rows), default=0)
     numbers = sorted({row["groups"] for row in rows if row["groups"] is not None}) or [None]
@@ -356,8 +356,8 @@ def show_stops(
                 columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
                 where.append(stops.room)
             if columns:
-                own = domain.rooms_of(ladder) if hasattr(domain, "rooms_of") else ()
-                about = {"ladder": ladder, "groups": groups, "seed": first, "rooms": rooms_shown(where, own)}
+                rooms = rooms_shown(where, domain.rooms_of(ladder))
+                about = {"ladder": ladder, "groups": groups, "seed": first, "rooms": rooms}
                 shown.append({**about, "columns": columns})
     for room in sorted({room for one in shown for room in one["rooms"]}):
         arrays[f"pictures/{room}"] = domain.picture(room)

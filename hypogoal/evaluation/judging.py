@@ -177,8 +177,8 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
     every = judge_all([case for _, case in cases], workers, lambda number: done(cases[number][0]))
     for (number, case), judged in zip(cases, every, strict=True):
         split, unlabelled = states_of(case.data, case.sub_goal)
-        kinds = getattr(installed_domain(open_dataset(case.data).domain), "kinds", ())
-        yield Judgement(number, case, split, unlabelled, kinds, judged)
+        domain = installed_domain(open_dataset(case.data).domain)
+        yield Judgement(number, case, split, unlabelled, domain.kinds if domain else (), judged)
     states_of.cache_clear()
 
 

@@ -261,7 +261,7 @@ def spread(aggregated: Entry | None, digits: int, scale: float = 1.0, error: str
     """Mean, and beside it the standard error where there are several runs; a dash where there is none."""
     if aggregated is None or aggregated["mean"] is None:
         return cell("–")
-    mean, wide = aggregated["mean"], aggregated[error]
+    mean, wide = aggregated["mean"], aggregated.get(error)
     return cell(fixed(scale * mean, digits), "" if wide is None else f"± {scale * wide:.{digits}f}")
 
 

@@ -14,7 +14,7 @@ from scipy.stats import rankdata
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation.accuracy import member_scores
 from hypogoal.evaluation.curves import (
     LEARNED,
@@ -251,9 +251,7 @@ def match_on_layout(source: Artefact, layout_seed: int) -> NDArray[np.float64]:
     from hypogoal.hypotheses.storage import read_ensemble  # with PyTorch, which a report needs not
 
     domain = load_domain(source.config["domain"])
-    known = source.config["domain_config"]
-    extra = {key: known[key] for key in ("keyring", "door_label") if key in known}
-    engine: Any = domain.make_engine(layout_seed, 1, 500, **extra)
+    engine = domain.make_engine(layout_seed, 1, 500, **domain.world(source.config["domain_config"]))
     ids = states_of_layout(engine)
     images, labels = engine.images(ids), engine.labels(ids)
     known_goals = list(domain.sub_goals)
@@ -268,12 +266,11 @@ def match_on_layout(source: Artefact, layout_seed: int) -> NDArray[np.float64]:
     return np.concatenate(match)
 
 
-def states_of_layout(engine: Any, steps: int = 2_000) -> NDArray[np.int64]:
+def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
     """The states of a fresh engine's layout: those that can be reached, or, where nobody knows them, what so many
     steps of random play meet; each once.
     """
-    if hasattr(engine, "reachable"):
-        known: NDArray[np.int64] = engine.reachable()
+    if (known := engine.reachable()) is not None:
         return known
     rng = rng_for(0, "states-of-layout")
     met = [

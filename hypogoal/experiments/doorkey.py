@@ -8,15 +8,15 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.config import STAGES as STAGES
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, closing_cells, stage_cell, with_common
-from hypogoal.learners.baselines.settings import hyperparameters
+from hypogoal.learners.baselines.settings import DQNSettings, hyperparameters
 from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
 
 DOMAIN = "doorkey"
-STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
 DECIDED = {"layout_seed": "layout_seeds", "agent": "baselines"}  # settings of stages, and which of the run's they are
 
 # What things cost on one core of the machine of docs/performance.md: seconds per environment step, per gradient step of
@@ -32,21 +32,23 @@ PER_EVALUATION = 20.0
 class RunConfig:
     """Which cells the experiment has."""
 
-    layout_seeds: tuple[int, ...] = setting((100,), "layouts, each with an agent of its own", source="Spec E4", low=0)
+    layout_seeds: tuple[int, ...] = setting(
+        (100,), "layouts, each with an agent of its own", source="paper, Figure 6", low=0
+    )
     seeds: tuple[int, ...] = setting((0,), "run seeds, each with an ensemble of its own", low=0)
     paired: bool = setting(
         False,
         "the first layout with the first seed, the second with the second, instead of all with all",
-        source="Spec E4",
+        source="paper, Figure 6",
     )
     pretrain: bool = setting(True, "train-options before train-meta; false is the paper's D5")
     controls: tuple[str, ...] = setting(
-        ("random", "oracle"), "controls beside the agent", source="Spec E6", choices=("random", "oracle")
+        ("random", "oracle"), "controls beside the agent", source="ours: controls", choices=("random", "oracle")
     )
     baselines: tuple[str, ...] = setting(
         ("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
         "agents on the primitive actions",
-        source="Spec E7",
+        source="paper, Figure 6",
         choices=("ppo-paper", "ppo-tuned", "dqn-paper", "dqn-tuned"),
     )
     workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
@@ -91,8 +93,8 @@ def cells(
     single = short and len(cases) == 1
     data = out / "data.h5"
     ensemble, play = resolved["train-ensemble"], resolved["train-meta"]
-    states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
-    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_layouts=0))  # type: ignore[attr-defined]
+    states: int = domain.collected_bytes(resolved["collect"])
+    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_layouts=0))
     collecting = Cost(PER_COLLECTION, BASE + 2 * states, states)
     planned = [stage_cell(data, out, ("collect", DOMAIN, *common["collect"]), cost=collecting)]
     goals = len(ensemble.sub_goals or domain.sub_goals)
@@ -144,10 +146,11 @@ def cells(
     for baseline in config.baselines:
         agent, _, kind = baseline.partition("-")
         for layout, seed in cases:
-            arguments = ("train-baseline", DOMAIN, "--agent", agent, "--set", f"setting={kind}")
+            played_by = ("--data", str(data), "--agent", agent, "--set", f"setting={kind}", "--set", f"steps={budget}")
             picture = prod(domain.observation_shape)
-            kept = getattr(hyperparameters(agent, kind), "replay", 0)
+            chosen = hyperparameters(agent, kind)
+            kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             costs = Cost(steps * PER_BASELINE_STEP[baseline], *baseline_needs(picture, kept))
-            agents.append(add(baseline, (*arguments, "--set", f"steps={budget}"), seed, layout, (), costs))
+            agents.append(add(baseline, ("train-baseline", DOMAIN, *played_by), seed, layout, (data,), costs))
     evaluating = Cost(PER_EVALUATION * len(ensembles), BASE + 300e6 + 2 * states, 2 * LOGS)
     return planned + closing_cells(out, (*ensembles.values(), *agents), evaluating)

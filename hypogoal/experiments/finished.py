@@ -5,6 +5,7 @@ It costs the reading of the output's files once (some ms per MB); ``hypogoal ver
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,6 +38,19 @@ def is_finished(cell: Cell) -> bool:
     if fault and cell.stage not in DERIVED:
         raise UserError(fault, cell.out, "Move it out of the run to have it made again.")
     return not fault
+
+
+def stamp_of(cell: Cell) -> tuple[int, int] | None:
+    """Which output of a cell is there: its file's number, and when that was written, in ns; None where none is.
+
+    It gets its name when it is whole.
+    """
+    place = cell.out if cell.stage == "collect" else cell.out / MANIFEST
+    try:
+        found = place.stat()
+    except OSError:
+        return None
+    return (found.st_ino, found.st_mtime_ns) if stat.S_ISREG(found.st_mode) else None
 
 
 def left_of(cells: Sequence[Cell]) -> list[Cell]:

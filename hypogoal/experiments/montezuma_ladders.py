@@ -41,12 +41,12 @@ METHODS: dict[str, tuple[str, ...]] = {
 class RunConfig:
     """Which cells the experiment has."""
 
-    groups: tuple[int, ...] = setting((1, 2, 3, 7), "labelled ladder groups (N)", source="Spec B5", low=1, high=7)
+    groups: tuple[int, ...] = setting((1, 2, 3, 7), "labelled ladder groups (N)", source="Figure 3", low=1, high=7)
     seeds: tuple[int, ...] = setting((0,), "run seeds, each with ensembles of its own", low=0)
     methods: tuple[str, ...] = setting(
         tuple(METHODS),
         "ensembles: D-BAT, the same without diversity, a single CNN",
-        source="Spec F1",
+        source="Figure 3",
         choices=METHODS,
     )
     variants: tuple[str, ...] = setting(
@@ -54,14 +54,16 @@ class RunConfig:
         "changes to compare: settings of train-ensemble as key=value, several with spaces between; each gives one more "
         "ensemble per method",
     )
-    ladders: tuple[str, ...] = setting((), "ladders to learn options on; empty for none", source="Spec D4")
+    ladders: tuple[str, ...] = setting((), "ladders to learn options on; empty for none", source="Figure 4")
     option_groups: tuple[int, ...] = setting(
         (2,), "the N whose ensembles get options; they must be among 'groups'", low=1, high=7
     )
     option_methods: tuple[str, ...] = setting(
         tuple(METHODS), "the ensembles that get options; they must be among 'methods'", choices=METHODS
     )
-    oracle: bool = setting(True, "options that end at the true sub-goal beside them, on each ladder", source="Spec E6")
+    oracle: bool = setting(
+        True, "options that end at the true sub-goal beside them, on each ladder", source="ours: a control"
+    )
     workers: int = setting(0, "cells at once; 0 for one per core", low=0, high=1024)
 
 
@@ -117,8 +119,8 @@ def cells(
     evaluated = judged = 0
 
     domain = load_domain(DOMAIN)
-    states: int = domain.collected_bytes(resolved["collect"])  # type: ignore[attr-defined]
-    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_per_room=0))  # type: ignore[attr-defined]
+    states: int = domain.collected_bytes(resolved["collect"])
+    taught: int = domain.collected_bytes(replace(resolved["collect"], heldout_per_room=0))
     goals = len(ensemble.sub_goals or domain.sub_goals)
     collecting = Cost(PER_COLLECTION, BASE + 2 * states / PLAYING, states, resolved["collect"].workers or PLAYING)
 

@@ -5,6 +5,7 @@ The file is data. Its commands are stages of hypogoal and nothing else, and writ
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
 import tomllib
@@ -15,7 +16,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.config import MAX_PRESET_BYTES, parse_assignments, parse_integers
+from hypogoal.core.config import MAX_PRESET_BYTES, STAGES, parse_assignments, parse_integers
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_text
 from hypogoal.core.workers import cores
@@ -24,7 +25,6 @@ from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_ce
 from hypogoal.experiments.results import COLUMNS
 
 FORMAT_VERSION = 1
-STAGES = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline")
 KEYS = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
 CELL_KEYS = {"name": str, "command": str, "axes": list, "minutes": (int, float), "memory_gb": (int, float)}
 RESERVED = ("--out", "--force", "--resume")
@@ -153,33 +153,28 @@ def _group(row: Any, axes: Mapping[str, Any], known: Mapping[str, _Group], path:
         raise UserError(f"the command cannot be read ({error})", where, MEND) from None
     if not words or words[0] not in STAGES:
         raise UserError("the command must be a stage", where, f"Choose one of {', '.join(STAGES)}.")
-    if any(word.split("=")[0] in RESERVED for word in words):
-        raise UserError(f"{', '.join(RESERVED)} are given by the sweep", where, MEND)
     minutes, memory = float(row.get("minutes", 0)), float(row.get("memory_gb", MEMORY / 1e9))
     if not (0 <= minutes < MOST and 0 <= memory < MOST):
         raise UserError("minutes and memory_gb cannot be this", where, MEND)
-    if words[0] in ("collect", "train-baseline"):
-        load_domain(_domain(words))
     return _Group(name, words, tuple(own), minutes, memory, _cores(words, known))
 
 
 def _cores(words: Sequence[str], known: Mapping[str, _Group]) -> int:
-    """Processes that a command can use: training ensembles one for each sub-goal, as far as those are simply seen."""
+    """Processes that a command can use: training ensembles one for each sub-goal, as far as those are simply seen.
+
+    Of a domain that may not be loaded they are not: what it is, and whether it may run, is for its cell to say.
+    """
     if words[0] != "train-ensemble":
         return 1
     text = " ".join(words)
     settings = dict(re.findall(r"--set[ =](\w+)=(\S+)", text))
     data = (known[name] for name in re.findall(r"\{([\w-]+)\}", text) if name in known)
-    domain = next((_domain(group.words) for group in data if group.words[0] == "collect"), "")
-    goals = (
-        settings["sub_goals"].split(",") if "sub_goals" in settings else load_domain(domain).sub_goals if domain else ()
-    )
+    domain = next((group.words[1] for group in data if group.words[0] == "collect" and group.words[1:]), "")
+    goals: Sequence[str] = settings.get("sub_goals", "").split(",")
+    with contextlib.suppress(UserError):
+        goals = goals if "sub_goals" in settings else load_domain(domain).sub_goals
     asked = settings.get("workers", "")
     return max(1, min(len(goals), int(asked) if asked.isdigit() and int(asked) else len(goals)))
-
-
-def _domain(words: Sequence[str]) -> str:
-    return next((word for word in words[1:] if not word.startswith("-")), "")
 
 
 def _cell(group: _Group, point: Mapping[str, Value], groups: Mapping[str, _Group], out: Path) -> Cell:
@@ -201,6 +196,8 @@ def _cell(group: _Group, point: Mapping[str, Value], groups: Mapping[str, _Group
         return str(needs[-1])
 
     words = [re.sub(r"\{([^{}]*)\}", filled, word) for word in group.words]
+    if any(word.split("=")[0] in RESERVED for word in words):  # and be it by an axis
+        raise UserError(f"{', '.join(RESERVED)} are given by the sweep", f"cells {group.name!r}", MEND)
     cost = Cost(60 * group.minutes, 1e9 * group.memory, cores=group.cores)
     return stage_cell(_place(group, point, out), out, words, needs, cost, {"group": group.name, **point})
 

@@ -15,11 +15,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hypogoal.core.config import parse_assignments, preset_digest
+from hypogoal.core.config import STAGES, parse_assignments, preset_digest
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, replace_text
-from hypogoal.experiments.cells import Cell, Cost, Plan, moved
+from hypogoal.experiments.cells import DERIVED, Cell, Cost, Plan, moved
 
 fcntl: Any  # on POSIX a module, elsewhere None
 try:
@@ -30,9 +30,10 @@ except ImportError:  # Windows: as on a file system that cannot lock
 FORMAT_VERSION = 1
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
-COMMANDS = ("collect", "train-ensemble", "train-options", "train-meta", "train-baseline", "evaluate", "report")
+COMMANDS = (*STAGES, *DERIVED)
 SHORT = ("--members", "--diversity", "--layout-seed", "--agent")  # options that are settings, which --set goes before
 AGAIN = "Start the sweep again."
+GIVE = "Give the command that began it, of 'run' with --resume and without --force: what is complete is kept."
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,8 @@ def excuse(run: Path, cells: Sequence[Cell]) -> None:
     """Have those of the cells that failed count as stopped: they are tried again."""
     for cell in cells:
         record = read_record(run, cell)
-        if record.code:  # and not None, which is said of one that runs
-            write_record(run, cell, replace(record, code=0))
+        if record.code:
+            write_record(run, cell, replace(record, code=None))
 
 
 def open_log(run: Path, cell: Cell) -> BinaryIO:
@@ -186,16 +187,24 @@ def _row(cell: Cell) -> dict[str, Any]:
     }
 
 
+class LostPlan(UserError):
+    """The plan of a sweep that was begun is there and cannot be read."""
+
+
 def read_plan(run: Path) -> tuple[Plan, float]:
     """The plan of a run's folder, and its machine's factor (see :func:`write_plan`).
 
     Raises:
-        UserError: there is none, or what is there is not one.
+        UserError: there is none, or one of a newer format.
+        LostPlan: what is there is not one.
     """
     path = run / PLAN
     if not path.is_file():
         raise UserError("no sweep here", run, "Give the folder of a sweep that was started as --out.")
-    about = read_json(path, "the sweep's plan is", AGAIN)
+    try:
+        about = read_json(path, "the sweep's plan is", GIVE)
+    except UserError as error:
+        raise LostPlan(error.what, path, GIVE) from None
     try:
         if about["format"] > FORMAT_VERSION:
             raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
@@ -211,7 +220,7 @@ def read_plan(run: Path) -> tuple[Plan, float]:
             seen.add(cell.out)
         return plan, float(about["factor"])
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise UserError("the sweep's plan is damaged", path, AGAIN) from None
+        raise LostPlan("the sweep's plan is damaged", path, GIVE) from None
 
 
 def _cell(row: dict[str, Any], run: Path) -> Cell:

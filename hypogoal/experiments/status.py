@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import MANIFEST
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import duration
-from hypogoal.experiments.finished import is_current
+from hypogoal.experiments.finished import is_current, stamp_of
 from hypogoal.experiments.records import Record, is_running, last_line, log_of, read_plan, read_record
 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
@@ -90,16 +89,11 @@ def done_of(plan: Plan) -> set[Path]:
     """
     done: set[Path] = set()
     for cell in plan.cells:
-        if cell.name in plan.anew or not is_there(cell):
+        if cell.name in plan.anew or stamp_of(cell) is None:
             continue
         if cell.stage not in DERIVED or (done.issuperset(cell.needs) and is_current(cell)):
             done.add(cell.out)
     return done
-
-
-def is_there(cell: Cell) -> bool:
-    """Whether a cell's output is there; it gets its name when it is whole."""
-    return (cell.out / MANIFEST).is_file() if cell.stage != "collect" else cell.out.is_file()
 
 
 def time_left(states: Sequence[State], workers: int, factor: float) -> float | None:

@@ -99,3 +99,11 @@ class EnsembleConfig:
         source=BEYOND,
         choices=("0.5", "unlabelled-q95"),
     )
+
+
+@dataclass(frozen=True)
+class TrainEnsembleConfig(EnsembleConfig):
+    """An ensemble's settings, and which sub-goals to train it for."""
+
+    sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
+    workers: int = setting(0, "processes; 0 for one per core", low=0, high=1024)

@@ -59,6 +59,9 @@ class Ensemble(nn.Module):
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self._networks = tuple(reordered(member) for member in self.members if isinstance(member, nn.Sequential))
 
+    def __repr__(self) -> str:
+        return f"Ensemble({len(self)} members, network {self.network!r}, observations uint8 {self.observation_shape})"
+
     def __len__(self) -> int:
         """K, the number of members."""
         return len(self.members)
@@ -85,7 +88,10 @@ class Ensemble(nn.Module):
     def verdicts(
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
     ) -> NDArray[np.bool_]:
-        """Whether each member says that the sub-goal is reached: bool (N, K); see :meth:`predict`."""
+        """Whether each member says that the sub-goal is reached: bool (N, K); see :meth:`predict`.
+
+        Within rounding of its threshold, some 1e-6, a member's verdict may depend on the states judged with it.
+        """
         says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
         return says_yes
 

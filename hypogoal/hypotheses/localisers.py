@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for
-from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, SCREEN
-from hypogoal.domains.montezuma_pictures import pixel
 from hypogoal.hypotheses.batches import grey_maps
 from hypogoal.hypotheses.networks import folded
 
@@ -31,24 +28,30 @@ BLOBS = 2  # at most
 GREY_SHARE = 0.5  # of the states get their shades changed
 
 
+Pixels = Callable[[NDArray[np.int64]], NDArray[np.float64]]  # positions (N, 3) -> row and column (N, 2)
+
+
 class RamLocaliser(nn.Module):
-    """The agent's pixel from its position in the memory of Montezuma's Revenge; what is seen is not looked at.
+    """The agent's pixel from its position in the game's memory; what is seen is not looked at.
 
     An oracle, to be called one wherever its results are shown.
+
+    Args:
+        pixels: the domain's, see ``Domain.agent_pixels``.
     """
 
     needs_positions = True
 
-    def __init__(self, observation_shape: tuple[int, ...]):
+    def __init__(self, pixels: Pixels):
         super().__init__()
-        montezuma_only(observation_shape, "localiser=ram")
+        self.pixels = pixels
 
     def locate(
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
     ) -> NDArray[np.float64]:
-        """Row and column (N, 2) of the agent's middle in observations; from positions (N, 3) of room, x, y."""
+        """Row and column (N, 2) of the agent's middle in observations; from positions (N, 3)."""
         assert positions is not None
-        return pixels_of(positions)
+        return self.pixels(positions)
 
 
 class LearnedLocaliser(nn.Module):
@@ -83,26 +86,6 @@ class LearnedLocaliser(nn.Module):
 
 
 Localiser = RamLocaliser | LearnedLocaliser
-LOCALISERS: dict[str, Callable[[tuple[int, ...]], Localiser]] = {"ram": RamLocaliser, "learned": LearnedLocaliser}
-
-
-def pixels_of(positions: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Row and column (N, 2) of the agent's middle in an 84x84 observation, of positions (N, 3) of room, x, y.
-
-    The observation is the console's picture made smaller; where the agent is in that, a test reads off the emulator.
-    """
-    return (pixel(positions)[:, ::-1] + 0.5) * (np.array(OBSERVATION_SHAPE[:2]) / SCREEN) - 0.5
-
-
-def montezuma_only(observation_shape: tuple[int, ...], why: str) -> None:
-    """Check that positions can be turned into pixels.
-
-    Raises:
-        UserError: observations of another game.
-    """
-    if tuple(observation_shape) != OBSERVATION_SHAPE:
-        found = f"observation shape {tuple(observation_shape)}"
-        raise UserError(f"{why} knows Montezuma's Revenge only", found, "Set view=full.")
 
 
 def fit_localiser(

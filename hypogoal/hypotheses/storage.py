@@ -9,8 +9,9 @@ from typing import Any
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.localisers import LOCALISERS
+from hypogoal.hypotheses.localisers import LearnedLocaliser, RamLocaliser
 from hypogoal.hypotheses.views import AgentView, FullView
 
 
@@ -47,5 +48,8 @@ def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any]) -> Full
     """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
     if config.get("view", "full") == "full":
         return FullView(observation_shape)
-    localiser = LOCALISERS[config["localiser"]](observation_shape)
+    oracle = config["localiser"] == "ram"
+    localiser = (
+        RamLocaliser(load_domain(config["domain"]).agent_pixels) if oracle else LearnedLocaliser(observation_shape)
+    )
     return AgentView(observation_shape, config["crop_height"], config["crop_width"], localiser)

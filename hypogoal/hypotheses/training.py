@@ -19,6 +19,7 @@ from hypogoal.diversity import load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import Pixels
 from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 
 __all__ = ["EnsembleConfig", "fit", "total_steps"]
@@ -43,10 +44,11 @@ def fit(
     *,
     origins: Origins | None = None,
     unlabelled_origins: Origins | None = None,
+    agent_pixels: Pixels | None = None,
     device: torch.device | str = "cpu",
     checkpoints: Checkpoints | None = None,
 ) -> Ensemble:
-    """Eq. (1): the trained members of one sub-goal. On one CPU the same arguments give the same bytes.
+    """Eq. (1): the trained members of one sub-goal. On one CPU in one thread the same arguments give the same bytes.
 
     Args:
         observations: uint8 (N, H, W, C), the labelled states.
@@ -61,6 +63,7 @@ def fit(
             ``room``, ``x``, ``y`` (and ``dying``) for view=agent-crop.
         unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram,
             ``action``, ``previous_action`` for localiser=learned.
+        agent_pixels: the domain's, for view=agent-crop; None where it does not know.
         device: where to train; the ensemble stays there.
         checkpoints: spec G1; ``on_step`` is part of them where it has ``snapshot`` and ``restore``.
 
@@ -80,7 +83,14 @@ def fit(
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
     view = view_of(
-        observations, unlabelled, config, seed_for(seed, "localiser"), origins, unlabelled_origins, fitted=not saved
+        observations,
+        unlabelled,
+        config,
+        seed_for(seed, "localiser"),
+        origins,
+        unlabelled_origins,
+        agent_pixels,
+        fitted=not saved,
     )
     generator = torch_generator(seed, "weights")
     ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)
@@ -133,7 +143,8 @@ def quantile_thresholds(probabilities: NDArray[np.float32]) -> NDArray[np.float3
     """Thresholds float32 (K,) above which each member says yes to 5 % of states, from its probabilities (M, K) of them.
 
     Members of a crop are sure of what is no base and unsure of what is one in a room they do not know; the quantile
-    needs no labels. It stays below 1: a member that is certain of more than 5 % goes on saying yes to those.
+    needs no labels. It stays below 1: a member that is certain of more than 5 % goes on saying yes to those. The state
+    whose probability it is lies at its edge: see :meth:`Ensemble.verdicts`.
     """
     quantiles = np.quantile(probabilities, QUANTILE_LEVEL, axis=0, method="higher").astype(np.float32)
     return np.minimum(quantiles, np.nextafter(np.float32(1), np.float32(0)))

@@ -13,10 +13,9 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.localisers import (
     LearnedLocaliser,
     Localiser,
+    Pixels,
     RamLocaliser,
     fit_localiser,
-    montezuma_only,
-    pixels_of,
 )
 
 Origins = Mapping[str, NDArray[np.int64]]
@@ -133,6 +132,7 @@ def view_of(
     seed: int,
     origins: Origins | None,
     unlabelled_origins: Origins | None,
+    agent_pixels: Pixels | None,
     *,
     fitted: bool,
 ) -> FullView | AgentView:
@@ -141,16 +141,17 @@ def view_of(
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
         return FullView(observations.shape[1:])
-    montezuma_only(observations.shape[1:], "view=agent-crop")
+    if agent_pixels is None:
+        raise UserError("nobody says where in these observations the agent is", "view=agent-crop", "Set view=full.")
     needed(origins, POSITION, "view=agent-crop")
     if len(unlabelled):
         needed(unlabelled_origins, POSITION if config.localiser == "ram" else ACTIONS, f"localiser={config.localiser}")
     if config.localiser == "ram":
-        localiser: Localiser = RamLocaliser(observations.shape[1:])
+        localiser: Localiser = RamLocaliser(agent_pixels)
     elif not fitted:
         localiser = LearnedLocaliser(observations.shape[1:])
     else:
-        localiser = _learned(observations, unlabelled, seed, origins or {}, unlabelled_origins or {})
+        localiser = _learned(observations, unlabelled, seed, origins or {}, unlabelled_origins or {}, agent_pixels)
     return AgentView(observations.shape[1:], config.crop_height, config.crop_width, localiser)
 
 
@@ -160,6 +161,7 @@ def _learned(
     seed: int,
     origins: Origins,
     unlabelled_origins: Origins,
+    agent_pixels: Pixels,
 ) -> LearnedLocaliser:
     """A localiser from the labelled states in which the agent lives (dying it is elsewhere) and from unlabelled ones.
 
@@ -171,4 +173,4 @@ def _learned(
     none = np.zeros(0, dtype=np.int64)
     actions = np.stack([unlabelled_origins.get(name, none) for name in ACTIONS], axis=1)
     known = np.flatnonzero((actions >= 0).all(axis=1))
-    return fit_localiser(observations[alive], pixels_of(positions[alive]), unlabelled[known], actions[known], seed)
+    return fit_localiser(observations[alive], agent_pixels(positions[alive]), unlabelled[known], actions[known], seed)

@@ -2,10 +2,14 @@
 
 Each number behind a stack of convolutions and poolings depends on one square window of pixels. A state that differs
 from known ones in a cell or two has one or two windows that no state had; of the others the numbers are looked up.
+
+Libraries may round otherwise in batches of another size and at another place of a batch. So that a window has the same
+numbers whenever it is computed, and after a break, all batches are of one size and its pixels say its place in them.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -17,7 +21,7 @@ from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.patches import windows_of
 
 MOST = 16_384  # windows kept; with 960 numbers each, 63 MB
-BATCH = 4  # windows computed at once, always so many: a window's numbers do not depend on which came with it
+BATCH = 4  # windows computed at once, always so many
 
 
 def split_of(network: nn.Sequential) -> tuple[int, int, int] | None:
@@ -76,13 +80,16 @@ class KnownWindows:
         return found.view(count, height, width, -1).permute(0, 3, 1, 2)
 
     def _learn(self, windows: Sequence[bytes], first: int, shape: Sequence[int]) -> None:
-        for start in range(0, len(windows), BATCH):
-            some = windows[start : start + BATCH]
+        end = first + len(windows)
+        left = {first + index: zlib.crc32(window) % BATCH for index, window in enumerate(windows)}
+        while left:
+            rows = {place: row for row, place in left.items()}  # one for each place
             pixels = np.zeros((BATCH, *shape), dtype=np.uint8)
-            pixels[: len(some)] = np.frombuffer(b"".join(some), dtype=np.uint8).reshape(-1, *shape)
-            numbers = self.compute(as_input(torch.from_numpy(pixels))).flatten(1)[: len(some)]
-            rows = slice(first + start, first + start + len(some))
-            if rows.stop > len(self._table):
-                more = torch.empty((max(rows.stop, 2 * len(self._table), 1024) - len(self._table), numbers.shape[1]))
+            for place, row in rows.items():
+                pixels[place] = np.frombuffer(windows[row - first], dtype=np.uint8).reshape(shape)
+                del left[row]
+            numbers = self.compute(as_input(torch.from_numpy(pixels))).flatten(1)
+            if end > len(self._table):
+                more = torch.empty((max(end, 2 * len(self._table), 1024) - len(self._table), numbers.shape[1]))
                 self._table = torch.cat([self._table.view(-1, numbers.shape[1]), more])
-            self._table[rows] = numbers
+            self._table[[*rows.values()]] = numbers[[*rows]]

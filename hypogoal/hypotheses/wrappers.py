@@ -103,10 +103,7 @@ class SubgoalReward(_Subgoal):
 
 
 class SubgoalTermination(_Subgoal):
-    """The episode terminates where a sub-goal's classifier fires (Spec D1).
-
-    Args:
-        env, ensemble, by: as of :class:`SubgoalReward`.
+    """The episode terminates where a sub-goal's classifier fires (Spec D1); arguments as of :class:`SubgoalReward`.
 
     ``info["subgoal"]`` says whether the sub-goal holds.
     """

@@ -1,10 +1,14 @@
-"""Settings of the meta-policy (Spec E), with the light recipe as defaults and Table 5 in the ``paper`` preset."""
+"""Settings of agents: where options are played, how the meta-policy learns (Spec D, E).
+
+The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
+from hypogoal.options.config import OptionConfig
 
 
 @dataclass(frozen=True)
@@ -14,7 +18,7 @@ class MetaConfig:
     meta_network: str = setting(
         "light",
         "the paper's three convolutions, or a small one on cells",
-        source="Spec E2",
+        source="paper: three convolutions",
         choices=("light", "paper"),
     )
     head: str = setting(
@@ -23,7 +27,9 @@ class MetaConfig:
         source="gaussian: paper",
         choices=("categorical", "gaussian"),
     )
-    gamma: float = setting(0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="E1")
+    gamma: float = setting(
+        0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="paper: not given"
+    )
     gae_lambda: float = setting(0.95, "advantage trace per decision", source="paper: 0.97", low=0.0, high=1.0)
     decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2)
     epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
@@ -37,4 +43,73 @@ class MetaConfig:
         "advantages are divided by their standard deviation, but by no less than this",
         source="ours: docs/decisions.md; paper: 0",
         low=0.0,
+    )
+
+
+@dataclass(frozen=True)
+class PlayConfig(OptionConfig):
+    """Where options are played, and for how long."""
+
+    start: str = setting(
+        "", "where episodes begin, in a domain that names several such places", source="paper, policy learning"
+    )
+    along: float = setting(
+        0.0,
+        "share of episodes that begin somewhere on the way from 'start'",
+        source="a curriculum, ours",
+        low=0.0,
+        high=1.0,
+    )
+    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
+    max_episode_steps: int = setting(
+        500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
+    )
+    termination: str = setting(
+        "learned",
+        "members' verdicts, or the true sub-goals (upper bound)",
+        source="ours: a control",
+        choices=("learned", "oracle"),
+    )
+    save_visited: int = setting(
+        0,
+        "distinct states visited that are kept as a data file, to train ensembles with",
+        source="the paper's suggestion",
+        low=0,
+    )
+    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
+
+
+@dataclass(frozen=True)
+class TrainOptionsConfig(PlayConfig):
+    """How the options are learned, and for how long."""
+
+    steps: int = setting(
+        60_000, "environment steps, all environments together", unit="steps", source="paper: 3e5 for each option", low=1
+    )
+    steps_for: str = setting(
+        "all",
+        "'steps' are those of all options together, or of each of them",
+        source="paper, policy learning",
+        choices=("all", "each"),
+    )
+    chooser: str = setting(
+        "random",
+        "uniform choice among the options offered, or the one with the fewest steps so far",
+        source="paper, policy learning",
+        choices=("random", "even"),
+    )
+
+
+@dataclass(frozen=True)
+class TrainMetaConfig(PlayConfig, MetaConfig):
+    """How options are learned and chosen, and for how long."""
+
+    steps: int = setting(
+        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
+    )
+    chooser: str = setting(
+        "ppo",
+        "the meta-policy, or uniform choice among those offered",
+        source="ours: a control",
+        choices=("ppo", "random"),
     )

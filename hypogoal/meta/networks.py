@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.options.networks import CellEmbedding
+from hypogoal.options.networks import CellEmbedding, TileNetwork
 
 
-class LightMetaNetwork(nn.Module):
+class LightMetaNetwork(TileNetwork):
     """Cells, two dense layers, actor and critic."""
 
     def __init__(self, observation_shape: tuple[int, ...], options: int, width: int = 128):

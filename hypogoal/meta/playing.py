@@ -3,54 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.hypotheses.storage import read_ensemble
-from hypogoal.options.config import OptionConfig
+from hypogoal.meta.config import MetaConfig, PlayConfig
+from hypogoal.options.config import STACK
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
-from hypogoal.options.memory import STACK
 from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.running import MemberVerdicts
-from hypogoal.options.verdicts import Verdicts, learned_terminations, oracle_terminations
+from hypogoal.options.verdicts import MemberVerdicts, Verdicts, learned_terminations, oracle_terminations
 from hypogoal.options.visited import Visited
 
 LOG_INTERVAL = 2_000  # environment steps
 LEARNERS: dict[str, type[LightLearner] | type[RecurrentLearner]] = {"light": LightLearner, "paper": RecurrentLearner}
-
-
-@dataclass(frozen=True)
-class PlayConfig(OptionConfig):
-    """Where options are played, and for how long."""
-
-    start: str = setting("", "where episodes begin, in a domain that names several such places", source="Spec D4")
-    along: float = setting(
-        0.0,
-        "share of episodes that begin somewhere on the way from 'start'",
-        source="a curriculum, ours",
-        low=0.0,
-        high=1.0,
-    )
-    layout_seed: int = setting(100, "the layout the agent lives on", source="Spec E4", low=0)
-    max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", source="B1", low=1)
-    termination: str = setting(
-        "learned",
-        "members' verdicts, or the true sub-goals (upper bound)",
-        source="E6",
-        choices=("learned", "oracle"),
-    )
-    save_visited: int = setting(
-        0, "distinct states visited that are kept as a data file, to train ensembles with", source="Spec B7", low=0
-    )
-    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="F5", low=0)
 
 
 def build(
@@ -70,7 +41,7 @@ def build(
         UserError: the domain has no such start, or options are to end at true sub-goals that it does not have.
     """
     goals: Sequence[str] = about["sub_goals"]
-    extra = {key: about["domain_config"][key] for key in ("keyring", "door_label") if key in about["domain_config"]}
+    extra = domain.world(about["domain_config"])
     oracle = config.termination == "oracle"
     columns = _columns(domain, goals) if oracle else []
     options = len(goals) * (1 if oracle else about["members"])
@@ -84,8 +55,8 @@ def build(
             verdicts = MemberVerdicts(engine, ensembles)
         else:
             verdicts = Verdicts(learned_terminations(engine, ensembles), options)
-        if hasattr(engine, "reachable"):
-            verdicts.of(engine.reachable())  # most of what will be visited, judged at once
+        if (reachable := engine.reachable()) is not None:
+            verdicts.of(reachable)  # most of what will be visited, judged at once
     return engine, verdicts, LEARNERS[config.network](engine, verdicts, config, seed, device)
 
 
@@ -113,22 +84,21 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
     Raises:
         UserError: the domain has no such start, or it has several and none is given.
     """
-    starts: tuple[str, ...] = tuple(getattr(domain, "starts", ()))
-    if not starts:
+    if not domain.starts:
         if config.start or config.along:
             given = f"start={config.start}" if config.start else f"along={config.along}"
             raise UserError(f"{domain.name} has no named starts", given, "Leave it out.")
         return {}
-    if config.start not in starts:
+    if config.start not in domain.starts:
         what = "unknown start" if config.start else "where are episodes to begin?"
-        raise UserError(what, config.start or "start", f"Give --set start=X, X one of {', '.join(starts)}.")
+        raise UserError(what, config.start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:
     """How many states back an engine must remember: what the replays hold, and the meta-policy's open decisions."""
-    decisions = getattr(config, "decisions", 0)
+    decisions = config.decisions if isinstance(config, MetaConfig) else 0
     asked = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
     return max(LEARNERS[config.network].reach(config, options), asked)
 
@@ -142,13 +112,13 @@ def play(
         loop: as it was when ``steps`` began; where there is a checkpoint, it goes on from there.
         steps: environment steps.
         log, progress: are told of every ``LOG_INTERVAL`` steps.
-        checkpoints: spec G1; of no use where the engine has no ``snapshot``.
+        checkpoints: spec G1; of no use where the engine cannot be resumed.
     """
     recorder = loop.recorder
     end = recorder.steps + steps
     logged = begin = recorder.steps
     numbers: dict[str, float] = {}
-    if checkpoints is None or not hasattr(loop.engine, "snapshot"):
+    if checkpoints is None or not loop.engine.resumes:
         checkpoints = Checkpoints(None)
 
     def state() -> dict[str, Any]:
@@ -177,19 +147,16 @@ def play(
             checkpoints.offer(state)
 
 
-def layout_facts(engine: Any, config: PlayConfig, seed: int) -> dict[str, Any]:
+def layout_facts(engine: Engine, layout_seed: int, episodes: int, seed: int, start: str = "") -> dict[str, Any]:
     """Spec F5: how hard the layout is: its shortest path and how often random play reaches the goal.
 
     Where the engine cannot tell them they are None, and no episode of random play was played.
     """
-    rng = rng_for(seed, "random-play")
-    episodes = config.random_episodes
-    if not hasattr(engine, "random_success"):
-        episodes = 0
+    success = engine.random_success(episodes, rng_for(seed, "random-play")) if episodes else None
     return {
-        **({"start": config.start} if config.start else {}),
-        "layout_seed": config.layout_seed,
-        "shortest_path": engine.shortest_path() if hasattr(engine, "shortest_path") else None,
-        "random_success": engine.random_success(episodes, rng) if episodes else None,
-        "random_episodes": episodes,
+        **({"start": start} if start else {}),
+        "layout_seed": layout_seed,
+        "shortest_path": engine.shortest_path(),
+        "random_success": success,
+        "random_episodes": 0 if success is None else episodes,
     }

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine
+
+STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
 
 
 @dataclass(frozen=True)
@@ -14,7 +18,7 @@ class OptionConfig:
     network: str = setting(
         "light",
         "Q-network: the paper's conv-GRU, or a small one on cells",
-        source="Spec D2",
+        source="paper, appendix; light: ours",
         choices=("light", "paper"),
     )
     experience: str = setting(
@@ -26,12 +30,14 @@ class OptionConfig:
     option_timeout: int = setting(
         10, "an option ends after this many steps", unit="steps", source="paper", low=1, high=32_000
     )
-    restart_options: bool = setting(False, "every option begins a new episode, at a start state", source="Spec D4")
-    mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="Spec D6")
+    restart_options: bool = setting(
+        False, "every option begins a new episode, at a start state", source="paper, policy learning"
+    )
+    mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="ours")
     initiation: str = setting(
         "anywhere",
         "where options may start: anywhere, or where executions showed that they reach their sub-goal in time",
-        source="Spec D7; anywhere: paper",
+        source="ours; anywhere: paper",
         choices=("anywhere", "learned"),
     )
     initiation_threshold: float = setting(
@@ -40,7 +46,9 @@ class OptionConfig:
     initiation_ignored: float = setting(
         0.1, "share of the choices for which none is held back (initiation=learned)", low=0.0, high=1.0
     )
-    bootstrap_timeout: bool = setting(True, "an option's timeout is not a terminal state", source="Spec D2")
+    bootstrap_timeout: bool = setting(
+        True, "an option's timeout is not a terminal state", source="paper, appendix; light: ours"
+    )
     bounded_values: bool = setting(
         True, "values are learned from targets clipped to 0..1, what an option can return", source="ours; paper: false"
     )
@@ -75,7 +83,11 @@ class OptionConfig:
         low=1.1,
         high=10.0,
     )
-    actions: str = setting("all", "the primitive actions: all, or a set that the domain's engine names", source="B4")
+    actions: str = setting(
+        "all",
+        "the primitive actions: all, or a set that the domain's engine names",
+        source="paper, Montezuma's Revenge",
+    )
     epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
     epsilon_final: float = setting(0.05, "exploration in the end", source="paper: 0.01", low=0.0, high=1.0)
     epsilon_from: str = setting(
@@ -88,3 +100,22 @@ class OptionConfig:
     priority_beta: float = setting(
         0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0
     )
+
+
+def require_memory(engine: Engine, reach: int, replay: int) -> None:
+    """Spec D3: what a replay reaches back to must lie within what the engine remembers.
+
+    Args:
+        engine: forgets all but the last ``engine.memory`` states, where that is not None.
+        reach: states.
+        replay: the setting, for the message.
+
+    Raises:
+        UserError: it does not.
+    """
+    if engine.memory is not None and reach > engine.memory:
+        raise UserError(
+            f"the replay reaches back {reach} states, the engine remembers {engine.memory}",
+            f"replay={replay}",
+            f"Give --set replay={max(100, replay - (reach - engine.memory))} or less.",
+        )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -12,6 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import load_domain
 from hypogoal.domains.gymnasium_engine import as_image
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import as_number, require_observations
@@ -20,7 +21,7 @@ from hypogoal.options.initiation import Narrowing
 from hypogoal.options.policies import Policies
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Options:
     """G x K options; option g*K + k aims at member k's hypothesis of sub-goal g.
 
@@ -32,6 +33,7 @@ class Options:
         timeout: steps after which an option ends.
         initiation: holds options back where they rarely reach their sub-goals (D7); None, it holds none back.
         mask_reached: options are not offered where their sub-goals hold already, as they were trained (D6).
+        domain, domain_config: where they were trained, see :meth:`make_env`.
 
     It can be sent to another process.
     """
@@ -43,11 +45,29 @@ class Options:
     timeout: int
     initiation: Narrowing | None = None
     mask_reached: bool = True
+    domain: str = ""
+    domain_config: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        goals = ", ".join(self.sub_goals)
+        return f"Options({self.count} of {goals}: {self.members} members each, at most {self.timeout} steps)"
 
     @property
     def count(self) -> int:
         """G * K."""
         return len(self.sub_goals) * self.members
+
+    def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
+        """The Gymnasium environment that they were trained in, with the settings that its states were collected with.
+
+        Args:
+            arguments: of the environment, such as ``layout_seed``.
+
+        Raises:
+            UserError: the domain is not installed here, is code that the user did not allow, or has no environment.
+        """
+        domain = load_domain(self.domain)
+        return domain.make_env(**{**domain.world(self.domain_config), **arguments})
 
     def name(self, option: int) -> str:
         """For example ``open-red-door/2``."""

@@ -20,7 +20,6 @@ from hypogoal.domains.base import Engine, Step
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
-from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 from hypogoal.options.visited import Visited
 
@@ -53,6 +52,28 @@ class Outcome:
     truncated: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Move:
+    """One step of every environment, arrays (E,): what intra-option policies learn from.
+
+    Attributes:
+        ids, actions, next_ids, rewards: the step.
+        options: the options that were running.
+        terminated: the task is over.
+        timed_out: the option's time was up without reaching its sub-goal.
+        ended: the option stopped here for whatever reason.
+    """
+
+    ids: NDArray[np.int64]
+    actions: NDArray[np.int64]
+    next_ids: NDArray[np.int64]
+    rewards: NDArray[np.float32]
+    options: NDArray[np.int64]
+    terminated: NDArray[np.bool_]
+    timed_out: NDArray[np.bool_]
+    ended: NDArray[np.bool_]
+
+
 class Learner(Protocol):
     """Intra-option policies: see :class:`hypogoal.options.light.LightLearner`."""
 
@@ -65,17 +86,7 @@ class Learner(Protocol):
         explore: bool = True,
     ) -> NDArray[np.int64]: ...
 
-    def observe(
-        self,
-        ids: NDArray[np.int64],
-        actions: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        options: NDArray[np.int64],
-        *,
-        terminated: NDArray[np.bool_],
-        timed_out: NDArray[np.bool_],
-        ended: NDArray[np.bool_],
-    ) -> None: ...
+    def observe(self, move: Move) -> None: ...
 
     def learn(self) -> dict[str, float]: ...
 
@@ -142,7 +153,7 @@ class OptionLoop:
         self.initiation, self.visited = initiation, visited
         self.engine, self.verdicts, self.learner, self.chooser = engine, verdicts, learner, chooser
         self.recorder, self.config, self.gamma = recorder, config, gamma
-        if config.restart_options and not hasattr(engine, "restart"):
+        if config.restart_options and not engine.restarts:
             raise UserError(
                 "this domain's engine cannot begin an episode when asked",
                 "restart_options=true",
@@ -157,7 +168,7 @@ class OptionLoop:
         self.episode_reward = np.zeros(count)
         self.episode_length = np.zeros(count, dtype=np.int64)
         # Spec D4: executions are counted that begin at the start proper, not on the way from there.
-        self.on_the_way = np.array([start.on_the_way for start in getattr(engine, "starts", ())], dtype=np.bool_)
+        self.on_the_way = np.array([start.on_the_way for start in engine.starts], dtype=np.bool_)
         self.counts = np.ones(count, dtype=np.bool_)
         recorder.watch(engine)
         engine.reset()
@@ -172,18 +183,16 @@ class OptionLoop:
             place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
             where = f"in environment {place} under option {option[place]} at step {self.recorder.steps}"
             raise NumericalError(f"the reward is {step.rewards[place]} {where}")
-        reached = self._reached(step.next_ids, option)
+        reached = self.verdicts.running(step.next_ids, option)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
         timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
         ended = reached | timed_out | over
-        self.learner.observe(
-            ids, actions, step.next_ids, option, terminated=step.terminated, timed_out=timed_out, ended=ended
-        )
+        self.learner.observe(Move(ids, actions, step.next_ids, step.rewards, option, step.terminated, timed_out, ended))
         if self.config.restart_options:
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
-            self.engine.restart(ended & ~over)  # type: ignore[attr-defined]
+            self.engine.restart(ended & ~over)
         if self.visited:
             self.visited.see(step.next_ids, actions, step.terminated | step.truncated)
         self.recorder.steps += len(ids)
@@ -196,12 +205,6 @@ class OptionLoop:
             if self.initiation:
                 numbers |= self.initiation.learn()
         return numbers
-
-    def _reached(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether each option's own sub-goal holds in the state it arrived at, bool (E,)."""
-        if self.config.experience == "own" and not self.config.mask_reached:
-            return running_verdicts(self.verdicts, ids, options)  # nobody asks for the other members'
-        return self.verdicts.of(ids)[np.arange(len(ids)), options]
 
     def _choose(self) -> None:
         free = np.flatnonzero(self.option == NONE)

@@ -27,10 +27,10 @@ def action_set(engine: Engine, name: str) -> NDArray[np.int64]:
     """
     if name == ALL:
         return np.arange(engine.n_actions)
-    sets = getattr(engine, "action_sets", {})
-    if name not in sets:
-        raise UserError("unknown set of actions", f"actions={name}", f"Choose one of {', '.join((ALL, *sets))}.")
-    return np.array(sets[name], dtype=np.int64)
+    if name not in engine.action_sets:
+        known = ", ".join((ALL, *engine.action_sets))
+        raise UserError("unknown set of actions", f"actions={name}", f"Choose one of {known}.")
+    return np.array(engine.action_sets[name], dtype=np.int64)
 
 
 def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:

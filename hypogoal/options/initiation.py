@@ -24,7 +24,6 @@ from hypogoal.core.tensors import AGAIN, check_fit, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import gradient_norm
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, apply_to_states
 
 NAME, PREFIX = "initiation.safetensors", "network."
@@ -134,7 +133,7 @@ class Initiation:
         while self._due >= EXECUTIONS_PER_UPDATE:
             self._due -= EXECUTIONS_PER_UPDATE
             drawn = self.rng.integers(min(self.count, KEPT), size=BATCH)
-            drawn = drawn[remembered(self.engine, self.states[drawn])]
+            drawn = drawn[self.engine.remembers(self.states[drawn])]
             if len(drawn):
                 numbers = self._update(drawn)
         return numbers

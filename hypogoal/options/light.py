@@ -27,11 +27,10 @@ from hypogoal.learners.double_dqn import double_q_targets, follow_tensors, linea
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.n_step import StepsAhead
 from hypogoal.learners.replay import PrioritisedReplay
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import STACK, OptionConfig, require_memory
+from hypogoal.options.execution import Move
 from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
-from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
-from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 POSITIVES_KEPT = 512  # per member
@@ -127,29 +126,10 @@ class LightLearner:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return self.actions[chosen]
 
-    def observe(
-        self,
-        ids: NDArray[np.int64],
-        actions: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        options: NDArray[np.int64],
-        *,
-        terminated: NDArray[np.bool_],
-        timed_out: NDArray[np.bool_],
-        ended: NDArray[np.bool_],
-    ) -> None:
-        """Store one step of every environment; all arrays (E,).
-
-        Args:
-            ids, actions, next_ids: the step.
-            options: the options that were running.
-            terminated: the task is over.
-            timed_out: the option's time was up without reaching its sub-goal.
-            ended: the option stopped here for whatever reason.
-        """
-        rows = self.ahead.add(
-            ids, self._index[actions], next_ids, ended, option=options, end=terminated, timeout=timed_out
-        )
+    def observe(self, move: Move) -> None:
+        """Store one step of every environment."""
+        own = {"option": move.options, "end": move.terminated, "timeout": move.timed_out}
+        rows = self.ahead.add(move.ids, self._index[move.actions], move.next_ids, move.ended, **own)
         self.replay.add(**rows)
         here, reached = self._verdicts(rows)
         for place, option in zip(*np.nonzero(reached & ~here), strict=True):
@@ -157,11 +137,11 @@ class LightLearner:
             for name, values in rows.items():
                 self.positive[name][option, slot] = values[place]
             self.positives[option] += 1
-        np.add.at(self.option_steps, options, 1)
+        np.add.at(self.option_steps, move.options, 1)
         found = (self.positives > 0) | (self.steps_since_positive > 0)  # the latter: in the run that this one continues
-        np.add.at(self.steps_since_positive, options, found[options])
-        self.steps += len(ids)
-        self._due += len(ids)
+        np.add.at(self.steps_since_positive, move.options, found[move.options])
+        self.steps += len(move.ids)
+        self._due += len(move.ids)
 
     def _verdicts(self, rows: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which options' sub-goals hold in ``s`` and in ``next`` of transitions, bool (m, O) each.
@@ -173,7 +153,7 @@ class LightLearner:
             return self.verdicts.of(s), self.verdicts.of(following)
         option = rows["option"].astype(np.int64)
         owner = option[:, None] == np.arange(self.options)
-        here, reached = (running_verdicts(self.verdicts, ids, option) for ids in (s, following))
+        here, reached = (self.verdicts.running(ids, option) for ids in (s, following))
         return owner & here[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
@@ -190,9 +170,9 @@ class LightLearner:
     def _batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64], NDArray[np.float32]]:
         counts = np.minimum(self.positives, POSITIVES_KEPT)
         kept: NDArray[np.bool_] | None = None  # where the engine forgets: the slots of states that it remembers
-        if hasattr(self.engine, "oldest"):
+        if self.engine.memory is not None:
             kept = np.arange(POSITIVES_KEPT) < counts[:, None]
-            kept &= remembered(self.engine, self.positive["s"]) & remembered(self.engine, self.positive["next"])
+            kept &= self.engine.remembers(self.positive["s"]) & self.engine.remembers(self.positive["next"])
             counts = kept.sum(1)
         have = np.flatnonzero(counts)
         extra = round(self.config.option_batch * self.config.positives) if len(have) else 0

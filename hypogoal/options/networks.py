@@ -105,7 +105,15 @@ def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | Picture
     return CellEmbedding(observation_shape) if whole else PictureEmbedding(observation_shape)
 
 
-class LightQNetwork(nn.Module):
+class TileNetwork(nn.Module):
+    """A network that also takes the tile codes of images that are made of cells."""
+
+    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
+        """The same from tile codes; see :meth:`CellEmbedding.from_codes`."""
+        raise AssertionError("for subclasses")
+
+
+class LightQNetwork(TileNetwork):
     """One trunk and a head per member (Spec D8): values of every member's policy at once."""
 
     def __init__(self, observation_shape: tuple[int, ...], members: int, actions: int, width: int = 128):
@@ -178,10 +186,11 @@ def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) 
 def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDArray[np.int64]) -> list[Tensor]:
     """As :func:`apply_to_states`, several networks' outputs on the same states."""
     device = next(networks[0].parameters()).device
-    tiles = getattr(engine, "tiles", None)
-    if tiles is not None and all(hasattr(network, "from_codes") for network in networks):
-        codes = tensor(engine.codes(ids).astype(np.int64), device)  # type: ignore[attr-defined]
-        return [network.from_codes(codes, tiles) for network in networks]  # type: ignore[operator]
+    tiles = engine.tiles
+    by_codes = [network for network in networks if isinstance(network, TileNetwork)]
+    if tiles is not None and len(by_codes) == len(networks):
+        codes = tensor(engine.codes(ids).astype(np.int64), device)
+        return [network.from_codes(codes, tiles) for network in by_codes]
     images = tensor(engine.images(ids), device)
     return [network(images) for network in networks]
 

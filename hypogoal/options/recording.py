@@ -66,7 +66,7 @@ class Recorder:
 
     def watch(self, engine: Engine) -> None:
         """Where it is played: of an engine that forgets states, stops are kept as pictures."""
-        self._forgetful = engine if hasattr(engine, "oldest") else None
+        self._forgetful = engine if engine.memory is not None else None
 
     def start_at(self, steps: int) -> None:
         """Environment steps spent before (those of ``train-options``) count in every curve."""

@@ -24,11 +24,10 @@ from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow, gradient_norm, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import STACK, OptionConfig, require_memory
+from hypogoal.options.execution import Move
 from hypogoal.options.exploration import Exploration, action_set, check_actions, check_counters
-from hypogoal.options.memory import STACK, remembered, require_memory
 from hypogoal.options.networks import PaperQNetwork
-from hypogoal.options.running import running_verdicts
 from hypogoal.options.verdicts import Verdicts
 
 FIELDS = {
@@ -146,30 +145,20 @@ class RecurrentLearner:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return self.actions[chosen]
 
-    def observe(
-        self,
-        ids: NDArray[np.int64],
-        actions: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        options: NDArray[np.int64],
-        *,
-        terminated: NDArray[np.bool_],
-        timed_out: NDArray[np.bool_],
-        ended: NDArray[np.bool_],
-    ) -> None:
-        """Collect each execution; store it in its member's replay when it ends. Arrays (E,)."""
-        chosen = self._index[actions]
-        for e in range(len(ids)):
-            steps = self.running[e]
-            steps.append((int(ids[e]), int(chosen[e]), int(next_ids[e]), bool(terminated[e]), bool(timed_out[e])))
-            if ended[e]:
-                self._store(int(options[e]), steps)
+    def observe(self, move: Move) -> None:
+        """Collect each execution; store it in its member's replay when it ends."""
+        chosen = self._index[move.actions]
+        columns = (move.ids, chosen, move.next_ids, move.terminated, move.timed_out)
+        for e, row in enumerate(zip(*(values.tolist() for values in columns), strict=True)):
+            self.running[e].append(row)
+            if move.ended[e]:
+                self._store(int(move.options[e]), self.running[e])
                 self.running[e] = []
 
     def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool]]) -> None:
         member = self.members[option]
         s, a, following, end, timeout = (np.array(column) for column in zip(*steps, strict=True))
-        reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
+        reached = self.verdicts.running(following, np.full(len(following), option))
         member.replay.add(
             s=s, a=a, next=following, terminal=reached | end, timeout=timeout,
             place=np.arange(len(s)), execution=np.full(len(s), member.executions),
@@ -199,8 +188,8 @@ class RecurrentLearner:
         kept = np.arange(int(place.max()) + 1)
         prefix = (indices[:, None] - place[:, None] + kept) % config.replay
         whole = data["execution"][prefix[:, 0]] == data["execution"][indices]
-        whole &= (remembered(self.engine, data["s"][prefix]) | (kept > place[:, None])).all(1)
-        whole &= remembered(self.engine, data["next"][indices])
+        whole &= (self.engine.remembers(data["s"][prefix]) | (kept > place[:, None])).all(1)
+        whole &= self.engine.remembers(data["next"][indices])
         if not whole.any():
             return 0.0
         indices, weights, place, prefix = indices[whole], weights[whole], place[whole], prefix[whole]
@@ -224,7 +213,7 @@ class RecurrentLearner:
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]
         following = data["next"][indices].astype(np.int64)
-        reached = running_verdicts(self.verdicts, following, np.full(len(following), option))
+        reached = self.verdicts.running(following, np.full(len(following), option))
         goal = double_q_targets(
             self._tensor(reached).float(),
             self._tensor(terminal),

@@ -34,7 +34,7 @@ class Visited:
     def __init__(self, engine: Engine, most: int, layout_seed: int, seed: int):
         self.engine, self.most, self.layout_seed = engine, most, layout_seed
         self._key = seed_for(seed, "visited").to_bytes(16, "little")
-        self._forgets = hasattr(engine, "oldest")  # and gives every step a new id
+        self._forgets = engine.memory is not None  # and gives every step a new id
         self._known = np.zeros(1024, dtype=np.bool_)
         self._before = np.full(engine.count, -1, dtype=np.int64)
         self._kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.int64]]] = {}
@@ -59,15 +59,14 @@ class Visited:
         return fresh
 
     def _places(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        if hasattr(self.engine, "positions"):
-            places: NDArray[np.int64] = self.engine.positions(ids)
-            return places
+        if self.engine.position_names:
+            return self.engine.positions(ids)
         return np.full((len(ids), 1), self.layout_seed, dtype=np.int64)
 
     @property
     def origins(self) -> tuple[str, ...]:
         """What is kept of where states come from."""
-        return (*ORIGINS, *(("room", "x", "y") if hasattr(self.engine, "positions") else ("layout_seed",)))
+        return (*ORIGINS, *(self.engine.position_names or ("layout_seed",)))
 
     def _offer(self, picture: NDArray[np.uint8], origin: NDArray[np.int64]) -> None:
         digest = int.from_bytes(blake2b(picture.tobytes(), digest_size=7, key=self._key).digest(), "little")

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import sync
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import replace_file, sync
 from hypogoal.own_data.images import read_image
 
 KINDS = ("positive", "negative", "unlabelled")
@@ -61,11 +61,9 @@ class Marks:
         fresh = file.with_name(f".{file.name}.new")
         try:
             fresh.write_bytes(content)
-            sync(fresh)
-            fresh.replace(file)
+            replace_file(fresh, file)
         finally:
             fresh.unlink(missing_ok=True)
-        sync(file.parent)
         self._files[name] = file
         self._before.append((name, None))
 

@@ -16,7 +16,7 @@ from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, r
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import write_observations
-from hypogoal.meta.recorded import Episode
+from hypogoal.meta.episodes import Episode
 from hypogoal.own_data.parts import Parts
 
 MAIN_FILE = Path("data") / "main_data.hdf5"

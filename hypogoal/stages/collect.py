@@ -56,10 +56,10 @@ def collect(
             raise UserError(f"the data file has lost {', '.join(found.lost)}", out, do)
         before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
         raise check_complete(before, about, given)
-    size = getattr(domain, "collected_bytes", lambda config: 0)(config)
+    size = domain.collected_bytes(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
-        kept = {"kept": partial(checkpoints_of, work.files)} if getattr(domain, "resumes", False) else {}
+        kept = {"kept": partial(checkpoints_of, work.files)} if domain.resumes else {}
         with Progress(f"collect {about['domain']}", total=1, quiet=quiet) as progress:
             collected = domain.collect(config, seed, progress, **kept)
         made = work.files / out.name

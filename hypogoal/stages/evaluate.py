@@ -22,8 +22,8 @@ from hypogoal.evaluation.provenance import provenance
 from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings, summary_table
 from hypogoal.evaluation.run import LAST, WINDOW, find, most_used
 from hypogoal.experiments.cells import DERIVED
+from hypogoal.experiments.finished import stamp_of
 from hypogoal.experiments.records import PLAN, read_plan
-from hypogoal.experiments.status import is_there
 from hypogoal.hypotheses.ensemble import THRESHOLD
 from hypogoal.needs import evaluation_needs
 
@@ -134,6 +134,6 @@ def _unfinished_cells(run: Path) -> list[str]:
     if not (run / PLAN).is_file():
         return []
     planned, _ = read_plan(run)
-    left = [cell.name for cell in planned.cells if cell.stage not in DERIVED and not is_there(cell)]
+    left = [cell.name for cell in planned.cells if cell.stage not in DERIVED and stamp_of(cell) is None]
     names = ", ".join([*left[:5], *(["..."] if len(left) > 5 else [])])
     return [f"{len(left)} of the sweep's cells are not done: {names}"] if left else []

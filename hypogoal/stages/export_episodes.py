@@ -14,8 +14,7 @@ from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.domains.base import load_domain
-from hypogoal.meta.recorded import Episode, play_episodes
-from hypogoal.meta.watched import loop_of, read_agent
+from hypogoal.meta.episodes import Episode, loop_of, play_episodes, read_agent
 from hypogoal.own_data import write_minari
 
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")

@@ -79,7 +79,7 @@ def _too_small(domain: str, shape: tuple[int, ...]) -> list[str]:
 
     name = defaults_of(domain, "train-ensemble", given=True).get("network", EnsembleConfig().network)
     try:
-        with own_code.given(name):  # by the domain, which the user gave
+        with own_code.vouched(name):  # by the domain
             build_network(name, shape, torch_generator(0, "import"))
     except UserError as error:
         return [str(error)]

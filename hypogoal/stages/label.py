@@ -9,12 +9,11 @@ from typing import Any
 
 import gymnasium
 
-import hypogoal
 from hypogoal.core import own_code
 from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import require_names
-from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS
+from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS, Domain
 from hypogoal.own_data import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
 
 HELD_OUT = "heldout"
@@ -76,7 +75,6 @@ def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
     Raises:
         UserError: there is no such thing.
     """
-    hypogoal.register()
     import ale_py
     import minigrid  # noqa: F401 - registers its environments when it is loaded
 
@@ -92,6 +90,4 @@ def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
             raise
         do = "Give a data file, a .npz file, a folder of images, a domain, an environment's id or module:object."
         raise UserError("neither a file nor an environment", source, do) from error
-    if hasattr(found, "env_id"):
-        return gymnasium.make(found.env_id, **arguments)
-    return getattr(found, "make", found)(**arguments)
+    return found.make_env(**arguments) if isinstance(found, Domain) else found(**arguments)

@@ -77,7 +77,7 @@ def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int)
     """Spec E1: episodes of the agents in turn, played from their saved weights, one GIF each."""
     from hypogoal.domains.base import load_domain
     from hypogoal.evaluation.videos import episode_gif
-    from hypogoal.meta.watched import play_episode, read_agent
+    from hypogoal.meta.episodes import play_episode, read_agent
 
     folder.mkdir()
     for index in range(count):

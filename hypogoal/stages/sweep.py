@@ -16,24 +16,25 @@ from typing import Any
 
 from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
-from hypogoal.core.config import STAGES, as_dict, parse_assignments, resolve
+from hypogoal.core.config import TABLES, as_dict, parse_assignments, resolve
 from hypogoal.core.drafts import GO_ON, sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.workers import cores
-from hypogoal.domains.base import CONFIGS, defaults_of, load_domain, stage_config
+from hypogoal.domains.base import defaults_of, load_domain
 from hypogoal.experiments import doorkey, montezuma_ladders
-from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
 from hypogoal.experiments.engines import slurm
 from hypogoal.experiments.engines.local import run_cells
-from hypogoal.experiments.finished import left_of
+from hypogoal.experiments.finished import left_of, stamp_of
 from hypogoal.experiments.own import own_plan
 from hypogoal.experiments.records import (
     FINISHED,
     LOGS,
     PLAN,
     RESULTS,
+    LostPlan,
     check_same,
     excuse,
     forget_records,
@@ -44,6 +45,7 @@ from hypogoal.experiments.records import (
 )
 from hypogoal.experiments.results import write_results
 from hypogoal.experiments.status import done_of
+from hypogoal.settings import CONFIGS
 
 EXPERIMENTS: Mapping[str, Any] = {"doorkey": doorkey, "montezuma-ladders": montezuma_ladders}
 FIGURES = {  # of the paper: the experiment and its preset
@@ -68,8 +70,8 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
                 return experiment.RunConfig
         raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
     if stage not in CONFIGS:
-        raise UserError("no such stage", stage, f"Choose one of {', '.join(STAGES)}.")
-    return stage_config(stage)
+        raise UserError("no such stage", stage, f"Choose one of {', '.join(TABLES)}.")
+    return CONFIGS[stage]
 
 
 def plan(
@@ -198,10 +200,16 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
 
 
 def _begun(out: Path, planned: Plan) -> bool:
-    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with."""
+    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with.
+
+    Raises:
+        LostPlan: that is not known any more.
+    """
     try:
         before, _ = read_plan(out)
         check_same(out, planned.cells)
+    except LostPlan:
+        raise
     except UserError:
         return False
     return len(done_of(replace(planned, anew=before.anew))) < len(planned.cells)
@@ -292,14 +300,22 @@ def _begin(
 ) -> Plan:
     """Before the first cell: is this the sweep of this folder, what will it cost, is that wanted; the plan as written.
 
-    What is to be made again is so until it is, however often the sweep is started.
+    What is to be made again is so until it is, however often the sweep is started. What is there though no plan has it
+    is held against its command: it lay there before, or the plan was lost.
     """
     if alive := slurm.queued(out):
         raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
     anew = frozenset(cell.name for cell in planned.cells) if force else frozenset()
+    unsure = [] if force else [cell for cell in planned.cells if cell.stage not in DERIVED and stamp_of(cell)]
+    lost = "the sweep's plan is gone" if (out / LOGS).is_dir() and not (out / PLAN).exists() else ""
     if not force and (out / PLAN).is_file():
-        check_same(out, planned.cells)
-        anew = read_plan(out)[0].anew
+        try:
+            check_same(out, planned.cells)
+            before = read_plan(out)[0]
+            anew, known = before.anew, {cell.name for cell in before.cells}
+            unsure = [cell for cell in unsure if cell.name not in known]
+        except LostPlan as error:
+            lost = error.what
     planned = replace(planned, anew=anew, presets=preset_digests(planned.cells))
     done = done_of(planned)
     todo = [cell for cell in planned.cells if cell.out not in done]
@@ -313,6 +329,11 @@ def _begin(
     if confirm is not None and seconds > LONG_SECONDS:
         confirm(cost_lines(todo, planned.workers, factor)[-1])
     (out / LOGS).mkdir(parents=True, exist_ok=True)
+    if lost and unsure:  # said to who asked for quiet, too
+        _say(f"{lost}, and is written anew: what is complete is kept where its command makes it")
+        if old := [cell.name for cell in unsure if read_record(out, cell).code != 0]:
+            _say(f"kept, though 'run --force' may have been about to make them again: {', '.join(old)}")
+    _check(unsure, planned, out, say)
     if force:
         forget_records(out, planned.cells)  # before the plan: what an attempt of now began is known by its record
     if todo:
@@ -320,6 +341,19 @@ def _begin(
         (out / FINISHED).unlink(missing_ok=True)
     write_plan(out, planned, factor)
     return planned
+
+
+def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str], None]) -> None:
+    """Have each cell's stage say whether what is there is what its command makes.
+
+    Raises:
+        UserError: one is not.
+    """
+    alone = [replace(cell, needs=()) for cell in cells]
+    outcome = run_cells(replace(planned, cells=alone, anew=frozenset(), workers=cores()), out, say=say, check=True)
+    for name, why in outcome.failed.items():
+        do = "Move it out of the run to have it made, or choose another --out."
+        raise UserError(f"what is there is not what the command of {name} makes: {why}", None, do)
 
 
 def gather(out: Path) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,28 +13,21 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import as_dict, setting
+from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import given
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, open_dataset
 from hypogoal.diversity import load_objective
+from hypogoal.domains.base import installed_domain
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.networks import load_network
 from hypogoal.hypotheses.storage import write_ensemble
-from hypogoal.hypotheses.training import EnsembleConfig, fit
+from hypogoal.hypotheses.training import fit
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
-
-
-@dataclass(frozen=True)
-class TrainEnsembleConfig(EnsembleConfig):
-    """An ensemble's settings, and which sub-goals to train it for."""
-
-    sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
-    workers: int = setting(0, "processes; 0 for one per core", low=0, high=1024)
 
 
 def train_ensemble(
@@ -68,9 +60,8 @@ def train_ensemble(
         NumericalError: a loss became NaN or Inf.
     """
     device = prepare(device)
-    with given(config.diversity, config.network):
-        load_objective(config.diversity)
-        load_network(config.network)
+    load_objective(config.diversity)
+    load_network(config.network)
     dataset = open_dataset(data)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
@@ -177,19 +168,20 @@ def _train_one(
     report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)))
     if not checkpoints.saved:
         report.log.restore(0)
-    with given(config.diversity, config.network):
-        ensemble = fit(
-            split.observations,
-            split.labels,
-            unlabelled,
-            config,
-            seed_for(seed, "ensemble", sub_goal),
-            report,
-            origins=split.origins,
-            unlabelled_origins=origins,
-            device=device,
-            checkpoints=checkpoints,
-        )
+    domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
+    ensemble = fit(
+        split.observations,
+        split.labels,
+        unlabelled,
+        config,
+        seed_for(seed, "ensemble", sub_goal),
+        report,
+        origins=split.origins,
+        unlabelled_origins=origins,
+        agent_pixels=domain.agent_pixels if domain and domain.sees_agent else None,
+        device=device,
+        checkpoints=checkpoints,
+    )
     write_ensemble(folder, sub_goal, ensemble)
     report.log.close()
     return {"sub_goal": sub_goal, **report.numbers}

@@ -7,44 +7,28 @@ count in every curve.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact, sha256_of
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import as_dict, setting
+from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation import run as run_tables
-from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments, visited_by
+from hypogoal.evaluation import run as tables
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.playing import build, layout_facts, play, start_arguments, visited_by
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.needs import play_needs
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.execution import Chooser, OptionLoop
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
-
-
-@dataclass(frozen=True)
-class TrainMetaConfig(PlayConfig, MetaConfig):
-    """How options are learned and chosen, and for how long."""
-
-    steps: int = setting(
-        300_000, "environment steps, all environments together", unit="steps", source="E4: 1.5e6", low=1
-    )
-    chooser: str = setting(
-        "ppo",
-        "the meta-policy, or uniform choice among those offered",
-        source="E6",
-        choices=("ppo", "random"),
-    )
 
 
 def train_meta(
@@ -129,7 +113,8 @@ def train_meta(
             save_tensors(folder / "initiation.safetensors", initiation.state())
         if policy:
             save_tensors(folder / "meta.safetensors", policy.state())
-        (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
+        facts = layout_facts(engine, config.layout_seed, config.random_episodes, seed, config.start)
+        (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")
     return {
         "steps": recorder.steps,
         "episodes": len(recorder.episodes),
@@ -140,7 +125,7 @@ def train_meta(
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     """The rows of an ``episodes.csv``: step, length, reward, terminated."""
-    found = run_tables.read_episodes(path)
+    found = tables.read_episodes(path)
     columns = (found.step, found.length, found.reward, found.terminated.astype(int))
     return list(zip(*(column.tolist() for column in columns), strict=True))
 

@@ -3,46 +3,25 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import as_dict, setting
+from hypogoal.core.config import as_dict
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.meta.playing import PlayConfig, build, layout_facts, play, start_arguments, visited_by
+from hypogoal.meta.config import TrainOptionsConfig
+from hypogoal.meta.playing import build, layout_facts, play, start_arguments, visited_by
 from hypogoal.needs import play_needs
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
-
-
-@dataclass(frozen=True)
-class TrainOptionsConfig(PlayConfig):
-    """How the options are learned, and for how long."""
-
-    steps: int = setting(
-        60_000, "environment steps, all environments together", unit="steps", source="D4: 3e5 for each option", low=1
-    )
-    steps_for: str = setting(
-        "all",
-        "'steps' are those of all options together, or of each of them",
-        source="Spec D4",
-        choices=("all", "each"),
-    )
-    chooser: str = setting(
-        "random",
-        "uniform choice among the options offered, or the one with the fewest steps so far",
-        source="Spec D4",
-        choices=("random", "even"),
-    )
 
 
 def train_options(
@@ -97,14 +76,15 @@ def train_options(
             play(loop, steps, log, progress, checkpoints_of(folder))
         log.close()
         recorder.write(folder, engine.images)
-        if hasattr(engine, "positions") and hasattr(domain, "distance"):
+        if domain.measures and engine.position_names:
             recorder.write_executions(folder, engine.positions, domain.distance)
         if visited:
             visited.write(folder, domain, source.config, seed)
         save_tensors(folder / "options.safetensors", learner.state())
         if initiation:
             save_tensors(folder / "initiation.safetensors", initiation.state())
-        (folder / "layout.json").write_text(json.dumps(layout_facts(engine, config, seed)) + "\n", encoding="utf-8")
+        facts = layout_facts(engine, config.layout_seed, config.random_episodes, seed, config.start)
+        (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")
     counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
     if config.restart_options:
         return counted | recorder.recent(restarted=True)

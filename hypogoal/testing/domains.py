@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from hypogoal.core.config import from_values, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import Collected, States, require_names
-from hypogoal.domains.base import CONFIGS, Domain, Engine, Step, stage_config
+from hypogoal.domains.base import Domain, Engine, Step
+from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Broken, Test, Verdict, run
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
@@ -41,9 +41,9 @@ class _Contract:
 
     def tests(self) -> Iterator[Test]:
         yield "names", self.names
-        if getattr(self.domain, "defaults", None):
+        if self.domain.defaults:
             yield "defaults", self.defaults
-        if hasattr(self.domain, "make"):
+        if self.domain.has_env:
             yield "gymnasium", self.gymnasium
         for test in (self.engine, self.images, self.steps, self.labels, self.determinism, self.going_on):
             yield test.__name__.replace("_", " "), test
@@ -62,24 +62,20 @@ class _Contract:
 
     def defaults(self) -> str:
         """Of each stage settings that it has, with values that it takes."""
-        known: dict[str, Callable[[], type]] = {
-            "collect": lambda: self.domain.config_class,
-            **{one: partial(stage_config, one) for one in CONFIGS},
-        }
-        given: Mapping[str, Mapping[str, Any]] = self.domain.defaults  # type: ignore[attr-defined]
-        for stage, values in given.items():
+        known = {"collect": self.domain.config_class, **CONFIGS}
+        for stage, values in self.domain.defaults.items():
             near = difflib.get_close_matches(str(stage), known, n=1)
             do = f"Did you mean {near[0]!r}?" if near else f"The stages are {', '.join(known)}."
             _is(stage in known, f"defaults are of {stage!r}, which is no stage", do)
             _is(isinstance(values, Mapping), f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
-            from_values(known[stage](), values, stage)
-        return ", ".join(f"{stage} {len(values)}" for stage, values in given.items())
+            from_values(known[stage], values, stage)
+        return ", ".join(f"{stage} {len(values)}" for stage, values in self.domain.defaults.items())
 
     def gymnasium(self) -> str:
         """Gymnasium's own checker."""
         from gymnasium.utils.env_checker import check_env
 
-        env = self.domain.make()  # type: ignore[attr-defined]
+        env = self.domain.make_env()
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             check_env(env, skip_render_check=True, skip_close_check=True)  # closing makes it anew
@@ -88,7 +84,7 @@ class _Contract:
                 warnings.warn(str(one.message), stacklevel=2)
         return f"{env.observation_space.shape} {env.observation_space.dtype}, {env.action_space}"
 
-    def make_engine(self) -> Any:
+    def make_engine(self) -> Engine:
         return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **_start_arguments(self.domain, self.seed))
 
     def engine(self) -> str:
@@ -168,8 +164,11 @@ class _Contract:
 
     def going_on(self) -> str:
         one = self.make_engine()
-        if not (hasattr(one, "snapshot") and hasattr(one, "restore")):
-            warnings.warn("the engine has no snapshot and restore: training on it cannot be resumed", stacklevel=2)
+        if not one.resumes:
+            warnings.warn(
+                "the engine has no snapshot and restore (resumes is false): training on it cannot be resumed",
+                stacklevel=2,
+            )
             return "not looked at"
         actions = list(self.actions(one))
         for row in actions[: STEPS // 2]:
@@ -238,7 +237,7 @@ class _Contract:
         from hypogoal.hypotheses.config import EnsembleConfig
         from hypogoal.hypotheses.networks import build_network
 
-        name = getattr(self.domain, "defaults", {}).get("train-ensemble", {}).get("network", EnsembleConfig().network)
+        name = self.domain.defaults.get("train-ensemble", {}).get("network", EnsembleConfig().network)
         build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"))
         return f"member network {name!r} takes the images"
 
@@ -258,11 +257,10 @@ def _sets(found: Collected) -> list[tuple[str, States]]:
 
 def _start_arguments(domain: Domain, seed: int) -> dict[str, Any]:
     """What the engine of a domain with named starts must be told."""
-    starts = getattr(domain, "starts", ())
-    return {"start": starts[0], "along": 0.0, "memory": 10_000, "seed": seed} if starts else {}
+    return {"start": domain.starts[0], "along": 0.0, "memory": 10_000, "seed": seed} if domain.starts else {}
 
 
-def _same_step(one: Any, other: Any, actions: NDArray[np.int64], where: str, do: str) -> None:
+def _same_step(one: Engine, other: Engine, actions: NDArray[np.int64], where: str, do: str) -> None:
     left, right = one.step(actions), other.step(actions)
     for name in ("rewards", "terminated", "truncated"):
         same = np.array_equal(getattr(left, name), getattr(right, name))

@@ -193,6 +193,15 @@ def test_what_another_process_finished_meanwhile_is_not_replaced(tmp_path: Path)
     assert set(open_artefact(out).manifest["files"]) == {"whole"}
 
 
+def test_who_is_refused_leaves_no_draft(tmp_path: Path) -> None:
+    """Spec G2: a process that comes too late, after the other has tidied up, makes no folder that nobody needs."""
+    out = tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(UserError, match="exists already"), draft(out, {}):
+        raise AssertionError
+    assert [*tmp_path.iterdir()] == [out]
+
+
 def test_an_output_that_is_a_link_is_made_where_it_leads(tmp_path: Path) -> None:
     """Spec A8: another disk, say; nothing is there yet, an empty folder is, or something to be replaced."""
     far, near = tmp_path / "far", tmp_path / "near"

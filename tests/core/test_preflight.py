@@ -40,8 +40,7 @@ def test_a_control_group_allows_less(
     """Spec G1, G4: in a container or a cluster job its limit counts, the cache of files aside."""
     for name, text in (("memory.max", limit), ("memory.current", "2000000"), ("memory.stat", "anon 9\nfile 500000\n")):
         (tmp_path / name).write_text(text)
-    names = ("memory.max", "memory.current", "file")
-    monkeypatch.setattr(preflight, "_folders", lambda: [(tmp_path, names), (tmp_path / "none", names)])
+    monkeypatch.setattr(preflight, "_folders", lambda: [tmp_path, tmp_path / "none"])
     if free is None:
         assert abs((preflight.free_memory() or 0) - (preflight._system() or 0)) < 2**30
     else:
@@ -62,8 +61,7 @@ def test_what_the_process_has_itself_is_not_needed_twice(tmp_path: Path, monkeyp
     limit = own + 300_000_000
     for name, text in (("memory.max", limit), ("memory.current", own), ("memory.stat", "file 0\n")):
         (tmp_path / name).write_text(str(text))
-    names = ("memory.max", "memory.current", "file")
-    monkeypatch.setattr(preflight, "_folders", lambda: [(tmp_path, names)])
+    monkeypatch.setattr(preflight, "_folders", lambda: [tmp_path])
     preflight.preflight("collect", tmp_path / "a", (limit - 20_000_000, 1))
     with pytest.raises(UserError, match="not enough memory"):
         preflight.preflight("collect", tmp_path / "a", (limit + 20_000_000, 1))

@@ -16,13 +16,11 @@ from hypogoal.dataset import Collected
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.domains.doorkey import (
     DOMAIN,
-    ENV_ID,
     SUB_GOALS,
     DoorKeyConfig,
     DoorKeyEnv,
     DoorKeyGrid,
     collect,
-    register,
 )
 from hypogoal.domains.doorkey_env import layout_of
 from hypogoal.domains.doorkey_states import DROP, FORWARD, LEFT, PICKUP, TOGGLE, DoorKeyStates
@@ -60,9 +58,7 @@ def act(env: DoorKeyEnv, *actions: int) -> dict[str, bool]:
 @pytest.mark.parametrize("arguments", [{}, {"layout_seed": 3}, {"keyring": False, "max_steps": 20}])
 def test_gymnasium_accepts_it(arguments: dict[str, int]) -> None:
     """Spec B1: registered, and Gymnasium's own checker has nothing to say (warnings are errors here)."""
-    register()
-    register()
-    env = gymnasium.make(ENV_ID, **arguments)  # type: ignore[arg-type]
+    env = gymnasium.make(DOMAIN.env_id, **arguments)  # type: ignore[arg-type]
     assert env.observation_space == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
     assert env.action_space == gymnasium.spaces.Discrete(7)
     check_env(env.unwrapped, skip_render_check=True)

@@ -38,7 +38,7 @@ from hypogoal.domains.montezuma_states import (
     origins_of,
 )
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.stages.train_options import TrainOptionsConfig
+from hypogoal.meta.config import TrainOptionsConfig
 
 pytestmark = pytest.mark.atari
 

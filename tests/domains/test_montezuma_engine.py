@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.domains import montezuma_env
 from hypogoal.domains.base import Engine
+from hypogoal.domains.montezuma import DOMAIN
 from hypogoal.domains.montezuma_emulator import (
     DOWN,
     FIRE,
@@ -27,7 +28,6 @@ from hypogoal.domains.montezuma_emulator import (
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import SUB_GOALS, MontezumaLadder, descend, draw_start, make_starts
 from hypogoal.domains.montezuma_ladders import BY_NAME, at_base, distance_to_base
-from hypogoal.domains.montezuma_registration import ENV_ID, register
 
 pytestmark = pytest.mark.atari
 
@@ -139,9 +139,7 @@ def test_start_states_that_cannot_be(emulator: Emulator, monkeypatch: pytest.Mon
 
 def test_gymnasium_accepts_it() -> None:
     """Spec B4: Gymnasium's own checker has nothing to say (warnings are errors here); spaces; the id."""
-    register()
-    register()
-    env = gymnasium.make(ENV_ID, start_states=1, max_steps=60, render_mode="rgb_array").unwrapped
+    env = gymnasium.make(DOMAIN.env_id, start_states=1, max_steps=60, render_mode="rgb_array").unwrapped
     assert isinstance(env, MontezumaLadder)
     assert env.observation_space == gymnasium.spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
     assert env.action_space == gymnasium.spaces.Discrete(18)

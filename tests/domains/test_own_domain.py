@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import hypogoal
 from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
@@ -83,3 +85,44 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(
     assert message in err and err.count("\n") == 1
     assert domain != "RAISING" or "corridor_env.py, line " in err
     assert not list(tmp_path.glob("data.h5"))
+
+
+def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6: states are collected, options and agents trained, baselines, films and judgements made in one world."""
+    import corridor_env
+
+    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:MIRRORED")
+    data, run = tmp_path / "run" / "data.h5", tmp_path / "run"
+    small = [word for pair in ("steps=60", "states=30", "mirrored=true") for word in ("--set", pair)]
+    play = [word for pair in ("steps=200", "environments=2", "warm_up=50") for word in ("--set", pair)]
+    few = [word for pair in ("steps=64", "environments=2", "max_episode_steps=20") for word in ("--set", pair)]
+    network = [word for pair in ("steps=5", "workers=1") for word in ("--set", pair)]
+    commands = (
+        ["collect", "corridor_env:MIRRORED", "--out", str(data), *small],
+        ["train-ensemble", str(data), "--out", str(run / "ensemble"), *network],
+        ["train-options", str(run / "ensemble"), "--out", str(run / "options"), *play],
+        ["train-meta", str(run / "ensemble"), "--out", str(run / "meta"), *play],
+        ["train-baseline", "corridor_env:MIRRORED", "--data", str(data), "--out", str(run / "ppo"), *few],
+        ["evaluate", str(run)],
+        ["report", str(run), "--videos", "1"],
+    )
+    for command in commands:
+        corridor_env.Mirrored.played.clear()
+        assert main([*command, *([] if command[0] == "report" else ["-q"])]) == 0
+        worlds = {*corridor_env.Mirrored.played}
+        assert worlds == (set() if command[0] == "train-ensemble" else {True}), command
+    env = hypogoal.load_options(run / "meta").make_env()
+    assert env.unwrapped.mirrored
+
+
+def test_baselines_play_in_the_world_of_the_data(tmp_path: Path) -> None:
+    """Spec E7: without the key ring, where the states were collected without it; not on states of another domain."""
+    data = tmp_path / "data.h5"
+    few = [word for pair in ("keyring=false", "heldout_layouts=1", "labelled_seed=2") for word in ("--set", pair)]
+    assert main(["collect", "doorkey", "--out", str(data), *few, "-q"]) == 0
+    steps = ["--set", "steps=64", "--set", "environments=2", "--layout-seed", "1", "-q"]
+    assert main(["train-baseline", "doorkey", "--data", str(data), "--out", str(tmp_path / "ppo"), *steps]) == 0
+    assert open_artefact(tmp_path / "ppo").config["domain_config"] == {"keyring": False, "door_label": "open"}
+    # On layout 1 nobody gets to the goal without the ring unless keys are dropped.
+    assert json.loads((tmp_path / "ppo" / "layout.json").read_text())["shortest_path"] is None
+    assert main(["train-baseline", "montezuma", "--data", str(data), "--out", str(tmp_path / "other"), *steps]) == 2

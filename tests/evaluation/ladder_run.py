@@ -8,6 +8,7 @@ import numpy as np
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey import DOMAIN as DOORKEY
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import write_ensemble
@@ -24,14 +25,14 @@ COLUMNS = ("step", "option", "duration", "reached", "inside_at_start", "terminat
 METHODS = {"dbat": ("dbat", 2), "none": ("none", 2), "cnn": ("none", 1)}
 
 
-class LadderDomain:
+class LadderDomain(Domain):
     """What the evaluation asks of a domain with rooms; it is never collected from or played."""
 
     name = "ladder_run:DOMAIN"
     sub_goals = (SUB_GOAL,)
     observation_shape = SHAPE
     config_class = DOORKEY.config_class
-    env_id = ""
+    pictures = True
     kinds = KINDS
     starts = ("1L", "2-6")
 

@@ -16,6 +16,7 @@ import pytest
 from slurm import MISSING, cluster, told
 from toy import write_toy
 
+from hypogoal.core import own_code
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import draft_folder, unfinished
 from hypogoal.core.errors import UserError
@@ -88,7 +89,8 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("hypogoal.experiments.engines.slurm.queued", lambda run: [])
     plan, out = some_plan(), tmp_path / "a run"
     asked = Options("long", "4:00:00", "", 1, 0, 7, 90, ("--account=x",))
-    jobs = submit(plan, out, plan.cells, asked)
+    with own_code.given("mine:net"):
+        jobs = submit(plan, out, plan.cells, asked)
     assert [job["name"] for job in jobs] == [
         *("00-collect", "00-train-baseline", "01-train-ensemble", "02-evaluate", "gather")
     ]
@@ -105,6 +107,8 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
         "#SBATCH --requeue",
         "#SBATCH --account=x",
         "set -- e-0 e-1 e-2",
+        "export HYPOGOAL_TRUST=mine:net",
+        f"exec {sys.executable} -P -m hypogoal sweep --out '{out}' --cell \"$1\"",
     ):
         assert f"\n{line}\n" in script, line
     percent = submit(plan, tmp_path / "50%A", plan.cells[:1], Options())

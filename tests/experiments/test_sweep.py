@@ -20,6 +20,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.experiments.engines.local import run_cells
 from hypogoal.experiments.engines.slurm import Options
 from hypogoal.experiments.records import (
+    GIVE,
+    LostPlan,
     Record,
     is_running,
     made_anew,
@@ -129,6 +131,83 @@ def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str])
             err = capsys.readouterr().err
             assert words in err and err.count("\n") == 1, err
     assert [path.name for path in tmp_path.iterdir()] == ["there"] and there.read_text() == "mine"
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[]", '{"format": 1}', "\ud800"])
+def test_a_lost_plan_is_told_with_what_goes_on(
+    swept: Path, tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G2: whatever looks at it says which command goes on and that nothing is lost."""
+    (tmp_path / "sweep.json").write_bytes(damage.encode(errors="surrogatepass"))
+    for words in (["--status"], ["--gather"], ["--cell", "data"]):
+        command = [sys.executable, "-m", "hypogoal", "sweep", "--out", str(tmp_path), *words]
+        if words[0] == "--cell":  # which listens for signals, in a process of its own
+            told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stderr if not damage else GIVE
+        else:
+            assert main(command[3:]) == 2
+            told = capsys.readouterr().err
+        assert GIVE in told and told.count("\n") <= 1
+    with pytest.raises(LostPlan):
+        run(plan(str(swept / "toy.toml"), tmp_path), tmp_path, force=True, resume=True)
+
+
+def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(
+    swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G4: the same command goes on, nothing is made again; what another command made is refused, and stays."""
+    out = tmp_path / "out"
+    shutil.copytree(swept / "whole", out)
+    shutil.rmtree(out / "ensemble" / "seed-1")
+    kept = [out / "data.h5", out / "ensemble/seed-0/manifest.json"]
+    before = [path.stat().st_mtime_ns for path in kept]
+    (out / "sweep.json").write_text("")
+    other = tmp_path / "toy.toml"
+    other.write_text((swept / "toy.toml").read_text().replace("steps=6", "steps=7"))
+    assert main(["sweep", str(other), "--out", str(out), "-q"]) == 2
+    err = capsys.readouterr().err
+    assert "not what the command of ensemble-seed-0 makes: what is complete there was made with steps=6, not 7" in err
+    assert (out / "sweep.json").read_text() == ""
+    assert main(["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]) == 0
+    assert "is written anew: what is complete is kept" in capsys.readouterr().err
+    assert [path.stat().st_mtime_ns for path in kept] == before
+    assert (out / "results.csv").read_bytes() == (swept / "whole" / "results.csv").read_bytes()
+    plan_of = [json.loads((folder / "sweep.json").read_text())["cells"] for folder in (out, swept / "whole")]
+    assert plan_of[0] == plan_of[1]
+
+
+LEAVER = """
+import os
+from own_domain import CorridorDomain
+if os.environ.get("LEAVE"):
+    os._exit(0)
+DOMAIN = CorridorDomain()
+"""
+
+
+def test_a_cell_is_done_when_its_output_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G2: own code that leaves with 0 has made nothing: neither at first, nor in a job, nor made again."""
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT / 'tests'}")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "leaver:DOMAIN")
+    (tmp_path / "leaver.py").write_text(LEAVER)
+    toml, out = tmp_path / "own.toml", tmp_path / "out"
+    toml.write_text('format = 1\nevaluate = false\ncells = [{ name = "data", command = "collect leaver:DOMAIN" }]')
+    monkeypatch.setenv("LEAVE", "1")
+    words = ["sweep", str(toml), "--out", str(out), "-q"]
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert "1 of 1 cells failed" in err and "own code has left the process" in err and err.count("\n") == 1
+    assert [one.state for one in read_status(out).states] == ["failed"]
+    job = [sys.executable, "-m", "hypogoal", "sweep", "--out", str(out), "--cell", "data"]
+    done = subprocess.run(job, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and "own code has left the process" in done.stderr
+    monkeypatch.delenv("LEAVE")
+    assert main(words) == 0
+    monkeypatch.setenv("LEAVE", "1")
+    with pytest.raises(UserError, match="own code has left the process"):
+        run(plan(str(toml), out), out, force=True, quiet=True)
+    assert (out / "data.h5").is_file() and read_plan(out)[0].anew == {"data"}
 
 
 FAILS = f"""
@@ -247,7 +326,9 @@ def test_cells_are_run_in_the_plans_order(tmp_path: Path) -> None:
     assert started() == ["ensemble-seed-0", "more"]
 
 
-def test_what_was_to_be_made_anew_is_so_until_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_to_be_made_anew_is_so_until_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Spec A6, G4: ``run --force`` is interrupted: what stood there before does not pass for what it will make."""
     out = tmp_path / "out"
     planned = plan(str(write_toy(tmp_path / "toy.toml", "0")), out)
@@ -271,6 +352,13 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(tmp_path: Path, monkeypatch:
     assert [one.state for one in read_status(out).states] == ["done", "waiting"] and not (out / "run.json").exists()
     gather(out)
     assert "ensemble" not in (out / "results.csv").read_text() and not (out / "run.json").exists()
+    copy = tmp_path / "copy"
+    shutil.copytree(out, copy)
+    (copy / "sweep.json").write_text("")
+    capsys.readouterr()
+    run(plan(str(tmp_path / "toy.toml"), copy), copy, resume=True, quiet=True)  # what was to be made is not known now
+    told = capsys.readouterr().err
+    assert "kept, though 'run --force' may have been about to make them again: ensemble-seed-0\n" in told
     monkeypatch.setattr("hypogoal.experiments.engines.slurm.check", lambda run, options: None)
     with pytest.raises(UserError, match="still to be made again"):
         submit(planned, out, Options(), quiet=True)

@@ -11,6 +11,7 @@ import torch
 from test_views import CROP, montezuma_states
 
 from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.domains.montezuma_pictures import observed_pixel
 from hypogoal.hypotheses import views
 from hypogoal.hypotheses.localisers import fit_localiser
 from hypogoal.hypotheses.training import EnsembleConfig, fit
@@ -72,6 +73,7 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
             lambda *report: told.append(report),
             origins=origins,
             unlabelled_origins=there,
+            agent_pixels=observed_pixel,
             checkpoints=checkpoints,
         )
         return ensemble.state(), told

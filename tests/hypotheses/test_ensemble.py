@@ -13,8 +13,9 @@ from safetensors.torch import load_file, save_file
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import save_tensors
+from hypogoal.domains.montezuma_pictures import observed_pixel
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble
-from hypogoal.hypotheses.localisers import LOCALISERS
+from hypogoal.hypotheses.localisers import LearnedLocaliser, RamLocaliser
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.storage import read_ensemble, write_ensemble
@@ -141,7 +142,8 @@ def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path
     """Spec A8, G2: a localiser's weights and the thresholds lie beside the members' weights, no pickle."""
     shape = (84, 84, 4)
     torch.manual_seed(0)  # for the localiser's weights
-    view = AgentView(shape, 24, 32, LOCALISERS[localiser](shape))
+    where = RamLocaliser(observed_pixel) if localiser == "ram" else LearnedLocaliser(shape)
+    view = AgentView(shape, 24, 32, where)
     ensemble = Ensemble("montezuma-crop", shape, 2, torch_generator(1, "weights"), view).eval()
     ensemble.set_thresholds(np.array([0.25, 0.75], dtype=np.float32))
     write_ensemble(tmp_path, "goal", ensemble)
@@ -150,6 +152,7 @@ def test_views_and_thresholds_come_back_from_disk(localiser: str, tmp_path: Path
         "observation_shape": list(shape),
         "members": 2,
         "sub_goals": ["goal"],
+        "domain": "montezuma",
         "view": "agent-crop",
         "localiser": localiser,
         "crop_height": 24,

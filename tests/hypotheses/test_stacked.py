@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from uneven import Uneven
 
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import NETWORKS
@@ -57,16 +58,17 @@ def test_known_windows_equal_whole_images() -> None:
 
 
 def test_a_window_s_numbers_do_not_depend_on_its_company() -> None:
-    """Spec G1: a resumed run, which knows no windows yet, judges as one that knows many: to the bit."""
+    """Spec G1: a resumed run, which knows no windows yet, judges as one that knows many, on any processor."""
     rng = np.random.default_rng(1)
     ensembles = [Ensemble("doorkey", (64, 64, 3), 3, torch.Generator().manual_seed(0)).eval() for _ in range(5)]
     states = grid_worlds(40, rng)
     learned = StackedMembers(ensembles, repeats=True)
-    learned.predict(states[rng.permutation(40)])
-    for start in range(0, 40, 3):
-        some = states[start : start + 3]
-        fresh = StackedMembers(ensembles, repeats=True)
-        np.testing.assert_array_equal(fresh.predict(some), learned.predict(some))
+    with Uneven():
+        learned.predict(states[rng.permutation(40)])
+        for start in range(0, 40, 3):
+            some = states[start : start + 3]
+            fresh = StackedMembers(ensembles, repeats=True)
+            np.testing.assert_array_equal(fresh.predict(some), learned.predict(some))
 
 
 def test_networks_without_windows_are_judged_whole() -> None:

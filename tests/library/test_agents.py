@@ -92,6 +92,14 @@ def test_options_do_what_their_members_say(options: Options) -> None:
         assert env.action_masks().tolist() == expected
 
 
+def test_what_a_session_shows_is_one_useful_line(options: Options) -> None:
+    """What there is to use is listed; ensembles and options say what they are."""
+    assert dir(hypogoal) == sorted(hypogoal.__all__)
+    assert repr(options) == "Options(4 of left-end, right-end: 2 members each, at most 10 steps)"
+    ensemble = options.ensembles[0]
+    assert repr(ensemble) == f"Ensemble(2 members, network 'doorkey', observations uint8 {ensemble.observation_shape})"
+
+
 def test_options_are_held_back_by_what_was_learned_of_them(run: Path, options: Options) -> None:
     """Spec D7, E1: initiation sets come with the artefact, and ``action_masks`` goes by them."""
     with pytest.MonkeyPatch.context() as patch:

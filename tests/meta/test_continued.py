@@ -16,14 +16,15 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.learners.baselines.agents import make_agent
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.settings import hyperparameters
+from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.networks import LightMetaNetwork
 from hypogoal.meta.playing import frames_kept
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.execution import Move
 from hypogoal.options.light import LightLearner
 from hypogoal.options.networks import LightQNetwork
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
-from hypogoal.stages.train_meta import TrainMetaConfig
 
 GOALS = 5
 QUICK: dict[str, Any] = {"environments": 2, "warm_up": 20, "update_interval": 4, "option_batch": 8, "replay": 200}
@@ -43,7 +44,7 @@ def walk(learner: Any, steps: int) -> None:
     for _ in range(steps):
         ids, actions = engine.ids.copy(), rng.integers(2, size=2)  # it only turns
         step = engine.step(actions)
-        learner.observe(ids, actions, step.next_ids, options, terminated=nothing, timed_out=nothing, ended=ends)
+        learner.observe(Move(ids, actions, step.next_ids, step.rewards, options, nothing, nothing, ends))
         learner.learn()
 
 

@@ -35,8 +35,9 @@ class Scripted:
     def act(self, ids, options, age, *, explore=True):
         return np.full(len(ids), self.action)
 
-    def observe(self, ids, actions, next_ids, options, *, terminated, timed_out, ended):
-        self.seen.append((ids.copy(), next_ids.copy(), options.copy(), timed_out.copy(), ended.copy()))
+    def observe(self, move):
+        parts = (move.ids, move.next_ids, move.options, move.timed_out, move.ended)
+        self.seen.append(tuple(part.copy() for part in parts))
 
     def learn(self):
         return {}
@@ -137,24 +138,6 @@ def test_choices_are_counted_per_window(tmp_path: Path) -> None:
     assert all(int(row[3]) <= int(row[2]) for row in rows)
     assert len({row[0] for row in rows}) >= 4
     assert sum(int(row[6]) for row in rows) <= recorder.steps == 400
-
-
-def test_verdicts_are_asked_once_per_state() -> None:
-    """Spec D1: the cache gives what the classifier gives and asks it once for each state."""
-    engine, asked = Corridor(1), []
-
-    def classify(ids):
-        asked.extend(ids.tolist())
-        return engine.labels(ids)
-
-    verdicts = Verdicts(classify, 2)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        ids = rng.integers(LENGTH, size=7)
-        np.testing.assert_array_equal(verdicts.of(ids), engine.labels(ids))
-    assert sorted(asked) == list(range(LENGTH))
-    far = np.array([5000])
-    Verdicts(lambda ids: np.ones((len(ids), 2), dtype=bool), 2).of(far)
 
 
 def test_the_tile_path_is_the_image_path() -> None:

@@ -14,22 +14,24 @@ from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import TRUST
+from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import write_ensemble
+from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.recording import EXECUTION_COLUMNS
-from hypogoal.stages.train_options import TrainOptionsConfig, train_options
+from hypogoal.stages.train_options import train_options
 
 BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "environments": 4, "warm_up": 60}
 
 
-class LongCorridorDomain:
+class LongCorridorDomain(Domain):
     """The long corridor's two named cells."""
 
     name = "test_named_starts:DOMAIN"
     sub_goals = ("left-end", "right-end")
     observation_shape = LongCorridor.observation_shape
     config_class = type(None)
-    env_id = ""
+    measures = True
     starts = tuple(LongCorridor.cells)
 
     def collect(self, config, seed, progress):

@@ -12,17 +12,14 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.execution import OptionLoop
 from hypogoal.options.light import LightLearner
-from hypogoal.options.memory import remembered
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels
 from hypogoal.options.policies import make_policies
 from hypogoal.options.recording import EXECUTION_COLUMNS, EXECUTIONS_KEPT, Recorder
 from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.running import MemberVerdicts, running_verdicts
 from hypogoal.options.verdicts import Verdicts, oracle_terminations
 
 LEFT, RIGHT, STAY = 2, 3, 0
@@ -39,7 +36,7 @@ class Script:
     def act(self, ids, options, age, *, explore=True):
         return np.full(len(ids), self.actions.pop(0))
 
-    def observe(self, ids, actions, next_ids, options, **ends):
+    def observe(self, move):
         pass
 
     def learn(self):
@@ -155,7 +152,7 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
     engine = LongCorridor(1, memory=5)
     _, recorder = play(engine, [LEFT, LEFT, *[STAY] * 40], [0] * 12)
     (stop,) = recorder.stops[0]
-    assert not remembered(engine, np.array([stop])).any()
+    assert not engine.remembers(np.array([stop])).any()
     with pytest.raises(ValueError, match="forgotten"):
         engine.images(np.array([stop]))
     recorder.write(tmp_path, engine.images)
@@ -232,9 +229,9 @@ def test_forgotten_states_are_not_learned_from() -> None:
     learner.act = lambda ids, options, age, **_: np.zeros(len(ids), np.int64)  # from now on nothing is reached
     for _ in range(150):
         loop.step()
-    assert not remembered(engine, learner.positive["next"][learner.positive["next"] > 0]).any()
+    assert not engine.remembers(learner.positive["next"][learner.positive["next"] > 0]).any()
     batch, indices, weights = learner._batch()
-    assert remembered(engine, batch["s"]).all() and remembered(engine, batch["next"]).all()
+    assert engine.remembers(batch["s"]).all() and engine.remembers(batch["next"]).all()
     assert len(indices) == len(weights) == config.option_batch, "all of it from the replay"
 
 
@@ -335,43 +332,3 @@ def test_even_choice_gives_every_option_as_many_steps() -> None:
     assert abs(steps[0] - steps[1]) <= 4 * 10 and sum(steps) > 3900
     masked = np.array([[True, False]])
     assert [chooser.choose(np.array([9]), np.zeros(1, np.int64), masked)[0] for _ in range(5)] == [0] * 5
-
-
-class TallCorridor(LongCorridor):
-    """In pictures that the member network takes."""
-
-    observation_shape = (84, 84, 4)
-
-
-def test_running_members_are_judged_alone_and_once() -> None:
-    """Spec D1: the verdicts of each ensemble's own, its thresholds included, member by member, each state once."""
-    engine = TallCorridor(3)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        engine.step(rng.integers(4, size=3))
-    everything = np.arange(engine.n_states)
-    ensembles = [
-        Ensemble("montezuma", engine.observation_shape, 2, torch.Generator().manual_seed(g)).eval() for g in range(2)
-    ]
-    for ensemble in ensembles:  # so that each member says yes in some of the states
-        ensemble.set_thresholds(np.quantile(ensemble.predict(engine.images(everything)), 0.6, axis=0))
-    wanted = np.concatenate([ensemble.verdicts(engine.images(everything)) for ensemble in ensembles], axis=1)
-    assert (wanted.any(0) & ~wanted.all(0)).all()
-    verdicts = MemberVerdicts(engine, ensembles)
-    asked: list[tuple[int, int]] = []
-    ask = verdicts._ask
-
-    def counted(ids, option):
-        asked.extend((int(identity), option) for identity in ids)
-        return ask(ids, option)
-
-    verdicts._ask = counted
-    for _ in range(30):
-        ids, options = rng.integers(engine.n_states, size=9), rng.integers(4, size=9)
-        np.testing.assert_array_equal(running_verdicts(verdicts, ids, options), wanted[ids, options])
-    assert len(set(asked)) == len(asked) > 100
-    np.testing.assert_array_equal(running_verdicts(verdicts, everything[:0], everything[:0]), [])
-    plain = Verdicts(oracle_terminations(engine), 2)
-    options = rng.integers(2, size=len(everything))
-    truth = engine.labels(everything)[everything, options]
-    np.testing.assert_array_equal(running_verdicts(plain, everything, options), truth)

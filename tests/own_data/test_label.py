@@ -14,7 +14,6 @@ import pygame
 import pytest
 from keyboard import label
 
-import hypogoal
 from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
@@ -126,7 +125,6 @@ def test_real_time_is_kept_however_many_keys_go_down(tmp_path: Path) -> None:
 @pytest.mark.atari
 def test_keys_are_actions() -> None:
     """Spec B6: MiniGrid's by name, Atari's by what is held together, others by number."""
-    hypogoal.register()
     grid = action_names(gymnasium.make("hypogoal/DoorKey-8x8-v0"))
     nothing: frozenset[str] = frozenset()
     assert [action_of(grid, key, nothing) for key in ("left", "d", "up", "page up", "space")] == [0, 1, 2, 3, 5]

@@ -15,8 +15,14 @@ from hypogoal.domains.base import Step
 from hypogoal.learners.baselines.agents import epsilon, train
 from hypogoal.learners.baselines.engine_env import EngineEnv
 from hypogoal.learners.baselines.networks import NETWORKS, BlockConvolution
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings, PPOSettings, hyperparameters
-from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
+from hypogoal.learners.baselines.settings import (
+    HYPERPARAMETERS,
+    BaselineConfig,
+    DQNSettings,
+    PPOSettings,
+    hyperparameters,
+)
+from hypogoal.stages.train_baseline import train_baseline
 
 EASY_STEPS = {("ppo", "paper"): 1_000, ("dqn", "paper"): 4_000, ("ppo", "tuned"): 6_000, ("dqn", "tuned"): 12_000}
 

@@ -20,14 +20,17 @@ from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.run import find, read_evaluation
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import write_plan
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.inspection import summary_of
+from hypogoal.learners.baselines.settings import BaselineConfig
+from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.stages.collect import collect
 from hypogoal.stages.evaluate import evaluate, missing, summary_table
 from hypogoal.stages.report import draw_figures, report
-from hypogoal.stages.train_baseline import BaselineConfig, train_baseline
-from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
-from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
-from hypogoal.stages.train_options import TrainOptionsConfig, train_options
+from hypogoal.stages.train_baseline import train_baseline
+from hypogoal.stages.train_ensemble import train_ensemble
+from hypogoal.stages.train_meta import train_meta
+from hypogoal.stages.train_options import train_options
 
 QUIET = {"quiet": True}
 SMALL = {"members": 2, "workers": 1}

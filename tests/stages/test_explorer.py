@@ -11,11 +11,13 @@ from browser import document_of, needs_browser, title_of
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
 from hypogoal.evaluation.explorer import MOST_EXPLAINED, MOST_STATES
+from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.stages.collect import collect
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import report
-from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
-from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
+from hypogoal.stages.train_ensemble import train_ensemble
+from hypogoal.stages.train_meta import train_meta
 
 QUIET = {"quiet": True}
 MEMBERS = 2

@@ -9,19 +9,17 @@ import gymnasium
 import numpy as np
 import pytest
 
-import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS
+from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.playing import build
-from hypogoal.stages.train_options import TrainOptionsConfig
 
 FEW = ["--set", "steps=600", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
 
 
 def walked(layout_seed: int, steps: int) -> np.ndarray:
     """What random play sees, uint8 (steps, 64, 64, 3)."""
-    hypogoal.register()
     env = gymnasium.make("hypogoal/DoorKey-8x8-v0", layout_seed=layout_seed)
     env.reset(seed=0)
     rng = np.random.default_rng(layout_seed)

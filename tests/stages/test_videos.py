@@ -14,13 +14,15 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation.videos import BAR, draw_frame, episode_gif, frame_lines
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.storage import read_ensemble
-from hypogoal.meta.watched import Agent, Frame, play_episode
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.episodes import Agent, Frame, play_episode
 from hypogoal.options.initiation import Initiation
 from hypogoal.stages.collect import collect
 from hypogoal.stages.report import agents_of, draw_videos
-from hypogoal.stages.train_ensemble import TrainEnsembleConfig, train_ensemble
-from hypogoal.stages.train_meta import TrainMetaConfig, train_meta
+from hypogoal.stages.train_ensemble import train_ensemble
+from hypogoal.stages.train_meta import train_meta
 
 QUIET = {"quiet": True}
 CAP, TIMEOUT, MEMBERS = 30, 7, 2

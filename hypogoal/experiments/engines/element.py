@@ -69,7 +69,7 @@ def run_element(run: Path, name: str) -> None:
     if again and (not unfinished(cell.out) or _saved(cell) == before):  # it would come here for ever
         signals.running.log.write(f"hypogoal: {SLOW}\n".encode())
         again, code = False, 1
-    signals.running.ended(code)
+    code = signals.running.ended(code)
     if again:
         _queue_again(cell)
     elif code:

@@ -27,13 +27,14 @@ class Outcome:
     waiting: list[Cell] = field(default_factory=list)
 
 
-def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None]) -> Outcome:
+def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool = False) -> Outcome:
     """Run what is not finished; a cell that fails stops only those that need it.
 
     Args:
         plan: the cells, which of them are to be made again though finished, and how many cores they may use.
         run: the run's folder.
         say: told what happens, a line at a time.
+        check: all are there: have the stage of each say whether its command makes what is there.
     """
     outcome = Outcome(waiting=list(plan.cells))
     places = {cell.name: place for place, cell in enumerate(plan.cells)}
@@ -48,7 +49,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None]) -> Outcome:
                 for cell in ready:  # of which those that are finished make others ready
                     outcome.waiting.remove(cell)
                     try:
-                        if cell.name not in plan.anew and is_finished(cell):
+                        if cell.name not in plan.anew and is_finished(cell) and not check:
                             _add(outcome, made, cell)
                         else:
                             startable.append(cell)
@@ -58,7 +59,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None]) -> Outcome:
             while startable and (cores := _allotted(startable, running, plan.workers, budget)):
                 cell = startable.pop(0)
                 try:
-                    running.append(start(cell, run, cores=cores, force=cell.name in plan.anew))
+                    running.append(start(cell, run, cores=cores, force=cell.name in plan.anew, check=check))
                     say(f"[{len(made)}/{total}] {cell.name} ...")
                 except UserError as error:
                     _fail(outcome, cell, str(error), say)
@@ -67,9 +68,8 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None]) -> Outcome:
             time.sleep(POLL_SECONDS)
             for one in [one for one in running if one.process.poll() is not None]:
                 running.remove(one)
-                one.ended(one.process.returncode)
-                if one.process.returncode:
-                    _fail(outcome, one.cell, reason(run, one.cell, one.process.returncode), say)
+                if code := one.ended(one.process.returncode):
+                    _fail(outcome, one.cell, reason(run, one.cell, code), say)
                 else:
                     if one.cell.name in plan.anew:
                         made_anew(run, one.cell)

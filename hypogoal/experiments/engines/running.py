@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,12 +11,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 from hypogoal.core.drafts import unfinished
-from hypogoal.core.workers import CORES, die_with_parent
+from hypogoal.core.own_code import environment_of_children
+from hypogoal.core.workers import CORES, PYTHON, die_with_parent
 from hypogoal.experiments.cells import Cell
+from hypogoal.experiments.finished import stamp_of
 from hypogoal.experiments.records import Record, begun, open_log, read_record, write_record
 
 # Of the libraries beneath the stages: one thread a process, unless the user says otherwise.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+LEFT = "hypogoal: it ended as if all were well, but made nothing: own code has left the process (sys.exit, os._exit)"
 
 
 @dataclass
@@ -31,19 +33,24 @@ class Running:
     log: BinaryIO
     record: Record
     since: float
+    before: tuple[int, int] | None
 
     @property
     def seconds(self) -> float:
         """Since it was started."""
         return time.monotonic() - self.since
 
-    def ended(self, code: int) -> None:
-        """Write down how it ended, and let go of the log."""
+    def ended(self, code: int) -> int:
+        """Write down how it ended, and let go of the log; returns the exit code, of one that made nothing not 0."""
+        if code == 0 and stamp_of(self.cell) in (None, self.before):
+            self.log.write(f"{LEFT}\n".encode())
+            code = 2
         write_record(self.run, self.cell, replace(self.record, seconds=self.record.seconds + self.seconds, code=code))
         self.log.close()
+        return code
 
 
-def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Running:
+def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False, check: bool = False) -> Running:
     """Start a cell; it goes on where it was, and ends when this process does.
 
     Args:
@@ -51,6 +58,7 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Runn
         run: the run's folder.
         cores: processes that it may use.
         force: make it again, whatever is there; what an attempt of that has begun is gone on with.
+        check: it is there: have its stage say whether this command makes what is there.
 
     Raises:
         UserError: another process runs it.
@@ -61,10 +69,11 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Runn
         record = begun(before)
         write_record(run, cell, record)
         log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
-        fresh = force or cell.out.exists()  # what is there is an evaluation of before
+        fresh = (force or cell.out.exists()) and not check  # what is there is an evaluation of before
         again = "--force" if fresh and not (before.attempts and unfinished(cell.out)) else "--resume"
-        command = [sys.executable, "-m", "hypogoal", *cell.arguments, again]
-        environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores)}
+        made = None if check else stamp_of(cell)
+        command = [*PYTHON, "-m", "hypogoal", *cell.arguments, again]
+        environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores), **environment_of_children()}
         process = subprocess.Popen(
             command,
             stdout=log,
@@ -76,7 +85,7 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False) -> Runn
     except BaseException:
         log.close()
         raise
-    return Running(cell, run, process, cores, log, record, time.monotonic())
+    return Running(cell, run, process, cores, log, record, time.monotonic(), made)
 
 
 def _follow(parent: int) -> Callable[[], None]:

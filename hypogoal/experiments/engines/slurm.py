@@ -13,7 +13,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +22,9 @@ from typing import Any
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text
+from hypogoal.core.own_code import TRUST, environment_of_children
+from hypogoal.core.workers import PYTHON
 from hypogoal.experiments.cells import Cell, Plan, depths
-from hypogoal.experiments.records import AGAIN
 
 FOLDER, JOBS = "slurm", "jobs.json"
 MOST_ELEMENTS = 1000  # of one array, where Slurm does not say: its limit, if nobody changed it, is 1001
@@ -183,22 +183,27 @@ def _script(array: Array, run: Path, options: Options) -> str:
     names = " ".join(shlex.quote(cell.name) for cell in array.cells)
     lines += [
         "trap '' USR2  # until the program listens: the warning must not end it",
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
         f"set -- {names}",
         'shift "$SLURM_ARRAY_TASK_ID"',
-        f'exec {shlex.quote(sys.executable)} -m hypogoal sweep --out {shlex.quote(str(run))} --cell "$1"',
+        f"export {TRUST}={shlex.quote(environment_of_children()[TRUST])}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_sweep(run, '--cell "$1"')]) + "\n"
+
+
+def _sweep(run: Path, what: str) -> list[str]:
+    python = shlex.join(PYTHON)
+    return [
+        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
+        f"exec {python} -m hypogoal sweep --out {shlex.quote(str(run))} {what}",
+    ]
 
 
 def _gather(run: Path, options: Options) -> str:
     lines = _head(run, GATHER, options)
     lines += [
         f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M",
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
-        f"exec {shlex.quote(sys.executable)} -m hypogoal sweep --out {shlex.quote(str(run))} --gather",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_sweep(run, "--gather")]) + "\n"
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
@@ -221,11 +226,12 @@ def jobs_of(run: Path) -> list[str]:
     path = run / FOLDER / JOBS
     if not path.is_file():
         return []
-    jobs = read_json(path, "the list of jobs is", AGAIN)
+    do = "Look with squeue that no job of the sweep waits or runs, then remove this file."
+    jobs = read_json(path, "the list of jobs is", do)
     try:
         numbers = [str(job["id"]) for job in jobs]
     except (KeyError, TypeError):
-        raise UserError("the list of jobs is damaged", path, "Remove it if no job runs.") from None
+        raise UserError("the list of jobs is damaged", path, do) from None
     return [number for number in numbers if number.isdigit()]
 
 

@@ -193,7 +193,7 @@ def train(
         report: called with (step, numbers) every ``interval`` steps.
         interval: steps.
         checkpoints: spec G1; ``report`` is part of them where it has ``snapshot`` and ``restore``. Of no use where the
-            engine has no ``snapshot``.
+            engine cannot be resumed.
         device: where the agent's networks are.
 
     Returns:
@@ -202,7 +202,7 @@ def train(
     Raises:
         NumericalError: NaN or Inf in a weight.
     """
-    if checkpoints is None or not hasattr(env.engine, "snapshot"):
+    if checkpoints is None or not env.engine.resumes:
         checkpoints = Checkpoints(None)
     with own_randomness():
         agent = make_agent(env, chosen, seed, device)

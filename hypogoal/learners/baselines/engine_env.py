@@ -27,7 +27,7 @@ class EngineEnv(VecEnv):
 
     def __init__(self, engine: Engine):
         self.engine = engine
-        self.tiles: NDArray[np.uint8] | None = getattr(engine, "tiles", None)
+        self.tiles = engine.tiles
         space = spaces.Box(0, 255, self._observe(engine.ids[:1]).shape[1:], np.uint8)
         super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
         self.steps = 0
@@ -37,7 +37,7 @@ class EngineEnv(VecEnv):
 
     def _observe(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
         if self.tiles is not None:
-            return self.engine.codes(ids)  # type: ignore[attr-defined]
+            return self.engine.codes(ids)
         return self.engine.images(ids).transpose(0, 3, 1, 2)
 
     def reset(self) -> NDArray[np.uint8]:
@@ -68,7 +68,7 @@ class EngineEnv(VecEnv):
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
         return {
-            "engine": self.engine.snapshot(),  # type: ignore[attr-defined]
+            "engine": self.engine.snapshot(),
             "steps": self.steps,
             "episodes": np.array(self.episodes, np.float64).reshape(-1, 4),
             "rewards": self._rewards.copy(),
@@ -76,7 +76,7 @@ class EngineEnv(VecEnv):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of environments made with the same arguments."""
-        self.engine.restore(snapshot["engine"])  # type: ignore[attr-defined]
+        self.engine.restore(snapshot["engine"])
         self.steps = snapshot["steps"]
         rows = snapshot["episodes"].tolist()
         self.episodes = [(int(row[0]), int(row[1]), row[2], int(row[3])) for row in rows]

@@ -1,9 +1,10 @@
-"""A trained agent's episode, frame by frame: which option runs, what its member says, how long it may (Spec D1, E1)."""
+"""Episodes of a trained agent: frame by frame for films, and as data for other software (Spec D1, E1)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,11 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Domain
-from hypogoal.meta.config import MetaConfig
-from hypogoal.meta.playing import PlayConfig, build
+from hypogoal.meta.config import MetaConfig, PlayConfig
+from hypogoal.meta.playing import build
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import RandomChooser
-from hypogoal.options.execution import Chooser, Learner, OptionLoop
+from hypogoal.options.execution import Chooser, Learner, Move, OptionLoop
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.recording import Recorder
 
@@ -69,13 +70,33 @@ class Agent:
     initiation: dict[str, Tensor] | None = None
 
 
+@dataclass(frozen=True)
+class Episode:
+    """T steps.
+
+    Attributes:
+        observations: uint8 (T + 1, *obs), the last one that of the state it ended in.
+        actions: int64 (T,), primitive ones.
+        options: int64 (T,), which option ran.
+        rewards: float32 (T,).
+        terminated: the task was over; otherwise the episode was cut.
+    """
+
+    observations: NDArray[np.uint8]
+    actions: NDArray[np.int64]
+    options: NDArray[np.int64]
+    rewards: NDArray[np.float32]
+    terminated: bool
+
+
 @dataclass
 class _Onlooker:
     """A learner that is looked at while it acts, and learns nothing."""
 
     learner: Learner
-    loop: OptionLoop | None = None
+    loop: OptionLoop
     frames: list[Frame] = field(default_factory=list)
+    moves: list[Move] = field(default_factory=list)
 
     def act(
         self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
@@ -84,21 +105,12 @@ class _Onlooker:
         self._see(ids, int(options[0]), int(age[0]), "")
         return self.learner.act(ids, options, age, explore=explore)
 
-    def observe(
-        self,
-        ids: NDArray[np.int64],
-        actions: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        options: NDArray[np.int64],
-        *,
-        terminated: NDArray[np.bool_],
-        timed_out: NDArray[np.bool_],
-        ended: NDArray[np.bool_],
-    ) -> None:
-        """What the option arrived at, where it ended there."""
-        if ended[0]:
-            why = "the task is over" if terminated[0] else "its time is up" if timed_out[0] else ""
-            self._see(next_ids, int(options[0]), self.frames[-1].left, why, arrived=True)
+    def observe(self, move: Move) -> None:
+        """The step, and what the option arrived at, where it ended there."""
+        self.moves.append(move)
+        if move.ended[0]:
+            why = "the task is over" if move.terminated[0] else "its time is up" if move.timed_out[0] else ""
+            self._see(move.next_ids, int(move.options[0]), self.frames[-1].left, why, arrived=True)
 
     def learn(self) -> dict[str, float]:
         """Nothing."""
@@ -113,7 +125,6 @@ class _Onlooker:
         self.learner.restore(snapshot)
 
     def _see(self, ids: NDArray[np.int64], option: int, age: int, ended: str, *, arrived: bool = False) -> None:
-        assert self.loop is not None
         says_yes = bool(self.loop.verdicts.of(ids)[0, option])
         left = age - 1 if arrived else self.loop.config.option_timeout - age
         if arrived and not ended:
@@ -139,16 +150,13 @@ def read_agent(artefact: Artefact) -> Agent:
     return Agent(artefact.config, about.config, about.path, options, meta, initiation)
 
 
-def loop_of(
-    agent: Agent, domain: Domain, seed: int, onlooker: Callable[[Learner], Learner] | None = None
-) -> OptionLoop:
+def loop_of(agent: Agent, domain: Domain, seed: int) -> OptionLoop:
     """One environment in which the agent plays.
 
     Args:
         agent: see :class:`Agent`.
         domain: where it lives.
         seed: of the draws.
-        onlooker: what is to stand between the loop and the options' learner.
     """
     config = replace(_settings(PlayConfig, agent.config), environments=1, replay=REPLAY)
     engine, verdicts, learner = build(domain, agent.ensemble, agent.about, config, seed)
@@ -162,29 +170,49 @@ def loop_of(
     if agent.initiation is not None:
         initiation = Initiation(engine, verdicts.options, config, seed)
         initiation.load(agent.initiation)
-    played: Learner = onlooker(learner) if onlooker else learner
     recorder = Recorder(verdicts.options)
-    return OptionLoop(engine, verdicts, played, chooser, recorder, config, gamma=meta.gamma, initiation=initiation)
+    return OptionLoop(engine, verdicts, learner, chooser, recorder, config, gamma=meta.gamma, initiation=initiation)
+
+
+def _watched(loop: OptionLoop) -> Iterator[_Onlooker]:
+    """What an onlooker sees of one episode after the other; options are greedy, and drawn as in training."""
+    learner = loop.learner
+    while True:
+        loop.learner = onlooker = _Onlooker(learner, loop)
+        episodes = len(loop.recorder.episodes)
+        while len(loop.recorder.episodes) == episodes:
+            loop.step(explore=False, learn=False)
+        yield onlooker
 
 
 def play_episode(agent: Agent, domain: Domain, seed: int) -> list[Frame]:
-    """One episode with greedy options; options are drawn as in training.
+    """One episode: a frame per step, and one for the state in which each execution ended.
 
     Args:
         agent: see :class:`Agent`.
         domain: where it lives.
         seed: of the draws.
-
-    Returns:
-        A frame per step, and one for the state in which each execution ended.
     """
-    loop = loop_of(agent, domain, seed, _Onlooker)
-    onlooker = loop.learner
-    assert isinstance(onlooker, _Onlooker)
-    onlooker.loop = loop
-    while not loop.recorder.episodes:
-        loop.step(explore=False, learn=False)
-    return onlooker.frames
+    return next(_watched(loop_of(agent, domain, seed))).frames
+
+
+def play_episodes(loop: OptionLoop, count: int) -> Iterator[Episode]:
+    """So many episodes one after the other.
+
+    Args:
+        loop: from :func:`loop_of`.
+        count: episodes.
+    """
+    for seen in islice(_watched(loop), count):
+        begun = [frame.observation for frame in seen.frames if not frame.ended]
+        last = loop.engine.images(seen.moves[-1].next_ids)[0].copy()
+        yield Episode(
+            np.stack([*begun, last]),
+            np.array([move.actions[0] for move in seen.moves], dtype=np.int64),
+            np.array([move.options[0] for move in seen.moves], dtype=np.int64),
+            np.array([move.rewards[0] for move in seen.moves], dtype=np.float32),
+            bool(loop.recorder.episodes[-1][3]),
+        )
 
 
 def _settings(kind: type[Any], config: Mapping[str, Any]) -> Any:
