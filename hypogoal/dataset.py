@@ -22,7 +22,15 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import claim, versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import parse_json, plain_name, replace_file
+from hypogoal.core.files import (
+    FORMULA,
+    NO_FILE_NAME,
+    parse_json,
+    path_part,
+    plain_name,
+    plain_names,
+    replace_file,
+)
 from hypogoal.core.hdf5 import (
     Foreign,
     attribute,
@@ -42,7 +50,6 @@ ATTRIBUTES = (
     "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete", "lost",
 )  # fmt: skip
 AGAIN, REPAIR = "Collect it again.", "hypogoal verify --repair"
-NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
 
@@ -96,18 +103,18 @@ def leave_out(states: States, *known: NDArray[np.uint8]) -> States:
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
-    """Names of sub-goals become those of files and of groups in HDF5 files, on every system.
+    """Check the names of sub-goals, see ``plain_name``.
 
     Raises:
-        UserError: there is none, one cannot be a file's name, or two differ in upper and lower case only.
+        UserError: there is none, one is no plain name, or two differ in upper and lower case only.
     """
     if not sub_goals:
         raise UserError("there are no sub-goals", None, "Give one at least, with a name.")
     for name in sub_goals:
-        if not plain_name(name) or name.endswith(".") or set(name) & set(NO_FILE_NAME):
-            do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, a dot or space first or last."
+        if not plain_name(name):
+            do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, dot or space first or last, any of {FORMULA} first."
             raise UserError("a sub-goal's name must be able to be a file's name", repr(name), do)
-    if len({name.casefold() for name in sub_goals}) < len(sub_goals):
+    if not plain_names(sub_goals):
         do = "Give them different names; upper and lower case are one to some file systems."
         raise UserError("two sub-goals have the same name", ", ".join(sub_goals), do)
 
@@ -124,9 +131,12 @@ def write_dataset(
     """Write collected states; the file appears under its name only when it is whole.
 
     Raises:
-        UserError: see :func:`require_names`, or the file exists.
+        UserError: see :func:`require_names`, an origin's name is none, or the file exists.
     """
     require_names(collected.sub_goals)
+    for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
+        if not path_part(origin):
+            raise UserError("an origin's name must be able to be a file's name", repr(origin), "Leave out separators.")
     path = claim(path, kind=DATA, force=force)
     parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -217,8 +227,8 @@ class Dataset:
         self.lost: tuple[str, ...] = tuple(map(str, self._json("lost", list))) if self.attributes["lost"] else ()
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
-        names = all(map(plain_name, self.sub_goals)) and len(set(self.sub_goals)) == len(self.sub_goals)
-        if not (sizes and names and self.observation_shape and self.sub_goals and isinstance(self.domain, str)):
+        names = plain_names(self.sub_goals)
+        if not (sizes and names and self.observation_shape and isinstance(self.domain, str)):
             raise foreign
 
     def labelled(self, sub_goal: str) -> Split:

@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,14 @@ import torch
 from safetensors.torch import save_file
 from toy_data import SHAPE, write
 
+from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
 from hypogoal.core.hdf5 import set_attribute
 from hypogoal.core.tensors import load_fitting, load_tensors
-from hypogoal.dataset import open_dataset
+from hypogoal.dataset import Collected, States, open_dataset, write_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import stage_cell
 from hypogoal.experiments.own import own_plan
@@ -110,16 +112,59 @@ def test_a_bomb_is_weighed_before_it_is_unpacked(tmp_path: Path, monkeypatch: py
         open_dataset(path).labelled("one")
 
 
-@pytest.mark.parametrize(
-    "names", [["../../x"], ["/abs"], ["a/b"], [""], [".hidden"], ["a", "a"], [1], {}, "one", ["\n"]]
-)
+NO_NAMES = [
+    "../../x", "/abs", "a/b", "", ".hidden", "a.", " a", "a ", "\n", "a\0b", r"\q", "x" * 201, "a\u2028b", "\u202ea", 1,
+    'a"><img src=x onerror=alert(1)>', "<b>", "a:b", "a|b", "a?", "a*", "=1+1", "+x", "-x", "@x", "－x",
+]  # fmt: skip
+NAMES = ["open-red-door", "at the door", "türe_2", "去门口", "a.b", "$x$", "R&D", "a=b, c+d", "(2) #1", "x'y", "50%"]
+
+
+@pytest.mark.parametrize("names", [*([name] for name in NO_NAMES), ["a", "a"], ["a", "A"], [], {}, "one"])
 def test_names_of_sub_goals_become_files(tmp_path: Path, names: Any) -> None:
-    """Spec G2: a sub-goal called ../../x would be written outside --out."""
+    """Spec G2: one rule, where names are written and where they are read: ../../x would be written outside --out."""
     path = write(tmp_path / "data.h5")
     with h5py.File(path, "a") as file:
         set_attribute(file, "sub_goals", json.dumps(names))
     with pytest.raises(UserError, match="not a hypogoal data file"):
         open_dataset(path)
+    out = artefact(tmp_path / "meta") / "manifest.json"
+    out.write_text(json.dumps(json.loads(out.read_text()) | {"config": {"sub_goals": names}}))
+    with pytest.raises(UserError, match="'sub_goals' is malformed"):
+        open_artefact(out.parent)
+    if isinstance(names, list):
+        states = States(np.zeros((2, *SHAPE), "u1"), np.zeros((2, len(names)), bool))
+        with pytest.raises(UserError, match=r"name|no sub-goals") as caught:
+            write_dataset(
+                tmp_path / "b.h5", Collected(SHAPE, tuple(names), states, states, states), domain="", config={}, seed=0
+            )
+        assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("command", ["verify", "show", "train-ensemble"])
+def test_no_command_takes_mark_up_for_a_name(tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: a data file alone, whole but for a sub-goal's name, which would be an id on the report's page."""
+    path, name = write(tmp_path / "data.h5", domain="montezuma"), 'one"><img src=x onerror=alert(1)>'
+    with h5py.File(path, "a") as file:
+        set_attribute(file, "sub_goals", json.dumps([name, "two"]))
+        for split in ("labelled", "heldout"):
+            file.move(f"{split}/one", f"{split}/{name}")
+    assert main([command, str(path), *(["--out", str(tmp_path / "out")] if "train" in command else [])]) == 2
+    said = capsys.readouterr()
+    (line,) = (said.err or said.out).strip().splitlines()
+    assert "not a hypogoal data file" in line and not (tmp_path / "out").exists()
+
+
+def test_names_of_every_script_are_names(tmp_path: Path) -> None:
+    """Spec B6: what is written is read, by its name."""
+    states = States(np.zeros((2, *SHAPE), "u1"), np.ones((2, len(NAMES)), bool))
+    write_dataset(
+        tmp_path / "a.h5", Collected(SHAPE, tuple(NAMES), states, states, states), domain="", config={}, seed=0
+    )
+    assert list(open_dataset(tmp_path / "a.h5").counts()["labelled"]) == NAMES
+    for origin in ("a/b", "..", "\n"):
+        odd = replace(states, origins={origin: np.zeros(2, np.int64)})
+        with pytest.raises(UserError, match="an origin's name"):
+            write_dataset(tmp_path / "b.h5", Collected(SHAPE, ("a",), odd, odd, odd), domain="", config={}, seed=0)
 
 
 def test_labels_that_are_a_single_number(tmp_path: Path) -> None:

@@ -5,17 +5,23 @@ Sizes are looked at before anything is read, names before anything is opened. De
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeGuard
 
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import UserError, printable
 
 MAX_TEXT_BYTES = 64 * 2**20
 MAX_JSON_DEPTH = 32
 MAX_NAME_BYTES = 200
 MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
+NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
+FORMULA = "=+-@＝＋－＠"  # signs with which a spreadsheet begins to compute, of full width too
 
 
 def require_file(path: Path, what: str, do: str) -> int:
@@ -130,10 +136,28 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def plain_name(name: object) -> bool:
-    """Whether a text can be part of a file's name and of a message: no separators, no control characters, no dot first.
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A CSV file with a header, whole or not at all; numbers stay numbers, no text is a formula to a spreadsheet."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in (columns, *rows))
+    replace_text(path, text.getvalue())
 
-    Names of sub-goals become files of weights and groups of HDF5 files: ``../../x`` must not.
+
+def _harmless(value: Any) -> Any:
+    """A cell: in a text an apostrophe in front of what would begin a formula, there or after another separator."""
+    if not isinstance(value, str):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return re.sub(rf"(^|[,;\"])(?=\s*[{re.escape(FORMULA)}])", r"\1'", printable(value))
+    return value
+
+
+def path_part(name: object) -> TypeGuard[str]:
+    """Whether a text can be a part of a path and of a message: no separators, no control characters, no dot first.
+
+    What a file says is in a folder must not be ``../../x``.
     """
     return (
         isinstance(name, str)
@@ -145,9 +169,24 @@ def plain_name(name: object) -> bool:
     )
 
 
+def plain_name(name: object) -> TypeGuard[str]:
+    """Whether a text can be the name of a sub-goal or the like: one rule, where names are written and where read.
+
+    Names become those of files, on every system, words of commands, cells of tables. Letters of any script are fine.
+    """
+    return path_part(name) and not name.endswith(".") and name[0] not in FORMULA and not set(name) & set(NO_FILE_NAME)
+
+
+def plain_names(names: object) -> bool:
+    """Whether this is a list of plain names, two of which are not the same where upper and lower case are one."""
+    if not (isinstance(names, list | tuple) and names and all(map(plain_name, names))):
+        return False
+    return len({name.casefold() for name in names}) == len(names)
+
+
 def inside(folder: Path, name: object) -> Path | None:
     """The file called ``name`` (``a/b.csv``) in ``folder``; None where it would lie outside, links followed."""
-    if not isinstance(name, str) or not name or not all(plain_name(part) for part in name.split("/")):
+    if not isinstance(name, str) or not name or not all(path_part(part) for part in name.split("/")):
         return None
     path = folder / PurePosixPath(name)
     try:

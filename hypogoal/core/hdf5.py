@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, require_file
+from hypogoal.core.files import path_part, require_file
 from hypogoal.core.preflight import free_memory, human
 
 FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # all of them built into h5py
@@ -122,7 +122,7 @@ def members(group: Any) -> list[str]:
         names = sorted(group) if count <= MAX_ENTRIES else []
     except (OSError, RuntimeError, ValueError, KeyError, TypeError):
         raise Foreign("a group is not readable") from None
-    if count > MAX_ENTRIES or not all(map(plain_name, names)):
+    if count > MAX_ENTRIES or not all(map(path_part, names)):
         raise Foreign("a group has names that cannot be right")
     return names
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, parse_json, plain_name, read_json
+from hypogoal.core.files import MOST_INTEGER, parse_json, plain_name, plain_names, read_json
 
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
@@ -76,10 +76,6 @@ def _files(value: Any) -> bool:
     return isinstance(value, dict) and all(_text(name) and _text(digest) for name, digest in value.items())
 
 
-def _plain_names(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and all(map(plain_name, value)) and len({*value}) == len(value)
-
-
 def _size(value: Any) -> bool:
     return _count(value) and 0 < value < 1 << 16
 
@@ -94,7 +90,7 @@ WANTED: dict[str, Callable[[Any], bool]] = {
     "files": _files,
 }
 SETTINGS: dict[str, Callable[[Any], bool]] = {
-    "sub_goals": _plain_names,
+    "sub_goals": plain_names,
     "members": _size,
     "observation_shape": lambda value: isinstance(value, list) and bool(value) and all(map(_size, value)),
     "domain_config": lambda value: isinstance(value, dict),

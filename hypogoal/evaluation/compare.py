@@ -20,6 +20,7 @@ from hypogoal.evaluation.page import (
     comparison_tables,
     label,
     listed,
+    pick,
     section,
     shown,
     table,
@@ -256,7 +257,7 @@ def _curve(
     grid = np.linspace(0, end, POINTS).round().astype(np.int64)
     lines = []
     for index, (run, agent, called) in enumerate(drawn):
-        place = next(i for i, one in enumerate(runs[run]["agents"]) if one["name"] == agent)
+        place = [one["name"] for one in runs[run]["agents"]].index(agent)
         own = arrays[run]
         values = on_grid(own[f"curves/{place}/{quantity}"], own["curves/grid"], grid)
         lines.append(curves.Line(called, values, PALETTE[index], dashed=index % 2 == 1))
@@ -273,7 +274,7 @@ def _curve(
 
 
 def _count(metrics: Mapping[str, Any], agent: str) -> str:
-    found = next(one for one in metrics["agents"] if one["name"] == agent)["runs"]
+    found = pick(metrics["agents"], "name", agent)["runs"]
     layouts, seeds = (sorted({run[key] for run in found}) for key in ("layout_seed", "seed"))
     count = f"{len(found)} run{'s' if len(found) > 1 else ''}"
     return f"{count}: layout seeds {listed(layouts)}, run seeds {listed(seeds)}"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.curves import settings_of, variants
-from hypogoal.evaluation.page import Block, Material, Question, fixed, percent, picture, section, texts
+from hypogoal.evaluation.page import Block, Material, Question, fixed, percent, pick, picture, section, texts
 from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
 from hypogoal.evaluation.saliency import BASELINE
 
@@ -114,7 +113,7 @@ def explorer_section(material: Material) -> Block:
         needed = "a new evaluation: evaluate --force" if old else "an ensemble artefact: train-ensemble"
         missing = [f"States to browse: they need {needed}."]
         return section("explorer", TITLE, [], [], missing)
-    source = next(one for one in material.metrics["ensembles"] if one["path"] == found["ensemble"])
+    source = pick(material.metrics["ensembles"], "path", found["ensemble"])
     shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
         f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them: {shown:,} "
@@ -133,8 +132,7 @@ def explorer_section(material: Material) -> Block:
         "place": _any(sorted(places, key=_natural)),
         "kind": _any(sorted(kinds)),
     }
-    script = resources.files("hypogoal.evaluation").joinpath("templates/explorer.js").read_text(encoding="utf-8")
-    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "script": script}
+    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}}
     return section("explorer", TITLE, [text], [block])
 
 
@@ -150,7 +148,7 @@ def _natural(place: str) -> tuple[int, str]:
 
 
 def _goal(material: Material, source: Mapping[str, Any], sub_goal: str) -> dict[str, Any]:
-    numbers = next(row for row in source["sub_goals"] if row["sub_goal"] == sub_goal)
+    numbers = pick(source["sub_goals"], "sub_goal", sub_goal)
     members = [
         {"facts": _facts(member), "options": _options(material, source["path"], sub_goal, member["member"])}
         for member in numbers["members"]

@@ -5,8 +5,6 @@ Nothing is averaged over runs that were not made alike: what differs has another
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections import Counter
@@ -197,15 +195,6 @@ def rows_of(numbers: Mapping[str, Any], **place: Any) -> Iterable[Row]:
     for name, value in numbers.items():
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             yield Row(name, value, **place)
-
-
-def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table as CSV, None as nothing."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(header)
-    table.writerows(rows)
-    return text.getvalue()
 
 
 def plain(value: Any) -> Any:

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from hashlib import sha256
 from importlib import resources
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hypogoal.evaluation.pictures import image_png, reduced
-from hypogoal.evaluation.plots import COLOURS, to_svg
+from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +31,11 @@ if TYPE_CHECKING:
 
 Block = dict[str, Any]
 Entry = Mapping[str, Any]
+# What a browser may do with the page. Attributes of style are matplotlib's; they run and fetch nothing.
+POLICY = (
+    "default-src 'none'; script-src {script}; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'"
+)
 CAPTION = (
     "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
     "better, a tie counting half, with its 95 % bootstrap interval (2,000 resamples {drawn}); 0.5: neither is. An "
@@ -202,15 +209,28 @@ def section(
 
 
 def shown(material: Material, drawn: Drawn) -> Block:
-    """A figure on the page; it is added to the material's ``figures``."""
-    svg = ""
+    """A figure on the page; it is added to the material's ``figures`` by the :func:`slug` of its name."""
+    name, svg = slug(drawn.name), ""
     if drawn.figure is not None:
-        material.figures[drawn.name] = drawn.figure
-        svg = material.drawings[drawn.name] = to_svg(drawn.figure, drawn.name)
+        material.figures[name] = drawn.figure
+        svg = material.drawings[name] = to_svg(drawn.figure, name)
+        svg = re.sub(r"<style.*?</style>", "", svg, flags=re.S)  # the page allows its own alone, which says the same
         for colour, variable in COLOURS.items():
             svg = svg.replace(colour, f"var(--{variable})")
     about = {"label": drawn.label, "caption": drawn.caption, "missing": drawn.missing, "folded": drawn.folded}
-    return {"kind": "figure", "id": f"figure-{drawn.name}", "svg": svg, "heading": drawn.heading, **about}
+    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, "heading": drawn.heading, **about}
+
+
+def pick(rows: Iterable[Entry], key: str, value: Any) -> Entry:
+    """The first of the rows with this value.
+
+    Raises:
+        LookupError: none has it.
+    """
+    for one in rows:
+        if one[key] == value:
+            return one
+    raise LookupError(f"nothing whose {key!r} is {value!r}")
 
 
 def picture(image: NDArray[np.uint8]) -> str:
@@ -342,19 +362,34 @@ def _signed(value: float | None, digits: int) -> str:
 
 
 def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
-    """Sections as one HTML file that needs nothing else."""
+    """Sections as one HTML file that needs nothing else.
+
+    Every text in it is escaped but our own style and script and what matplotlib drew; should a text of a file ever slip
+    through, the page's policy still lets nothing run and nothing be fetched.
+    """
     import jinja2
 
     loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    css, script = (
+        resources.files("hypogoal.evaluation").joinpath(f"templates/{name}").read_text(encoding="utf-8")
+        for name in ("report.css", "explorer.js")
+    )
     return environment.get_template("report.html").render(
         title=title,
         subtitle=subtitle,
         version=version,
-        css=resources.files("hypogoal.evaluation").joinpath("templates/report.css").read_text(encoding="utf-8"),
+        policy=POLICY.format(script=_digest(script), style=_digest(css)),
+        css=css,
+        script=script,
         sections=sections,
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
+
+
+def _digest(text: str) -> str:
+    """As a policy names a script or a style that is in the page."""
+    return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from hashlib import blake2b
 from typing import Any
 
 import matplotlib
@@ -110,13 +111,20 @@ def show_picture(place: Axes, image: NDArray[np.uint8], title: str) -> None:
     place.set_title(title, fontsize=9)
 
 
+def slug(text: str) -> str:
+    """An id, or a file's name without its ending: of other signs than letters, digits, - and _ a digest is left."""
+    plain = re.sub(r"[^\w-]+", "-", text)[:80]
+    return text if plain == text else f"{plain}-{blake2b(text.encode(), digest_size=4).hexdigest()}"
+
+
 def to_svg(figure: Figure, name: str) -> str:
     """The figure as an SVG document, the same bytes each time.
 
     Args:
         figure: any figure.
-        name: makes the ids inside unique among several on one page.
+        name: its :func:`slug` makes the ids inside unique among several on one page.
     """
+    name = slug(name)
     buffer = io.StringIO()
     with styled({"svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})

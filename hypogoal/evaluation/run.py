@@ -5,10 +5,11 @@ Each damaged file is told in one line (Spec G2).
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import inspect
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_text
+from hypogoal.core.files import plain_name, read_json, read_text
 from hypogoal.core.hdf5 import Foreign, members, open_hdf5, read_array, walk
 
 TRAIN_AGAIN, AGAIN = "Train the agent again.", "Evaluate the run again."
@@ -269,6 +270,15 @@ class Evaluated:
     arrays: Mapping[str, NDArray[Any]]
 
 
+@contextlib.contextmanager
+def fitting(where: object) -> Iterator[None]:
+    """Drawing an evaluation, whose numbers are a file's: what does not fit is told in one line."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise UserError("the evaluation does not fit this hypogoal, or is damaged", where, AGAIN) from error
+
+
 def read_evaluation(run: Path, start: str = "") -> Evaluated:
     """The evaluation of a run: that in ``run/evaluation`` where there are several.
 
@@ -322,7 +332,17 @@ def _metrics(path: Path) -> dict[str, Any]:
     lacking = [part for part in PARTS if part not in metrics]
     if lacking:
         raise UserError(f"evaluated by an older hypogoal (no {', '.join(lacking)})", path, AGAIN)
+    for name in _sub_goals(metrics):
+        if not plain_name(name):
+            raise UserError(f"a sub-goal in the evaluation has a name that is none, {name!r}", path, AGAIN)
     return metrics
+
+
+def _sub_goals(part: Any) -> Iterator[Any]:
+    if isinstance(part, dict):
+        yield from [part["sub_goal"]] if "sub_goal" in part else []
+    for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
+        yield from _sub_goals(inner)
 
 
 def _arrays(path: Path, start: str) -> dict[str, NDArray[Any]]:

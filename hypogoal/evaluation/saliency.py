@@ -14,7 +14,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question, picture, section, texts, verdict
+from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question, pick, picture, section, texts, verdict
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
 from hypogoal.evaluation.plots import BLUE, VERMILLION, grid_of_pictures, show_picture, styled
 
@@ -164,7 +164,7 @@ def examples_section(material: Material) -> Block:
         missing = ["No example states: they need an ensemble artefact."]
         return section("examples", "Example states", [], [], missing)
     shown = material.metrics["saliency"]["ensemble"]
-    source = next(ensemble for ensemble in material.metrics["ensembles"] if ensemble["path"] == shown)
+    source = pick(material.metrics["ensembles"], "path", shown)
     text = (
         f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
         "probability that the sub-goal is reached. Orange: verdicts that differ from the truth. Chosen to show "

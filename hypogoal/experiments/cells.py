@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name
+from hypogoal.core.files import path_part
 
 DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
 Axes = tuple[tuple[str, str | int | float], ...]
@@ -93,10 +93,10 @@ def stage_cell(
     axes: Mapping[str, str | int | float] | None = None,
 ) -> Cell:
     """The cell of a stage that writes ``out`` within the run's folder; its name is its place there."""
-    if not all(map(plain_name, out.relative_to(run).parts)):
+    if not all(map(path_part, out.relative_to(run).parts)):
         raise UserError("this would be written outside the run", out, "Leave separators and dots out of names.")
     name = out.relative_to(run).as_posix().removesuffix(".h5").replace("/", "-")
-    if not plain_name(f"{name}.json"):
+    if not path_part(f"{name}.json"):
         raise UserError("this name is too long for a file", name, "Choose shorter ones.")
     return Cell(name, (*arguments, "--out", str(out)), out, tuple(needs), cost, tuple((axes or {}).items()))
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from hypogoal.core.config import MAX_PRESET_BYTES, STAGES, parse_assignments, parse_integers
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, read_text
+from hypogoal.core.files import path_part, plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_cell
@@ -121,7 +121,7 @@ def _values(name: str, values: Any, path: Path) -> tuple[Value, ...]:
     if isinstance(values, str):
         values = list(parse_integers(values))
     fits = isinstance(values, list) and values and len({str(value) for value in values}) == len(values)
-    if not fits or not all(isinstance(value, str | int | float) and plain_name(str(value)) for value in values):
+    if not fits or not all(isinstance(value, str | int | float) and path_part(str(value)) for value in values):
         raise UserError("an axis needs values that differ and can be parts of names", f"{name} in {path}", MEND)
     return tuple(values)
 

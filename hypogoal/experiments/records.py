@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 from hypogoal.core.config import STAGES, parse_assignments, preset_digest
 from hypogoal.core.drafts import NO_LOCKS, PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, read_json, replace_text
+from hypogoal.core.files import path_part, read_json, replace_text
 from hypogoal.experiments.cells import DERIVED, Cell, Cost, Plan, moved
 
 fcntl: Any  # on POSIX a module, elsewhere None
@@ -226,8 +226,8 @@ def read_plan(run: Path) -> tuple[Plan, float]:
 def _cell(row: dict[str, Any], run: Path) -> Cell:
     arguments = tuple(map(str, row["arguments"]))
     places = [Path(place).relative_to(RUN) for place in (row["out"], *row["needs"])]
-    fits = arguments[:1] and arguments[0] in COMMANDS and plain_name(row["name"])
-    if not fits or not all(plain_name(part) for place in places for part in place.parts):
+    fits = arguments[:1] and arguments[0] in COMMANDS and path_part(row["name"])
+    if not fits or not all(path_part(part) for place in places for part in place.parts):
         raise ValueError
     cost = Cost(float(row["seconds"]), float(row["memory"]), float(row["disk"]), int(row["cores"]))
     needs = tuple(Path(need) for need in row["needs"])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_text, replace_text
+from hypogoal.core.files import read_json, read_text, write_table
 from hypogoal.dataset import open_dataset
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import RESULTS
@@ -32,16 +32,13 @@ def write_results(plan: Plan, run: Path) -> Path:
     Raises:
         UserError: an artefact is damaged.
     """
-    from hypogoal.evaluation.numbers import csv_text
-
     names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
+    path = run / RESULTS
     try:
-        text = csv_text(["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
+        write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"an artefact is damaged ({type(error).__name__} {error})"
         raise UserError(what, run, "'hypogoal verify' says which.") from None
-    path = run / RESULTS
-    replace_text(path, text)
     return path
 
 

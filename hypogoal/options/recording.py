@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.domains.base import Engine
 
@@ -230,11 +230,3 @@ class Recorder:
             EXECUTION_COLUMNS,
             [(*map(int, row[:-1]), *map(int, at[n]), int(away[n])) for n, row in enumerate(rows)],
         )
-
-
-def write_table(path: Path, columns: tuple[str, ...], rows: Sequence[tuple[int | float, ...]]) -> None:
-    """A CSV file with a header."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)

@@ -10,7 +10,7 @@ from typing import Any
 from hypogoal.core.artefacts import claim, create_artefact, versions
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.numbers import plain
-from hypogoal.evaluation.run import read_evaluation
+from hypogoal.evaluation.run import fitting, read_evaluation
 
 
 def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
@@ -47,30 +47,31 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
     labels = labels_of([run.resolve().as_posix() for run in runs])
     found = {label: read_evaluation(run, "curves/") for label, run in zip(labels, runs, strict=True)}
     metrics = {label: one.metrics for label, one in found.items()}
-    reason = why_not(metrics)
-    if reason is not None:
-        raise UserError("these runs cannot be compared", reason, "Choose runs of one experiment, evaluated alike.")
-    about = {
-        "runs": [
-            {"label": label, "path": str(run), **_about(metrics[label])}
-            for label, run in zip(labels, runs, strict=True)
-        ],
-        "domains": domains_of(metrics[labels[0]]),
-        "shared": shared(metrics),
-        "differences": differences(metrics),
-        "comparisons": plain(compare_runs(metrics)),
-        **{
-            table: {label: own[table] for label, own in metrics.items()}
-            for table in ("agents", "hypotheses", "rooms", "distance")
-        },
-        "quantities": meanings(),
-    }
-    material = Material(about, {})
-    sections = compared_sections(metrics, {label: one.arrays for label, one in found.items()}, about, material)
-    version = versions().get("hypogoal", "unknown")
-    page = draw_page(
-        f"hypogoal: {len(runs)} runs compared", f"{', '.join(labels)}; hypogoal {version}", sections, version
-    )
+    with fitting(" ".join(map(str, runs))):
+        reason = why_not(metrics)
+        if reason is not None:
+            raise UserError("these runs cannot be compared", reason, "Choose runs of one experiment, evaluated alike.")
+        about = {
+            "runs": [
+                {"label": label, "path": str(run), **_about(metrics[label])}
+                for label, run in zip(labels, runs, strict=True)
+            ],
+            "domains": domains_of(metrics[labels[0]]),
+            "shared": shared(metrics),
+            "differences": differences(metrics),
+            "comparisons": plain(compare_runs(metrics)),
+            **{
+                table: {label: own[table] for label, own in metrics.items()}
+                for table in ("agents", "hypotheses", "rooms", "distance")
+            },
+            "quantities": meanings(),
+        }
+        material = Material(about, {})
+        sections = compared_sections(metrics, {label: one.arrays for label, one in found.items()}, about, material)
+        version = versions().get("hypogoal", "unknown")
+        page = draw_page(
+            f"hypogoal: {len(runs)} runs compared", f"{', '.join(labels)}; hypogoal {version}", sections, version
+        )
     inputs = [one.source.path for one in found.values()]
     with create_artefact(out, kind="comparison", config={}, seed=0, inputs=inputs, force=force) as folder:
         (folder / "index.html").write_text(page, encoding="utf-8")

@@ -10,6 +10,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import claim, create_artefact
 from hypogoal.core.compute import prepare
+from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.preflight import free_memory, preflight
 from hypogoal.core.progress import Progress
@@ -17,7 +18,7 @@ from hypogoal.core.workers import cores
 from hypogoal.evaluation.curves import GAMMA, SOLVED
 from hypogoal.evaluation.distance import INSIDE, NEAR
 from hypogoal.evaluation.judging import Case, Work, cases_of, judgements, processes_for
-from hypogoal.evaluation.numbers import Row, csv_text, ensemble_names, groups_of, method_names, plain
+from hypogoal.evaluation.numbers import Row, ensemble_names, groups_of, method_names, plain
 from hypogoal.evaluation.provenance import provenance
 from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings, summary_table
 from hypogoal.evaluation.run import LAST, WINDOW, find, most_used
@@ -83,7 +84,7 @@ def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False,
             rows = [row for question in QUESTIONS for row in question.rows(metrics, arrays)]
         compared = [question.pairs({"ensembles": work.ensembles, **work.metrics}) for question in QUESTIONS]
         metrics["comparisons"] = plain({name: own for pairs in compared for name, own in pairs.items()})
-        (folder / "numbers.csv").write_text(csv_text(Row._fields, rows), encoding="utf-8")
+        write_table(folder / "numbers.csv", Row._fields, rows)
         text = json.dumps(metrics, indent=1, allow_nan=False)
         (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
     return metrics

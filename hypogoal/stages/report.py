@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.run import AGAIN, read_evaluation
+from hypogoal.evaluation.run import fitting, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
 
@@ -41,11 +42,8 @@ def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = Fa
     about: dict[str, Any] = {"kind": "report", "config": {"videos": videos}, "seed": 0, "inputs": inputs}
     with create_artefact(out, **about, force=force, resume=resume) as folder:
         material = Material(found.metrics, found.arrays)
-        try:
+        with fitting(found.source.path):
             page = render(material, versions().get("hypogoal", "unknown"))
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-            what = "the evaluation does not fit this hypogoal, or is damaged"
-            raise UserError(what, found.source.path, AGAIN) from error
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
         for name, figure in material.figures.items():
@@ -105,14 +103,15 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
         UserError: no such kind, the run was not evaluated, or a file is there already.
     """
     from hypogoal.evaluation.page import Material
-    from hypogoal.evaluation.plots import to_file
+    from hypogoal.evaluation.plots import slug, to_file
     from hypogoal.evaluation.questions import paper_figures
 
     if kind not in KINDS:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(KINDS)}.")
     found = read_evaluation(run)
-    drawn, missing = paper_figures(Material(found.metrics, found.arrays))
-    files = {folder / f"{one.stem}.{kind}": one for one in drawn}
+    with fitting(found.source.path):
+        drawn, missing = paper_figures(Material(found.metrics, found.arrays))
+    files = {folder / f"{slug(one.stem)}.{kind}": one for one in drawn}
     captions = folder / "captions.md"
     for path in (*files, captions):
         if path.exists() and not force:
@@ -122,7 +121,7 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
         for path, one in files.items():
             if one.figure is not None:
                 path.write_bytes(to_file(one.figure, one.stem, kind))
-        text = [f"## {path.name}\n\n{one.caption}\n" for path, one in files.items()]
+        text = [f"## {path.name}\n\n{escape(one.caption, quote=False)}\n" for path, one in files.items()]
         captions.write_text("\n".join([*text, *(f"{line}\n" for line in missing)]), encoding="utf-8")
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None

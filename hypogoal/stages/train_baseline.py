@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import math
@@ -14,6 +13,7 @@ from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import write_table
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
@@ -22,6 +22,7 @@ from hypogoal.domains.base import Domain, load_domain
 from hypogoal.learners.baselines.settings import BaselineConfig, DQNSettings, hyperparameters
 from hypogoal.meta.playing import layout_facts
 from hypogoal.needs import baseline_needs
+from hypogoal.options.recording import EPISODE_COLUMNS
 
 LOG_INTERVAL = 5_000  # environment steps
 
@@ -87,10 +88,7 @@ def train_baseline(
             agent = train(env, chosen, config.steps, seed, report, LOG_INTERVAL, checkpoints, device)
             progress.update(config.steps)
         report.log.close()
-        with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(("step", "length", "reward", "terminated"))
-            writer.writerows(env.episodes)
+        write_table(folder / "episodes.csv", EPISODE_COLUMNS, env.episodes)
         save_tensors(folder / "policy.safetensors", weights(agent))
         facts = layout_facts(engine, config.layout_seed, config.random_episodes, seed)
         (folder / "layout.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")

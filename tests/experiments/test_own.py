@@ -1,12 +1,19 @@
 """Own experiments in TOML (Spec G4): what they can say, and that they can say nothing else."""
 
+import csv
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import path_part
 from hypogoal.experiments.cells import Plan
 from hypogoal.experiments.own import own_plan
+from hypogoal.experiments.results import write_results
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("somewhere")
@@ -119,3 +126,50 @@ def test_what_the_command_line_cannot_say(tmp_path: Path, given: str) -> None:
     """Spec G2: in one line."""
     with pytest.raises(UserError):
         planned(tmp_path, GOOD, given)
+
+
+FORMULAS = [
+    "=1+1", "+1+1", "-1+1", "@SUM(A1)", " =1+1", "'=1+1", "=HYPERLINK('http:x')", "=cmd|' C'!A0", "-2+3+cmd|' C'!A0",
+    "@A1", "==1", "=-1", "a;=1+1", "a,=1+1", 'a"=1+1', "a; =1+1", "a,+1", "a;-A1", "a;@A1", "=A1,=A2", "＝1+1", "＋A1",
+    "－A1", "＠A1", "\t=1+1", "\r=1+1", "\n=1+1", "a\n=1+1", "a\t=1+1", "=", "-", "+", "@", "=\u2028", "=🙂", "%0A=1",
+]  # fmt: skip
+NUMBERS = ["-1", "+2.5", "-1e-3", "7", "0.5"]
+BEGINS = re.compile(r"(^|[,;\t\r\n\"])\s*[=+@＝＋－＠-]")
+
+
+def test_no_cell_is_a_formula(tmp_path: Path) -> None:
+    """Spec G2, G4: texts of an experiment and of what its cells wrote; numbers are left as they are."""
+    fit = [text for text in FORMULAS if path_part(text)]
+    assert len(fit) > 20
+    toml = f"""format = 1
+evaluate = false
+axes = {{ text = {json.dumps(fit + NUMBERS, ensure_ascii=False)} }}
+cells = [{{ name = "ensemble", axes = ["text"], command = "train-ensemble d.h5" }}]"""
+    plan = planned(tmp_path, toml)
+    for cell in plan.cells:
+        with create_artefact(tmp_path / cell.out, kind="ensemble", config={}, seed=0) as folder:
+            lines = [json.dumps({"sub_goal": text, text: 2.5, "loss": -0.5}) for text in FORMULAS]
+            (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    moved = replace(plan, cells=[replace(cell, out=tmp_path / cell.out) for cell in plan.cells])
+    path = write_results(moved, tmp_path)
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    cells = {cell for row in rows for cell in row}
+    assert {cell for cell in cells if BEGINS.search(cell)} == {"-0.5", "-1", "+2.5", "-1e-3"}
+    assert len(rows) == len(plan.cells) * len(FORMULAS) * 2
+    assert {"-0.5", "2.5", *NUMBERS} <= cells, "numbers are numbers"
+    assert {cell.replace("'", "") for cell in cells} >= {text.replace("'", "") for text in fit}, (
+        "nothing else is changed"
+    )
+    assert header[:4] == ["cell", "stage", "group", "text"]
+
+
+def test_nothing_can_be_named_like_a_formula(tmp_path: Path) -> None:
+    """Spec G2: groups of cells and their axes, which are columns."""
+    for text in FORMULAS:
+        for toml in (
+            GOOD.replace('"agent"', json.dumps(text, ensure_ascii=False)),
+            GOOD.replace("seed =", f"{json.dumps(text, ensure_ascii=False)} ="),
+        ):
+            with pytest.raises(UserError):
+                planned(tmp_path, toml)
