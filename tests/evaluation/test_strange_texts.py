@@ -49,7 +49,7 @@ MADE_BY = (
 COMPARED_BY = r"sub_goal$|domain$"
 UNSEEN = re.compile(  # what no page has
     r"^(?!metrics\.quantities).*\.(unit|interval_over)$|inputs\.\*\.|agents\.\*\.kind|runs\.\*\.(path|ensemble)"
-    r"|ensembles\.\*\.method|distance\.options|explorer\.baseline|selection\.\*\.name|false_positives|attributes\.versions"
+    r"|ensembles\.\*\.method|distance\.options|explorer\.baseline|selection\.\*\.name|false_positives|arrays\.saliency.*kinds|attributes\.versions"
 )
 
 
