@@ -184,19 +184,20 @@ def resigned(artefact: Path, name: str) -> None:
 def read_run(case: Path, kind: str, often: bool) -> list[Callable[[], object]]:
     """The ways in which another stage or a program reads an artefact of a run; commands, which take long, at times."""
     import hypogoal
+    from hypogoal.evaluation import curves
+    from hypogoal.evaluation.run import find
     from hypogoal.inspection import describe_path, lines
-    from hypogoal.stages import evaluate
     from hypogoal.verification import faults_of
 
     path = case / kind
 
     def inputs() -> None:
-        found = evaluate.find(case)
+        found = find(case)
         for artefact in found.everything():
             for entry in artefact.manifest["inputs"]:
                 artefact.input(entry["kind"])
         for artefact in found.agents:
-            evaluate.agent_metrics("agent", [evaluate.read_run(found, artefact)])
+            curves.agent_metrics("agent", [curves.read_run(artefact, "agent")])
 
     def check() -> None:
         faults = faults_of(path)
@@ -216,14 +217,14 @@ def read_run(case: Path, kind: str, often: bool) -> list[Callable[[], object]]:
 
 def read_table(path: Path) -> None:
     """A table or file of the artefact ``meta``, as its readers do."""
-    from hypogoal.evaluation import reading
+    from hypogoal.evaluation import run
 
     readers: dict[str, Callable[[Path], Any]] = {
-        "episodes.csv": reading.read_episodes,
-        "choices.csv": lambda path: reading.read_choices(path).total("chosen", 4),
-        "executions.csv": reading.read_executions,
-        "layout.json": reading.read_layout,
-        "terminations.h5": reading.read_terminations,
+        "episodes.csv": run.read_episodes,
+        "choices.csv": lambda path: run.read_choices(path).total("chosen", 4),
+        "executions.csv": run.read_executions,
+        "layout.json": run.read_layout,
+        "terminations.h5": run.read_terminations,
     }
     readers[path.name](path)
 

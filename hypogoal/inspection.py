@@ -47,7 +47,7 @@ def numbers_of(path: Path) -> Mapping[str, Any] | None:
     Raises:
         UserError: it is damaged.
     """
-    from hypogoal.evaluation.evaluated import read_numbers
+    from hypogoal.evaluation.run import read_numbers
 
     for folder in (path, path / EVALUATION):
         if (folder / MANIFEST).is_file():
@@ -66,7 +66,7 @@ def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
     Raises:
         UserError: they are not what ``evaluate`` writes.
     """
-    from hypogoal.evaluation.summary import summary_table
+    from hypogoal.evaluation.questions import summary_table
 
     try:
         return summary_table(numbers)
@@ -108,7 +108,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     """
     from PIL import Image
 
-    from hypogoal.evaluation.contact_sheet import contact_sheets
+    from hypogoal.evaluation.pictures import contact_sheets
 
     if not path.is_file():
         raise UserError("contact sheets are of data files", path, "Give the .h5 file that 'hypogoal collect' wrote.")

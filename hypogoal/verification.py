@@ -115,7 +115,7 @@ def _fault(read: Callable[[], object]) -> Iterator[str]:
 
 
 def _read_table(path: Path) -> None:
-    from hypogoal.evaluation.reading import read_table
+    from hypogoal.evaluation.run import read_table
 
     read_table(path)
 

@@ -1,4 +1,4 @@
-"""How well members' verdicts match the true sub-goal (Spec F1): balanced accuracy first, and what it is made of."""
+"""How well members' verdicts match the true sub-goal (Spec F1), and how different they are (Spec F2)."""
 
 from __future__ import annotations
 
@@ -83,3 +83,26 @@ def best_mean_worst(scores: NDArray[np.float64]) -> dict[str, float]:
     if len(known) == 0:
         return {"best": float("nan"), "mean": float("nan"), "worst": float("nan")}
     return {"best": float(known.max()), "mean": float(known.mean()), "worst": float(known.min())}
+
+
+def pairwise_disagreement(verdicts: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Spec F2: the share of states on which members i and j differ.
+
+    Args:
+        verdicts: bool (N, K).
+
+    Returns:
+        float64 (K, K), symmetric, 0 on the diagonal; NaN without states.
+    """
+    states, members = verdicts.shape
+    if states == 0:
+        return np.full((members, members), np.nan)
+    differ = verdicts[:, :, None] != verdicts[:, None, :]
+    return differ.mean(axis=0)
+
+
+def mean_disagreement(verdicts: NDArray[np.bool_]) -> float:
+    """Spec F2: the mean over all pairs of different members; NaN for a single member or without states."""
+    rates = pairwise_disagreement(verdicts)
+    pairs = rates[np.triu_indices(len(rates), k=1)]
+    return float(pairs.mean()) if len(pairs) else float("nan")

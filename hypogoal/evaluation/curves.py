@@ -1,43 +1,115 @@
-"""From the list of episodes to curves over environment steps and the numbers read off them (Spec F5)."""
+"""Figure 6: what agents achieve on layouts that no data came from, over training and at its end (Spec E6, E7, F5)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-WINDOW = 100  # episodes
-SOLVED = 0.95  # share of the window's episodes
+from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.evaluation.numbers import Metrics, Row, Rows, ensemble_name, name_apart, over, pairs, rows_of
+from hypogoal.evaluation.page import (
+    Block,
+    Drawn,
+    Entry,
+    Material,
+    Question,
+    comparison_tables,
+    fixed,
+    interval,
+    label,
+    listed,
+    number,
+    percent,
+    section,
+    shown,
+    spread,
+    table,
+    terminal,
+    thousands,
+)
+from hypogoal.evaluation.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, WIDTH, legend_below, styled
+from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hypogoal.evaluation.judging import Work
+
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
+SOLVED = 0.95  # share of the window's episodes
 GAMMA = 0.99  # per environment step, of the discounted return
+LEARNED = "options (learned members)"
+RANDOM = "random choice"
+ORACLE = "oracle terminations"
+ORACLE_RANDOM = "oracle terminations, random choice"
+PRETRAINING = "random choice while options learn"
+BASELINES = ("PPO tuned", "PPO paper", "DQN tuned", "DQN paper")
+ORDER = (LEARNED, RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
+UNITS = {
+    "success": "share of episodes",
+    "reward": "undiscounted, per episode",
+    "length": "steps",
+    "length_over_shortest": "ratio to the layout's shortest path",
+    "discounted_return": "reward discounted by 0.99 per step",
+}
+HIGHER = {"success": True, "length": False, "discounted_return": True}  # compared; the higher is better
+Bounds = tuple[float | None, float | None]
+SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
+COLOURS = {
+    LEARNED: (BLUE, False),
+    RANDOM: (ORANGE, False),
+    PRETRAINING: (ORANGE, True),
+    ORACLE: (GREEN, False),
+    ORACLE_RANDOM: (GREEN, True),
+    "PPO tuned": (VERMILLION, False),
+    "PPO paper": (VERMILLION, True),
+    "DQN tuned": (PURPLE, False),
+    "DQN paper": (PURPLE, True),
+}
+# Of agents with other names; the last ones only where no agent of the figure has them by its name.
+OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True), (BLUE, True), *COLOURS.values())
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """A run's training episodes in the order in which they ended; arrays (n,).
+class Run:
+    """One trained agent.
 
     Attributes:
-        step: environment steps when it ended, summed over parallel environments and stages.
-        length: steps.
-        reward: undiscounted.
-        terminated: it reached a terminal state; else it was cut at the cap.
+        kind: options, meta or baseline.
+        path: of its artefact, relative to the run's folder.
+        seed: of the training.
+        config: its resolved settings, with those of its ensemble that matter.
+        episodes: its training episodes.
+        layout: layout_seed, shortest_path, random_success, random_episodes.
     """
 
-    step: NDArray[np.int64]
-    length: NDArray[np.int64]
-    reward: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
+    kind: str
+    path: str
+    seed: int
+    config: Mapping[str, Any]
+    episodes: Episodes
+    layout: Mapping[str, Any]
 
     @property
-    def succeeded(self) -> NDArray[np.bool_]:
-        """Spec F5: it terminated, and with a reward: an agent that dies reaches a terminal state too."""
-        return self.terminated & (self.reward > 0)
+    def budget(self) -> int:
+        """Environment steps, those of earlier stages included."""
+        return int(self.config["steps"]) + int(self.config.get("options_steps", 0))
 
-    def last(self, count: int = WINDOW) -> Episodes:
-        """The last ``count`` episodes, or all where there are fewer."""
-        start = max(0, len(self.step) - count)
-        return Episodes(self.step[start:], self.length[start:], self.reward[start:], self.terminated[start:])
+
+def read_run(artefact: Artefact, path: str) -> Run:
+    """The episodes and the layout of one trained agent, whose path in the run is ``path``."""
+    config = artefact.config
+    if artefact.kind != "baseline":
+        config["ensemble"] = ensemble_name(open_artefact(artefact.input("ensemble"), "ensemble").config)
+    episodes, layout = read_episodes(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
+    return Run(artefact.kind, path, artefact.seed, config, episodes, layout)
 
 
 def trailing_mean(
@@ -116,3 +188,515 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WIN
         "discounted_return": discounted_return(last),
         "steps_to_95": steps_to_solve(episodes, window),
     }
+
+
+def base_name(kind: str, config: Mapping[str, Any]) -> str:
+    """Spec E6, E7: what an agent is called by how it chooses and what ends its options."""
+    if kind == "baseline":
+        return f"{config['agent'].upper()} {config['setting']}"
+    if kind == "options":
+        return PRETRAINING
+    if config["termination"] == "oracle":
+        return ORACLE_RANDOM if config["chooser"] == "random" else ORACLE
+    return RANDOM if config["chooser"] == "random" else LEARNED
+
+
+def group_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs by the name of their agent, in the order of ``ORDER``.
+
+    Runs of the same name whose settings differ (the layout aside) are different agents: what differs is added to
+    the name, so that nothing is averaged that should not be.
+    """
+    bases = [base_name(run.kind, run.config) for run in runs]
+    names = name_apart(bases, [run.config for run in runs])
+    groups: dict[str, list[Run]] = {}
+    for _, name, run in sorted(zip(map(_rank, bases), names, runs, strict=True), key=lambda item: (item[0], item[1])):
+        groups.setdefault(name, []).append(run)
+    return groups
+
+
+def _rank(base: str) -> int:
+    return ORDER.index(base) if base in ORDER else len(ORDER)
+
+
+def agent_metrics(name: str, runs: Sequence[Run]) -> dict[str, Any]:
+    """Spec F5: each run's numbers and, for each number, what is said of it over runs.
+
+    Returns:
+        name, kind, runs (rows of numbers), one entry per key of ``UNITS`` (see ``numbers.over``), and
+        ``steps_to_95``: how many of the runs reached it, and the median over all runs, None where half did not.
+    """
+    rows = []
+    for run in runs:
+        shortest = run.layout.get("shortest_path")
+        numbers = run_numbers(run.episodes, shortest)
+        rows.append(
+            {
+                "path": run.path,
+                "seed": run.seed,
+                "layout_seed": run.layout["layout_seed"],
+                "shortest_path": shortest,
+                "steps": run.budget,
+                **numbers,
+            }
+        )
+    layouts = [row["layout_seed"] for row in rows]
+    metrics: dict[str, Any] = {"name": name, "kind": runs[0].kind, "runs": rows}
+    for key, unit in UNITS.items():
+        metrics[key] = over([row[key] for row in rows], unit, name, key, strata=layouts)
+    reached = [np.inf if row["steps_to_95"] is None else float(row["steps_to_95"]) for row in rows]
+    median = float(np.quantile(reached, 0.5, method="higher"))
+    metrics["steps_to_95"] = {
+        "reached": int(np.isfinite(reached).sum()),
+        "median": median if np.isfinite(median) else None,
+        "n": len(rows),
+        "unit": "environment steps",
+    }
+    return metrics
+
+
+def agent_curves(runs: Sequence[Run], grid: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+    """Figure 6: reward, success and length of every run on the common grid, each (R, G); NaN beyond a run's budget."""
+    found = []
+    for run in runs:
+        own = curves(run.episodes, grid)
+        found.append({key: np.where(grid <= run.budget, values, np.nan) for key, values in own.items()})
+    return {key: np.stack([own[key] for own in found]) for key in found[0]}
+
+
+def common_grid(runs: Sequence[Run], points: int = 151) -> NDArray[np.int64]:
+    """Environment steps from 0 to the largest budget, int64 (G,)."""
+    return np.linspace(0, max(run.budget for run in runs), points).round().astype(np.int64)
+
+
+def numbers(work: Work) -> dict[str, Any]:
+    """Spec F5: every agent, and how hard its layouts are; Figure 6's curves go to the arrays.
+
+    ``curves/grid`` and ``curves/<agent's index>/{reward,success,length}``, float (runs, grid).
+    """
+    runs = [read_run(artefact, work.found.name(artefact)) for artefact in work.found.agents]
+    groups = group_runs(runs)
+    if runs:
+        grid = work.arrays["curves/grid"] = common_grid(runs)
+        for index, same in enumerate(groups.values()):
+            for key, values in agent_curves(same, grid).items():
+                work.arrays[f"curves/{index}/{key}"] = values
+    layouts = {run.layout["layout_seed"]: dict(run.layout) for run in runs}
+    agents = [agent_metrics(name, same) for name, same in groups.items()]
+    return {"agents": agents, "layouts": [layouts[seed] for seed in sorted(layouts)]}
+
+
+def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
+    """Every run at its end, and its curves; random play on each layout."""
+    for index, agent in enumerate(metrics["agents"]):
+        for place, run in enumerate(agent["runs"]):
+            about = {"method": agent["name"], "layout": run["layout_seed"], "seed": run["seed"]}
+            about["artefact"] = run["path"]
+            own = {key: run[key] for key in run if key not in ("path", "seed", "layout_seed", "shortest_path", "steps")}
+            yield from rows_of({"steps": run["steps"], **own, "shortest_path": run["shortest_path"]}, **about)
+            for quantity in ("reward", "success", "length") if "curves/grid" in arrays else ():
+                values = arrays[f"curves/{index}/{quantity}"][place].tolist()
+                for step, value in zip(arrays["curves/grid"][()].tolist(), values, strict=True):
+                    yield from rows_of({quantity: value}, step=step, **about)
+    for layout in metrics["layouts"]:
+        yield from rows_of({"random_success": layout["random_success"]}, layout=layout["layout_seed"])
+
+
+def against(agents: Sequence[Entry]) -> Rows:
+    """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts.
+
+    Args:
+        agents: what :func:`agent_metrics` returns, in the report's order.
+    """
+    found: Rows = []
+    for quantity, higher in HIGHER.items():
+        measured = (
+            (agent["name"], (run["layout_seed"], run["seed"]), run[quantity])
+            for agent in agents
+            for run in agent["runs"]
+        )
+        found += pairs(measured, quantity, higher=higher, layouts=True)
+    return found
+
+
+def missing(work: Work) -> list[str]:
+    """Spec E6, E7: the comparisons that are not there, so that nothing is silently left out."""
+    names = [agent["name"] for agent in work.metrics["agents"]]
+    if not names:  # nor anything to compare: which ones Figure 6 has, the report says
+        return [] if work.metrics["rooms"] or work.found.ladders else ["no agents"]
+    lines = []
+    for wanted in (LEARNED, RANDOM, ORACLE, *BASELINES):
+        if not any(name == wanted or name.startswith(f"{wanted}, ") for name in names if name != ORACLE_RANDOM):
+            lines.append(f"no agent '{wanted}'")
+    return lines
+
+
+def solved(steps: Mapping[str, Any]) -> str:
+    """When 95 % were reached: the median over runs, or how many of them did."""
+    if steps["reached"] == steps["n"]:
+        return thousands(steps["median"])
+    if steps["reached"] == 0:
+        return "never"
+    return f"{steps['reached']} of {steps['n']}"
+
+
+AGENT = label("agent", "name")
+RUNS = number("runs", lambda agent: len(agent["runs"]))
+SOLVED_AT = number("95 % at", "steps_to_95", solved)
+HEADLINE = (
+    RUNS,
+    number("success, %", "success", spread, 1, 100),
+    number("steps", "length", spread, 0),
+    number("× shortest", "length_over_shortest", spread, 2),
+    number("discounted return", "discounted_return", spread, 2),
+    SOLVED_AT,
+)
+PLAIN = (
+    AGENT,
+    RUNS,
+    number("success", "success.mean", percent),
+    number("length", "length.mean", fixed, 0),
+    number("x shortest", "length_over_shortest.mean", fixed, 1),
+    SOLVED_AT,
+)
+INTERVALS = (
+    AGENT,
+    number("success, %", "success", interval, 1, 100),
+    number("steps", "length", interval, 0),
+    number("discounted return", "discounted_return", interval, 2),
+    number("runs", "success.n"),
+)
+EVERY_RUN = (
+    label("agent", "name", once=True),
+    number("layout", "layout_seed"),
+    number("seed", "seed"),
+    number("budget", "steps", thousands),
+    number("episodes", "episodes"),
+    number("success", "success", percent),
+    number("steps", "length", fixed, 1),
+    number("× shortest", "length_over_shortest", fixed, 2),
+    number("return", "discounted_return", fixed, 2),
+    number("95 % at", "steps_to_95", lambda steps: "never" if steps is None else thousands(steps)),
+)
+LAYOUTS = (
+    label("layout seed", lambda layout: str(layout["layout_seed"])),
+    number("shortest path, steps", "shortest_path", fixed, 0),
+    number("random play succeeds", "random_success", percent),
+    number("episodes of random play", "random_episodes"),
+)
+
+
+def summary(metrics: Metrics) -> list[Table]:
+    """Every agent's headline numbers, mean over runs; also where there is nothing at all."""
+    if not metrics["agents"] and (metrics["rooms"] or metrics["hypotheses"] or metrics["distance"]["options"]):
+        return []
+    return [terminal("Training episodes, the last 100 of each run", PLAIN, metrics["agents"])]
+
+
+def sections(material: Material) -> list[Block]:
+    """The summary and the curves, of a run with agents."""
+    return [summary_section(material), curves_section(material)] if material.of_agents() else []
+
+
+def summary_section(material: Material) -> Block:
+    """What was asked, what came out."""
+    metrics = material.metrics
+    asked = (
+        "Each sub-goal is known from one context only. An ensemble of classifiers holds several hypotheses about what "
+        "the sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by "
+        "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
+        "hypotheses that are true there?"
+    )
+    headline = [_headline(material)] if metrics["agents"] else []
+    return section("summary", "Summary", [asked, *_answers(material)], headline, metrics["missing"])
+
+
+def _answers(material: Material) -> list[str]:
+    """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
+    agents = material.metrics["agents"]
+    found = variants(agents)
+    several = len(found) > 1
+    paragraphs = []
+    for agent in found:
+        name = f"the agent '{agent['name']}'" if several else "the option agent"
+        text = _achieved(agent, name, material.metrics["settings"]["window"])
+        control = control_of(material, agent, agents)
+        if agent["success"]["mean"] is not None and control is not None:
+            alike = not several or same_settings(agent, control)
+            text += f" {_by_chance(control, 'options of the same members' if alike else 'options of its ensemble')}"
+        elif several and control is None:
+            text += " No random choice among options of the same members was run."
+        paragraphs.append(text)
+    return paragraphs
+
+
+def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
+    success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
+    if success is None:
+        return f"No episode of {name} came to its end ({_runs(agent)}): it needs more steps."
+    against = "" if ratio is None else f", {fixed(ratio, 1)} times the shortest path"
+    return (
+        f"{name[0].upper()}{name[1:]} reached the goal in {percent(success)} of its last {_episodes(agent, window)}, "
+        f"which took {fixed(agent['length']['mean'], 0)} steps{against} ({_runs(agent)})."
+    )
+
+
+def _by_chance(control: Mapping[str, Any], among: str) -> str:
+    if control["success"]["mean"] is None:
+        return f"Of uniformly random choice among {among} no episode came to its end."
+    return (
+        f"Uniformly random choice among {among}: {percent(control['success']['mean'])}, "
+        f"{fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
+    )
+
+
+def _episodes(agent: Mapping[str, Any], window: int) -> str:
+    """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
+    counts = [min(window, run["episodes"]) for run in agent["runs"] if run["episodes"]]
+    fewest, most = min(counts), max(counts)
+    count = str(most) if fewest == most else f"{fewest} to {most}"
+    return f"{count} training episode{'s' if most > 1 else ''}"
+
+
+def _runs(agent: Mapping[str, Any]) -> str:
+    runs = agent["runs"]
+    layouts = sorted({run["layout_seed"] for run in runs})
+    seeds = sorted({run["seed"] for run in runs})
+    count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
+    return (
+        f"{count}: layout seed{'s' if len(layouts) > 1 else ''} {listed(layouts)}, "
+        f"run seed{'s' if len(seeds) > 1 else ''} {listed(seeds)}"
+    )
+
+
+def _headline(material: Material) -> Block:
+    return table(
+        (AGENT, *HEADLINE),
+        material.metrics["agents"],
+        main=lambda agent: bool(agent["name"] == LEARNED),
+        caption="Over the last 100 training episodes of each run: mean over runs ± standard error. Steps: length of "
+        "an episode, failures counted at the cap; × shortest: against the layout's shortest path. Discounted return: "
+        "0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of the last 100 "
+        "episodes succeeded, or how many runs got there; steps of train-options count.",
+    )
+
+
+def curves_section(material: Material) -> Block:
+    """Figure 6 with controls and baselines, and every run's numbers."""
+    agents = material.metrics["agents"]
+    drawn = [shown(material, one) for one in figures(material)]
+    if not agents:
+        return section("curves", "Learning curves", [], drawn)
+    text = (
+        "Success at a cap of 500 steps cannot show by itself that choices are learned, so episode length stands "
+        "beside it. Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive "
+        "actions on the same observations and budget."
+    )
+    drawn_over = sorted({agent["success"]["interval_over"] for agent in agents if agent["success"]["n"] > 1})
+    resamples = (
+        f"its 95 % bootstrap interval (2,000 resamples of {listed(drawn_over)})"
+        if drawn_over
+        else "no interval: one run each"
+    )
+    digits = {"length": 0, "success": 2, "discounted_return": 2}
+    blocks = [
+        *drawn,
+        table(
+            INTERVALS,
+            agents,
+            heading="Interquartile means",
+            caption=f"Interquartile mean over runs with {resamples}; over the last 100 episodes of each run.",
+        ),
+        *comparison_tables(material.comparisons("agents"), "layout and seed", "layouts", digits),
+        table(
+            EVERY_RUN,
+            [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]],
+            folded="Every run",
+        ),
+        table(
+            LAYOUTS,
+            material.metrics["layouts"],
+            heading="How hard the layouts are",
+            caption="Random play: uniformly random primitive actions, the same cap.",
+        ),
+    ]
+    return section("curves", "Learning curves", [text], blocks)
+
+
+def figures(material: Material) -> list[Drawn]:
+    """Figure 6 and the same of episode length."""
+    if not material.metrics["agents"]:
+        nothing = "It needs options, meta or baseline artefacts: train-meta, train-baseline."
+        return [Drawn("reward", "Reward", None, missing=nothing)]
+    return [_curve(material, "reward"), _curve(material, "length")]
+
+
+def _curve(material: Material, quantity: str) -> Drawn:
+    metrics, grid = material.metrics, material.arrays["curves/grid"]
+    used = {COLOURS.get(agent["name"]) for agent in metrics["agents"]}
+    others = cycle(look for look in OTHERS if look not in used)
+    lines = []
+    for index, agent in enumerate(metrics["agents"]):
+        colour, dashed = COLOURS.get(agent["name"]) or next(others)
+        lines.append(Line(agent["name"], material.arrays[f"curves/{index}/{quantity}"], colour, dashed))
+    layouts = metrics["layouts"]
+    bounds: Bounds
+    if quantity == "reward":
+        title, axis, bounds = "Undiscounted reward per episode", "reward per episode", reward_bounds(lines)
+        # A share of episodes says nothing on an axis of other rewards.
+        known = [layout["random_success"] for layout in layouts if bounds == SHARES]
+        which_figure, name, dotted = "Figure 6 of the paper", "random play", "uniformly random play"
+    else:
+        title, axis, bounds = "Episode length", "episode length (steps)", (0.0, None)
+        known = [layout["shortest_path"] or None for layout in layouts]
+        which_figure, name, dotted = "Beside Figure 6 of the paper", "shortest path", "the shortest path"
+    values = [value for value in known if value is not None]
+    references = [(name, float(np.mean(values)))] if values else []
+    drawn = learning_curves(grid, lines, axis, references, bounds)
+    first = metrics["agents"][0]
+    reference = f" Dotted: mean over layouts of {dotted}." if references else ""
+    caption = (
+        f"{which_figure}: {title.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
+        f"bands: ± one standard error over runs. {first['name']}: {_runs(first)}; "
+        f"the other agents: {_others(metrics['agents'])}.{reference}"
+    )
+    return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
+
+
+def _others(agents: Sequence[Mapping[str, Any]]) -> str:
+    if len(agents) < 2:
+        return "none"
+    counts = sorted({len(agent["runs"]) for agent in agents[1:]})
+    same = all(
+        {(run["layout_seed"], run["seed"]) for run in agent["runs"]}
+        == {(run["layout_seed"], run["seed"]) for run in agents[0]["runs"]}
+        for agent in agents[1:]
+    )
+    return "the same layouts and seeds" if same else f"runs each: {listed(counts)}, see the table of runs"
+
+
+@dataclass(frozen=True)
+class Line:
+    """One agent's curve: values float (R, G), a row per run, NaN where it has no value."""
+
+    name: str
+    values: NDArray[np.float64]
+    colour: str
+    dashed: bool = False
+
+
+def reward_bounds(lines: Sequence[Line]) -> Bounds:
+    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values.
+
+    Args:
+        lines: those that are drawn.
+    """
+    values = np.concatenate([np.zeros(0), *(line.values.ravel() for line in lines)])
+    known = values[np.isfinite(values)]
+    return SHARES if bool(((known >= 0) & (known <= 1)).all()) else (None, None)
+
+
+def learning_curves(
+    grid: NDArray[np.int64],
+    lines: Sequence[Line],
+    quantity: str,
+    references: Sequence[tuple[str, float]] = (),
+    bounds: Bounds = (0.0, None),
+) -> Figure:
+    """Figure 6: a quantity of episodes against environment steps; mean over runs, bands of one standard error.
+
+    Args:
+        grid: int (G,), environment steps.
+        lines: one per agent.
+        quantity: the y axis's label, with its unit.
+        references: horizontal lines with their names.
+        bounds: of the y axis, None for what fits the values.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
+        axes = figure.subplots()
+        for line in lines:
+            _draw_curve(axes, grid / 1000, line)
+        for (name, value), style in zip(references, (":", (0, (1, 3)), "-."), strict=False):
+            axes.axhline(value, color=GREY, linewidth=1.2, linestyle=style, label=name)
+        axes.set_xlabel("environment steps, in thousands")
+        axes.set_ylabel(quantity)
+        axes.set_xlim(0, grid[-1] / 1000)
+        axes.set_ylim(*bounds)
+        legend_below(figure, [axes], 2, handlelength=2.4)
+        return figure
+
+
+def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
+    known = (~np.isnan(line.values)).sum(0)
+    total = np.nansum(line.values, axis=0)
+    shown = known > 0
+    mean = np.where(shown, total / np.maximum(known, 1), np.nan)
+    squares = np.nansum((line.values - mean) ** 2, axis=0)
+    error = np.sqrt(squares / np.maximum(known - 1, 1) / np.maximum(known, 1))
+    style = "--" if line.dashed else "-"
+    axes.plot(steps, mean, color=line.colour, linestyle=style, linewidth=1.6, label=line.name)
+    if len(line.values) > 1:
+        low, high = (mean - error)[shown], (mean + error)[shown]
+        axes.fill_between(steps[shown], low, high, color=line.colour, alpha=0.18, linewidth=0)
+
+
+def variants(entries: Iterable[Entry], name: str = LEARNED) -> list[Entry]:
+    """The entries called ``name``, also those to which settings that differ between runs were added."""
+    return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{name}, ")]
+
+
+def control_of(material: Material, agent: Entry, entries: Sequence[Entry]) -> Entry | None:
+    """The random chooser among a variant's options: the one with the same settings added to its name.
+
+    Settings that most runs of a name share are not added to it, so a name can leave open which options were chosen
+    among. Then it is the only chooser with an ensemble of this variant, if no other variant has that ensemble.
+
+    Args:
+        material: its ``selection`` tells the runs' ensembles.
+        agent: one of the entries.
+        entries: agents, or agents of the selection.
+    """
+    agents, controls = variants(entries), variants(entries, RANDOM)
+    if len(agents) == len(controls) == 1:
+        return controls[0]
+    known = material.metrics.get("selection", ())
+    ensembles = {entry["name"]: {run["ensemble"] for run in entry["runs"]} for entry in known}
+
+    def shares(one: Entry, other: Entry) -> bool:
+        return bool(ensembles.get(one["name"], set()) & ensembles.get(other["name"], set()))
+
+    same = [control for control in controls if same_settings(agent, control)]
+    if same and (shares(agent, same[0]) or not {agent["name"], same[0]["name"]} <= set(ensembles)):
+        return same[0]
+    near = [control for control in controls if shares(agent, control)]
+    rivals = [other for other in agents for control in near if shares(other, control)]
+    return near[0] if len(near) == len(rivals) == 1 else None
+
+
+def same_settings(agent: Entry, control: Entry) -> bool:
+    """Whether the same settings are added to both names."""
+    return bool(settings_of(agent) == settings_of(control, RANDOM))
+
+
+def settings_of(agent: Entry, name: str = LEARNED) -> str:
+    """What is added to a variant's name; nothing where it is the usual one."""
+    return str(agent["name"]).removeprefix(name).removeprefix(", ")
+
+
+def which(agent: Entry, entries: Sequence[Entry]) -> str:
+    """A sentence that says which variant is shown; nothing where there is only one."""
+    count = len(variants(entries))
+    return f"Shown is {agent['name']}, one of {count} variants of the option agent." if count > 1 else ""
+
+
+QUESTION = Question(
+    numbers=numbers,
+    missing=missing,
+    rows=rows,
+    pairs=lambda metrics: {"agents": against(metrics["agents"])},
+    summary=summary,
+    sections=sections,
+    figures=figures,
+    needed={"figure6": "options, meta or baseline artefacts: train-meta, train-baseline"},
+)

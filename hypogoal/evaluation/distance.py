@@ -1,61 +1,78 @@
-"""How near to the true sub-goal options stop (Spec F3, F4; Figures 4 and 5)."""
+"""Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders (Spec F3, F4)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from hypogoal.core.seeding import rng_for
-from hypogoal.evaluation.rooms import method_rank
-from hypogoal.evaluation.statistics import aggregate_with_deviation
+from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.domains.base import Domain, installed_domain
+from hypogoal.evaluation.numbers import (
+    METHODS,
+    ORACLE,
+    Metrics,
+    Row,
+    Rows,
+    by_groups,
+    by_method,
+    ensemble_name,
+    groups_of,
+    method_rank,
+    name_apart,
+    over,
+    pairs,
+    rows_of,
+)
+from hypogoal.evaluation.page import (
+    Block,
+    Drawn,
+    Entry,
+    Material,
+    Question,
+    comparison_tables,
+    deviation,
+    fixed,
+    interval,
+    label,
+    listed,
+    number,
+    percent,
+    section,
+    shown,
+    table,
+)
+from hypogoal.evaluation.pictures import overlay
+from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, legend_below, styled
+from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, within
 
-LAST = 100  # executions of an option that count
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hypogoal.evaluation.judging import Work
+
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
-ORACLE = "oracle termination"
 WHICH = ("best", "validated", "mean", "worst")
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
-SHARES = ("reached_base", "inside_at_start", "timed_out", "died")
-
-
-@dataclass(frozen=True)
-class Executions:
-    """Executions of options in the order in which they ended, arrays (n,): the rows of ``executions.csv``.
-
-    Attributes:
-        step: environment steps when it ended.
-        option: g*K + k.
-        duration: steps.
-        reached: its own termination classifier said yes.
-        inside_at_start: that classifier said yes where it began.
-        terminated: the episode ended in a terminal state: the agent died.
-        room, x, y: where it stopped.
-        distance: from there to the nearest true sub-goal, in the domain's units.
-    """
-
-    step: NDArray[np.int64]
-    option: NDArray[np.int64]
-    duration: NDArray[np.int64]
-    reached: NDArray[np.bool_]
-    inside_at_start: NDArray[np.bool_]
-    terminated: NDArray[np.bool_]
-    room: NDArray[np.int64]
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
-    distance: NDArray[np.int64]
-
-    def of(self, option: int, last: int = LAST) -> Executions:
-        """The last executions of one option."""
-        rows = np.flatnonzero(self.option == option)[-last:]
-        return Executions(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
-    def positions(self) -> NDArray[np.int64]:
-        """Where they stopped, (n, 3)."""
-        return np.stack([self.room, self.x, self.y], axis=1)
+SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
+_NAMES = (*WHICH, "executions_deviation", *SHARES)
+NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
+ROOMS_SHOWN = 3
+NEEDED = "It needs options artefacts with executions.csv: train-options with --set start=LADDER."
+GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
+HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
+STOPS = {
+    HIT: ("at a true base", "o", SKY),
+    MISS: ("elsewhere", "x", ORANGE),
+    BEGAN_INSIDE: ("began inside: counts 300", "s", PURPLE),
+}
 
 
 def counted(executions: Executions) -> NDArray[np.float64]:
@@ -158,7 +175,7 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
         before = sum((seed, ladder) == (row["seed"], row["ladder"]) for (seed, _), ladder in own)
         own[(row["seed"], before), row["ladder"]] = _numbers(row)  # of one seed there may be several ensembles' options
     by_ladder, over_ladders = [], []
-    for key in sorted(cells, key=_order):
+    for key in sorted(cells, key=by_method):
         found = cells[key]
         about = dict(zip(("method", "groups", "sub_goal"), key, strict=True))
         seeds = sorted({seed for seed, _ in found})
@@ -185,13 +202,10 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
     return {"by_ladder": by_ladder, "over_ladders": over_ladders}
 
 
-_NAMES = (*WHICH, "executions_deviation", *SHARES)
-
-
 def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
     """One artefact's numbers by the names in ``_NAMES``: distances, and of the best member the rest."""
     options, nothing = row["options"], float("nan")
-    known = [option["distance"] for option in options if not np.isnan(option["distance"])]
+    known = [value for option in options if (value := option["distance"]) is not None and not np.isnan(value)]
     best = {} if row["best"] is None else options[row["best"]]
     return {
         "best": best.get("distance", nothing),
@@ -206,11 +220,559 @@ def _over_seeds(rows: Sequence[Mapping[str, float]], *names: str) -> dict[str, A
     found = {}
     for name in _NAMES:
         unit = "share of executions" if name in SHARES else "units of position"
-        rng = rng_for(0, "bootstrap", "distance", *names, name)
-        found[name] = aggregate_with_deviation([row[name] for row in rows], [0] * len(rows), unit, rng)
+        found[name] = over([row[name] for row in rows], unit, "distance", *names, name, deviation=True)
     return found
 
 
-def _order(key: tuple[str, int | None, str]) -> tuple[str, int, str, int]:
-    method, groups, sub_goal = key
-    return sub_goal, method_rank(method), method, -1 if groups is None else groups
+def ladder_names(
+    methods: Sequence[str], groups: Sequence[int | None], configs: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """Names of options by their ensemble's method; where their own settings differ at one N, those are added.
+
+    Args:
+        methods: n names.
+        groups: n numbers N.
+        configs: n resolved settings of ``train-options``.
+    """
+    names = list(methods)
+    for own in set(groups):
+        here = [index for index, value in enumerate(groups) if value == own]
+        told = [{key: configs[index][key] for key in configs[index] if key not in NOT_A_METHOD} for index in here]
+        for index, name in zip(here, name_apart([methods[index] for index in here], told), strict=True):
+            names[index] = name
+    return names
+
+
+def rooms_shown(where: Sequence[NDArray[np.int64]], own: Sequence[int] = ()) -> list[int]:
+    """Figure 5: the rooms that are drawn: the ladder's own, then those in which the most executions stopped.
+
+    Args:
+        where: per option the rooms of its stops, (n,).
+        own: the ladder's rooms, from the top down.
+    """
+    rooms, counts = np.unique(np.concatenate([np.zeros(0, np.int64), *where]), return_counts=True)
+    often = rooms[np.argsort(-counts, kind="stable")]
+    return [*own, *(int(room) for room in often if room not in own)][: max(ROOMS_SHOWN, len(own))]
+
+
+def numbers(work: Work) -> dict[str, Any]:
+    """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
+
+    Returns:
+        ``options``: a row per artefact and sub-goal; ``by_ladder`` and ``over_ladders``: over seeds; ``shown``: what
+        Figure 5 is drawn of, for each ladder and N the best members of the first seed, whose stops are in the arrays.
+    """
+    found, executions, options = work.found, {}, []
+    for artefact, about in zip(found.ladders, _named(work), strict=True):
+        config, path = artefact.config, found.name(artefact)
+        executions[path] = read_executions(artefact.path / "executions.csv")
+        if "terminations.h5" in artefact.manifest["files"]:
+            for option, states in read_terminations(artefact.path / "terminations.h5").items():
+                work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
+        validated = about.pop("validated")
+        about = {"path": path, "ladder": config["start"], "seed": artefact.seed, **about}
+        options += [{**about, **row} for row in rows_of_ladder(artefact, executions[path], validated)]
+        work.progress.advance()
+    names = {artefact.config["domain"] for artefact in found.ladders}
+    domain = installed_domain(names.pop()) if len(names) == 1 else None
+    used = {row["ladder"] for row in options}
+    starts = [start for start in (domain.starts if domain else ()) if start in used]
+    ladders = [*starts, *sorted(used - set(starts))]
+    stops = show_stops(options, ladders, executions, domain, work.arrays)
+    return {"distance": {"options": options, **distance_tables(options, ladders), "shown": stops}}
+
+
+def rows_of_ladder(
+    artefact: Artefact, executions: Executions, validated: Mapping[str, int | None]
+) -> list[dict[str, Any]]:
+    """:func:`ladder_numbers` of an options artefact."""
+    config = artefact.config
+    return ladder_numbers(executions, config["sub_goals"], config["members"], validated, masked=config["mask_reached"])
+
+
+def _named(work: Work) -> list[dict[str, Any]]:
+    """Of each ladder's options method and N, those of its ensemble, and the member that validation chooses."""
+    found, known = work.found, {ensemble["path"]: ensemble for ensemble in work.ensembles}
+    named: list[dict[str, Any]] = []
+    for artefact in found.ladders:
+        source = open_artefact(artefact.input("ensemble"), "ensemble")
+        path = within(found, source)
+        own = known.get(path or "", {})
+        about = {
+            "method": own.get("method", ensemble_name(source.config)),
+            "groups": groups_of(source.config),
+            "ensemble": path,
+            "validated": {
+                row["sub_goal"]: row["rooms"]["validated"]["member"]
+                for row in own.get("sub_goals", ())
+                if "rooms" in row
+            },
+        }
+        oracle: dict[str, Any] = {"method": ORACLE, "groups": None, "ensemble": None, "validated": {}}
+        named.append(about if takes(artefact) else oracle)
+    names = ladder_names(
+        [about["method"] for about in named],
+        [about["groups"] for about in named],
+        [artefact.config for artefact in found.ladders],
+    )
+    return [{**about, "method": name} for about, name in zip(named, names, strict=True)]
+
+
+def show_stops(
+    rows: Sequence[Mapping[str, Any]],
+    ladders: Sequence[str],
+    executions: Mapping[str, Executions],
+    domain: Domain | None,
+    arrays: Any,
+) -> list[dict[str, Any]]:
+    """Figure 5's material: for each ladder and N the best members' stops of the first seed, and pictures of the rooms.
+
+    Args:
+        rows: of ``distance.ladder_numbers``, with path, method, groups, ladder and seed.
+        ladders: in their order.
+        executions: by path.
+        domain: draws its rooms, where it can.
+        arrays: ``stops/<path>/<option>`` and ``pictures/<room>`` are written into it.
+
+    Returns:
+        Per figure ladder, groups, seed, rooms and columns; none where the domain has no pictures.
+    """
+    if domain is None or not domain.pictures:
+        return []
+    first = min((row["seed"] for row in rows), default=0)
+    numbers = sorted({row["groups"] for row in rows if row["groups"] is not None}) or [None]
+    shown = []
+    for ladder in ladders:
+        here = [row for row in rows if row["ladder"] == ladder and row["seed"] == first and row["best"] is not None]
+        here.sort(key=lambda row: method_rank(row["method"]))
+        for groups in numbers:
+            columns, where = [], []
+            for row in here:
+                if row["groups"] != groups and not row["method"].startswith(ORACLE):
+                    continue
+                best = row["options"][row["best"]]
+                stops = executions[row["path"]].of(best["option"])
+                _write_stops(arrays, row["path"], best["option"], stops, domain.pixel)
+                columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
+                where.append(stops.room)
+            if columns:
+                rooms = rooms_shown(where, domain.rooms_of(ladder))
+                about = {"ladder": ladder, "groups": groups, "seed": first, "rooms": rooms}
+                shown.append({**about, "columns": columns})
+    for room in sorted({room for one in shown for room in one["rooms"]}):
+        arrays[f"pictures/{room}"] = domain.picture(room)
+    return shown
+
+
+def _write_stops(arrays: Any, path: str, option: int, executions: Executions, pixel: Any) -> None:
+    """Figure 5: ``stops/<options artefact>/<option>/{positions,pixels,fates}``; ``pixel`` is the domain's."""
+    group = arrays.require_group(f"stops/{path}/{option}")
+    if len(group):
+        return  # the oracle's stand beside every N
+    group["positions"] = executions.positions()
+    group["pixels"] = np.asarray(pixel(executions.positions())).reshape(-1, 2)
+    group["fates"] = fates(executions)
+
+
+def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
+    """Every member's option on every ladder."""
+    for entry in metrics["distance"]["options"]:
+        about = {"method": entry["method"], "N": entry["groups"], "ladder": entry["ladder"], "seed": entry["seed"]}
+        for option in entry["options"]:
+            own = {name: value for name, value in option.items() if name not in ("member", "option")}
+            place = {"sub_goal": entry["sub_goal"], "member": option["member"], "artefact": entry["path"]}
+            yield from rows_of(own, **about, **place)
+
+
+def missing(work: Work) -> list[str]:
+    """Spec F3, F4: the options that are not there, of a run with ladders."""
+    found, lines = work.found, []
+    for artefact in found.silent:
+        lines.append(f"no executions.csv in {found.name(artefact)}: its domain tells no distance")
+    there = [entry["method"] for entry in work.metrics["distance"]["options"]]
+    if not there:
+        return [*lines, "no options artefact of a ladder (Figures 4 and 5)"] if work.metrics["rooms"] else lines
+    for start, name in METHODS.items():
+        if not any(method.startswith(start) for method in there):
+            lines.append(f"no options artefact of {name} (Figures 4 and 5)")
+    if not any(method.startswith(ORACLE) for method in there):
+        lines.append("no options artefact with oracle terminations beside them")
+    return lines
+
+
+def against(options: Sequence[Entry], *, ranked: bool = True) -> Rows:
+    """Spec F3: methods by how near their members' options stop, at each N, paired by ladder and seed; units are seeds.
+
+    The best member is the best on the executions that are compared, of more members the better: beside it stand the
+    one that validation on the labelled rooms chooses, and the mean over members.
+
+    Args:
+        options: rows of :func:`ladder_numbers` with path, method, groups, ladder and seed. Oracle terminations
+            have no N and no members to choose among; they are left out.
+        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
+    """
+    learned = [one for one in options if not one["method"].startswith(ORACLE) and one["best"] is not None]
+    learned.sort(key=lambda one: method_rank(one["method"]) if ranked else 0)
+    found: Rows = []
+    for groups in by_groups(learned):
+        for which in ("best", "validated", "mean"):
+            measured = [
+                (one["method"], (one["ladder"], one["sub_goal"], one["seed"]), _numbers(one)[which])
+                for one in learned
+                if one["groups"] == groups
+            ]
+            where = "" if groups is None else f"N={groups}"
+            found += pairs(measured, f"distance, {which} member", where, higher=False)
+    return found
+
+
+def _group(entry: Entry) -> str:
+    return "true sub-goal" if entry["groups"] is None else f"N={entry['groups']}"
+
+
+METHOD = label("method", "method")
+LABELS = label("labels", _group)
+STOPPED = tuple(number(which, which, deviation, 1) for which in WHICH)
+SHARED = tuple(number(title, f"{share}.mean", percent) for share, title in SHARES.items())
+SEEDS = number("seeds", "seeds")
+OVER_LADDERS = (
+    label("labels", _group, once=True),
+    METHOD,
+    *STOPPED,
+    number("± exec.", "executions_deviation.mean", fixed, 1),
+    *SHARED,
+    SEEDS,
+)
+INTERVALS = (METHOD, LABELS, *(number(which, which, interval, 1) for which in ("best", "validated", "mean")))
+BY_LADDER = (label("ladder", "ladder", once=True), METHOD, LABELS, *STOPPED, *SHARED, SEEDS)
+OPTIONS = (
+    label("options", "path", once=lambda option: (option["path"], option["sub_goal"])),
+    label("member", "name"),
+    number("executions", "executions"),
+    number("distance", "distance", fixed, 1),
+    number("±", "executions_deviation", fixed, 1),
+    number("steps", "duration", fixed, 1),
+    *(number(title, share, percent) for share, title in SHARES.items()),
+)
+
+
+def summary(metrics: Metrics) -> list[Table]:
+    """Figure 4: by ladder and N the best member's distance and the mean one's, a column per method; at most 80 wide."""
+    from rich.table import Table
+
+    if not metrics["distance"]["options"]:
+        return []
+    by_ladder, over_ladders = metrics["distance"]["by_ladder"], metrics["distance"]["over_ladders"]
+    several = len({entry["sub_goal"] for entry in over_ladders}) > 1
+
+    def method_of(entry: Entry) -> str:
+        return f"{entry['method']} ({entry['sub_goal']})" if several else str(entry["method"])
+
+    methods = list(dict.fromkeys(map(method_of, over_ladders)))
+    title = "Distance from a true base where options stop: best member (mean member)"
+    found = Table(title=title, title_justify="left", width=79)
+    for heading in ("ladder", "N"):
+        found.add_column(heading, no_wrap=True)
+    for method in methods:
+        found.add_column(method, justify="right", ratio=1)
+
+    def both(entry: Entry) -> str:
+        return f"{fixed(entry['best']['mean'], 0)} ({fixed(entry['mean']['mean'], 0)})"
+
+    ladders = dict.fromkeys(entry["ladder"] for entry in by_ladder)
+    parts = [(ladder, [entry for entry in by_ladder if entry["ladder"] == ladder], both) for ladder in ladders]
+    parts.append(("mean", over_ladders, both))
+    parts.append(("at base, best", over_ladders, lambda entry: percent(entry["reached_base"]["mean"])))
+    for name, entries, show in parts:
+        if entries is over_ladders and show is both:
+            found.add_section()
+        numbers: list[int | None] = [groups for groups in by_groups(entries) if groups is not None]
+        for groups in numbers or [None]:
+            own = {method_of(entry): entry for entry in entries if entry["groups"] in (groups, None)}
+            cells = [show(own[method]) if method in own else "–" for method in methods]
+            found.add_row(name, "–" if groups is None else str(groups), *cells)
+            name = ""
+    return [found]
+
+
+def sections(material: Material) -> list[Block]:
+    """Figures 4 and 5, of a run with ladders."""
+    return [distance_section(material), stops_section(material)] if material.of_ladders() else []
+
+
+def distance_section(material: Material) -> Block:
+    """Figure 4: how far from a true base options stop."""
+    found = material.metrics["distance"]
+    title, drawn = "Options on ladders", shown(material, _bars(material))
+    if not found["options"]:
+        return section("distance", title, [], [drawn])
+    text = (
+        "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
+        f"rooms, it stops from the nearest true base of a ladder, over its last {LAST} executions; an execution that "
+        f"begins inside the option's own termination set counts {INSIDE}. Per ladder the best member, as in the paper, "
+        "with mean, worst and validated member beside it; then the mean over ladders. Oracle termination ends "
+        "options at the true base: what is left to it is how well policies were learned."
+    )
+    rows = found["over_ladders"]
+    short = [f"{entry['method']}, {_group(entry)}" for entry in rows if entry["incomplete_seeds"]]
+    left = f" Seeds that lack a ladder are left out: {'; '.join(short)}." if short else ""
+    ladders = dict.fromkeys(entry["ladder"] for entry in found["by_ladder"])
+    blocks = [
+        drawn,
+        table(
+            OVER_LADDERS,
+            _ordered(rows),
+            tight=True,
+            caption="Distance of the best, the validated, the mean and the worst member, mean over ladders; mean "
+            "over seeds ± standard deviation over seeds. ± exec.: the best member's standard deviation over its last "
+            f"{LAST} executions, mean over ladders and seeds. Shares of the best member's executions: at base, within "
+            f"{NEAR} of a true one and not begun inside; inside, begun in its own termination set; timed out; died. A "
+            f"death or a time-out at a base counts as both.{left}",
+        ),
+        table(
+            INTERVALS,
+            _ordered(rows),
+            tight=True,
+            folded="Interquartile means of the distance with intervals",
+            caption="Interquartile mean over seeds with its 95 % bootstrap interval; no interval with one seed.",
+        ),
+        *comparison_tables(material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}),
+        table(
+            BY_LADDER,
+            [one for ladder in ladders for one in _ordered(found["by_ladder"]) if one["ladder"] == ladder],
+            tight=True,
+            folded="Every ladder",
+            caption="As above, ladder by ladder.",
+        ),
+        table(
+            OPTIONS,
+            [line for entry in found["options"] for line in _options(entry)],
+            tight=True,
+            folded=f"Every option of {len(found['options'])} artefacts",
+            caption=f"The last {LAST} executions of each. An option without any was never offered: it would always "
+            f"have begun inside its own termination set, and counts {INSIDE}.",
+        ),
+    ]
+    return section("distance", title, [text], blocks)
+
+
+def _ordered(rows: Sequence[Entry]) -> list[Entry]:
+    """By N, then as they come; those without N last."""
+    return sorted(rows, key=lambda entry: (entry["groups"] is None, entry["groups"] or 0))
+
+
+def _options(entry: Entry) -> Iterator[Entry]:
+    for index, option in enumerate(entry["options"]):
+        notes = [word for word in ("best", "validated") if entry[word] == index]
+        name = f"{index}{' (' + ', '.join(notes) + ')' if notes else ''}"
+        yield {**option, "path": entry["path"], "sub_goal": entry["sub_goal"], "name": name}
+
+
+def figures(material: Material) -> list[Drawn]:
+    """Figures 4 and 5."""
+    return [_bars(material), *_stops(material)]
+
+
+def _bars(material: Material) -> Drawn:
+    found, name = material.metrics["distance"], "Figure 4: distance to the nearest true base"
+    if not found["options"]:
+        return Drawn("figure4", name, None, missing=NEEDED)
+    rows = [entry for entry in _ordered(found["over_ladders"]) if entry["best"]["mean"] is not None]
+    several = len({one["sub_goal"] for one in found["options"]}) > 1
+    bars = []
+    for entry in rows:
+        wide = entry["best"]["standard_deviation"]
+        method = f"{entry['method']} ({entry['sub_goal']})" if several else entry["method"]
+        values = _seed_means(found["options"], entry)
+        bars.append(Bar(method, _group(entry), entry["best"]["mean"], np.nan if wide is None else wide, values))
+    names = list(dict.fromkeys(bar.name for bar in bars if not bar.name.startswith(ORACLE)))
+    drawn = distance_bars(bars, names, INSIDE) if bars else None
+    seeds = sorted({one["seed"] for one in found["options"]})
+    ladders = found["over_ladders"][0]["ladders"]
+    caption = (
+        f"Figure 4 of the paper: distance of the best member of each ladder, mean over the ladders {listed(ladders)}; "
+        f"bars: mean over seeds ({listed(seeds)}), whiskers: ± one standard deviation over seeds, dots: each seed. "
+        "Lower is better. The paper's error bars are the deviation over the last 100 executions instead: in the table."
+    )
+    return Drawn("figure4", name, drawn, caption, "No seed has executions on all ladders of the run.")
+
+
+def _seed_means(options: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> list[float]:
+    """Each complete seed's mean over ladders of the best member's distance."""
+    keys = ("method", "groups", "sub_goal")
+    own = [one for one in options if all(one[key] == entry[key] for key in keys) and one["best"] is not None]
+    values = []
+    for seed in sorted({one["seed"] for one in own} - set(entry["incomplete_seeds"])):
+        distances = [one["options"][one["best"]]["distance"] for one in own if one["seed"] == seed]
+        if len(distances) == len(entry["ladders"]):
+            values.append(float(np.mean(distances)))
+    return values
+
+
+def stops_section(material: Material) -> Block:
+    """Figure 5: where on the ladders' rooms the best members' options stopped."""
+    text = (
+        f"The last {LAST} executions of the best member on each ladder, drawn where they stopped; in rooms that are "
+        "not drawn none or few did. Circles: at a true base. Crosses: anywhere else, by the member's own verdict, out "
+        "of time, or dead. Squares: executions that began inside the option's own termination set."
+    )
+    drawn = _stops(material)
+    texts = [text] if material.metrics["distance"]["shown"] else []
+    return section("stops", "Where options stop on the ladders", texts, [shown(material, one) for one in drawn])
+
+
+def _stops(material: Material) -> list[Drawn]:
+    found = material.metrics["distance"]
+    if not found["shown"]:
+        nothing = NEEDED if not found["options"] else "The domain has no pictures of its rooms."
+        return [Drawn("figure5", "Figure 5: where executions stopped", None, missing=nothing)]
+    return [_scatter(material, one, index) for index, one in enumerate(found["shown"])]
+
+
+def _scatter(material: Material, one: Entry, index: int) -> Drawn:
+    columns, notes = [], []
+    for column in one["columns"]:
+        place = f"stops/{column['path']}/{column['option']}"
+        positions, ends = material.arrays[f"{place}/positions"], material.arrays[f"{place}/fates"]
+        columns.append(Stops(column["method"], positions[:, 0], material.arrays[f"{place}/pixels"], ends))
+        elsewhere = int((~np.isin(positions[:, 0], one["rooms"])).sum())
+        hits, inside = int((ends == HIT).sum()), int((ends == BEGAN_INSIDE).sum())
+        more = f", {inside} began inside" if inside else ""
+        more += f", {elsewhere} in rooms not drawn" if elsewhere else ""
+        notes.append(
+            f"{column['method']}: member {column['member']}, {hits} of {len(ends)} at a base{more}, "
+            f"distance {fixed(column['distance'], 1)}"
+        )
+    pictures = [(room, material.arrays[f"pictures/{room}"]) for room in one["rooms"]]
+    groups = "" if one["groups"] is None else f", {_group(one)}"
+    caption = f"Figure 5 of the paper: ladder {one['ladder']}{groups}, seed {one['seed']}. {'. '.join(notes)}."
+    return Drawn(
+        f"figure5-{one['ladder']}" + ("" if one["groups"] is None else f"-N{one['groups']}"),
+        f"Where executions stopped, ladder {one['ladder']}{groups}",
+        stops_over_rooms(pictures, columns),
+        caption,
+        folded=f"Ladder {one['ladder']}{groups}" if index else "",
+    )
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One bar of Figure 4: mean and standard deviation over seeds (NaN for one), and the seeds' own values."""
+
+    name: str
+    group: str
+    mean: float
+    deviation: float
+    seeds: Sequence[float]
+
+
+def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> Figure:
+    """Figure 4: the best member's distance; lower is better.
+
+    Args:
+        bars: their groups are put side by side in the order in which they come.
+        names: all methods, in the order of their colours; any other name is drawn grey.
+        inside: what an execution counts that begins inside its own termination set, drawn as a line if it is near.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
+        axes = figure.subplots()
+        groups = list(dict.fromkeys(bar.group for bar in bars))
+        highest = max((bar.mean + np.nan_to_num(bar.deviation) for bar in bars), default=1.0)
+        for place, group in enumerate(groups):
+            own = [bar for bar in bars if bar.group == group]
+            width = min(0.26, 0.84 / len(own))
+            for index, bar in enumerate(own):
+                x = place + (index - (len(own) - 1) / 2) * width
+                turn, method = divmod(names.index(bar.name), len(METHOD_COLOURS)) if bar.name in names else (0, -1)
+                colour = METHOD_COLOURS[method] if method >= 0 else GREY
+                hatch = HATCHES[turn % len(HATCHES)]
+                look: dict[str, Any] = {"color": colour, "edgecolor": INK, "linewidth": 0, "alpha": 0.8, "hatch": hatch}
+                axes.bar(x, bar.mean, width * 0.92, label=bar.name, **look)
+                if np.isfinite(bar.deviation):
+                    axes.errorbar(x, bar.mean, bar.deviation, color=INK, capsize=3, linewidth=1.2)
+                spots = np.full(len(bar.seeds), x)
+                axes.plot(spots, bar.seeds, ".", color=INK, markersize=5, alpha=0.7)
+        if highest > inside / 2:
+            axes.axhline(inside, color=GREY, linewidth=1.2, linestyle=":", label="began inside its own termination set")
+        axes.set_xticks(range(len(groups)), groups)
+        axes.set_xlim(-0.6, len(groups) - 0.4)
+        axes.grid(visible=False, axis="x")
+        axes.set_ylim(0, None)
+        axes.set_ylabel("distance to the nearest true base\n(units of position)")
+        legend_below(figure, [axes], 2, handlelength=2.6)
+        return figure
+
+
+@dataclass(frozen=True)
+class Stops:
+    """Where one option stopped: rooms (n,), pixels (n, 2) in their pictures, fates (n,) (see ``distance.fates``)."""
+
+    title: str
+    rooms: NDArray[np.int64]
+    pixels: NDArray[np.int64]
+    fates: NDArray[np.int64]
+
+
+def stops_over_rooms(pictures: Sequence[tuple[int, NDArray[np.uint8]]], options: Sequence[Stops]) -> Figure:
+    """Figure 5: a row per option, its rooms side by side; with one room two options in a row.
+
+    What became of an execution is told by shape and by colour.
+
+    Args:
+        pictures: (room, uint8 (H, W, 3)).
+        options: whose stops.
+    """
+    with styled():
+        columns = max(2, len(pictures))
+        panels = [(stops, room, picture) for stops in options for room, picture in pictures]
+        rows = -(-len(panels) // columns)
+        height, width = pictures[0][1].shape[:2]
+        wide = (WIDTH - (columns - 1) * GAP) / columns  # inches
+        high = wide * height / width
+        size = (WIDTH, rows * (high + TITLE) + TITLE)
+        figure = Figure(figsize=size)
+        for index, (stops, room, picture) in enumerate(panels):
+            row, column = divmod(index, columns)
+            left, bottom = column * (wide + GAP), size[1] - (row + 1) * (high + TITLE)
+            place = figure.add_axes((left / size[0], bottom / size[1], wide / size[0], high / size[1]))
+            place.set_axis_off()
+            place.imshow(picture, interpolation="none", aspect="auto")
+            _draw_stops(place, stops, room)
+            first = room == pictures[0][0]
+            title = f"{stops.title}, room {room}" if first else f"room {room}"
+            place.set_title(title, pad=3, fontsize=9.5 if columns == 2 else 8)
+        handles = [Line2D([], [], marker=marker, color=colour, **_mark(marker)) for _, marker, colour in STOPS.values()]
+        labels = [name for name, _, _ in STOPS.values()]
+        figure.legend(handles, labels, loc="lower left", ncols=3, handletextpad=0.2, columnspacing=1.2, borderpad=0)
+        return figure
+
+
+def _mark(marker: str) -> dict[str, Any]:
+    more: dict[str, dict[str, Any]] = {
+        "o": {"markeredgewidth": 0.6, "markeredgecolor": INK},
+        "s": {"fillstyle": "none"},
+    }
+    return {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5, **more.get(marker, {})}
+
+
+def _draw_stops(axes: Axes, stops: Stops, room: int) -> None:
+    for fate, (_, marker, colour) in STOPS.items():
+        here = (stops.rooms == room) & (stops.fates == fate)
+        x, y = stops.pixels[here].T
+        axes.plot(x, y, marker, color=colour, alpha=0.75, **_mark(marker))
+
+
+QUESTION = Question(
+    numbers=numbers,
+    missing=missing,
+    rows=rows,
+    pairs=lambda metrics: {"distance": against(metrics["distance"]["options"])},
+    summary=summary,
+    sections=sections,
+    figures=figures,
+    needed={
+        "figure4": "options artefacts with executions.csv: train-options with --set start=LADDER",
+        "figure5": "options artefacts with executions.csv, of a domain that draws its rooms",
+    },
+)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from math import prod
 from pathlib import Path
@@ -13,15 +16,27 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.compute import prepare
+from hypogoal.core.hdf5 import fixed
+from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
 from hypogoal.dataset import Split, open_dataset
-from hypogoal.evaluation.shown import Unlabelled
+from hypogoal.domains.base import installed_domain
+from hypogoal.evaluation.run import Found
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.hypotheses.views import positions_of
 
 # Bytes of states times members from which on more processes pay for their start (3 s): about 100 s of Montezuma's.
 SPREAD_FROM = 4e9
+WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"}  # values of the origin ``seen``
+
+
+@dataclass(frozen=True)
+class Unlabelled:
+    """Unlabelled states: observations uint8 (M, H, W, C), positions int64 (M, 3) where they are known."""
+
+    observations: NDArray[np.uint8]
+    positions: NDArray[np.int64] | None
 
 
 class Case(NamedTuple):
@@ -51,6 +66,89 @@ class Judged(NamedTuple):
     told: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """A case with its states and what the members say of them.
+
+    Attributes:
+        number: the ensemble's, among those of the run.
+        case: the sub-goal's ensemble and its data.
+        split: N held-out states.
+        unlabelled: M states.
+        kinds: names of the values of the origin ``kind``.
+        judged: what K members say.
+        row: filled by the questions: what is said of this sub-goal's members in ``ensembles``.
+    """
+
+    number: int
+    case: Case
+    split: Split
+    unlabelled: Unlabelled
+    kinds: Sequence[str]
+    judged: Judged
+    row: dict[str, Any] = field(default_factory=dict)
+
+    def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, NDArray[np.uint8], NDArray[np.uint8]]:
+        """The ensemble, what it sees of some held-out states (n, h, w, C), and of the unlabelled ones on average."""
+        from hypogoal.evaluation.deep_lift import mean_state
+
+        ensemble, positions = self.case.read(), positions_of(self.split.origins)
+        seen = ensemble.see(self.split.observations[states], None if positions is None else positions[states])
+        return ensemble, seen, mean_state(ensemble.see(self.unlabelled.observations, self.unlabelled.positions))
+
+    def write_states(self, group: Any, picked: Sequence[tuple[int, str]]) -> None:
+        """Held-out states, what members say of them, and where they are from.
+
+        Args:
+            group: gets ``observations``, ``labels`` and ``layout_seeds`` (-1: none) (n,), ``probabilities`` and
+                ``verdicts`` (n, K), and as JSON lists of n texts ``kinds`` and ``places``.
+            picked: n times (index in the split, kind).
+        """
+        split, index = self.split, np.array([index for index, _ in picked], dtype=np.int64)
+        group["observations"] = split.observations[index]
+        group["probabilities"] = self.judged.probabilities[index]
+        group["verdicts"] = self.judged.verdicts[index]
+        group["labels"] = split.labels[index]
+        seeds = split.origins.get("layout_seed")
+        group["layout_seeds"] = seeds[index] if seeds is not None else np.full(len(index), -1)
+        group["kinds"] = fixed(json.dumps([kind for _, kind in picked]))
+        group["places"] = fixed(json.dumps([place_of(split.origins, state) for state in index]))
+
+
+def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:
+    """Where a state is from, in words; nothing where no origin says it."""
+    if "layout_seed" in origins:
+        return f"layout {origins['layout_seed'][state]}"
+    if "room" not in origins:
+        return ""
+    seen = f" ({WHERE[int(origins['seen'][state])]})" if "seen" in origins else ""
+    return f"room {origins['room'][state]}{seen}"
+
+
+@dataclass
+class Work:
+    """What the questions' numbers are made from.
+
+    Attributes:
+        found: the run's artefacts.
+        arrays: ``arrays.h5``, to be written into.
+        progress: is told of each artefact.
+        shown, browsed: the ensembles whose states are shown, and browsed; None where there is none.
+        looked: what questions keep of the states that they were shown, by their own names.
+        ensembles: what is said of each ensemble; its ``sub_goals`` are the rows of :class:`Judgement`.
+        metrics: the numbers so far.
+    """
+
+    found: Found
+    arrays: Any
+    progress: Progress
+    shown: int | None = None
+    browsed: int | None = None
+    looked: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
+    ensembles: list[dict[str, Any]] = field(default_factory=list)
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+
 def cases_of(ensembles: Sequence[Artefact]) -> list[tuple[int, Case]]:
     """Every sub-goal of every ensemble with the ensemble's number, those on the same states one after another."""
     found = [
@@ -72,6 +170,16 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
         states = counts["heldout"][case.sub_goal]["states"] + counts["unlabelled"]
         work += case.config["members"] * states * prod(dataset.observation_shape)
     return min(cores, len(cases)) if work >= SPREAD_FROM else 1
+
+
+def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[int], None]) -> Iterator[Judgement]:
+    """Every case judged, one after another with its states; ``done`` is told an ensemble's number at each."""
+    every = judge_all([case for _, case in cases], workers, lambda number: done(cases[number][0]))
+    for (number, case), judged in zip(cases, every, strict=True):
+        split, unlabelled = states_of(case.data, case.sub_goal)
+        domain = installed_domain(open_dataset(case.data).domain)
+        yield Judgement(number, case, split, unlabelled, domain.kinds if domain else (), judged)
+    states_of.cache_clear()
 
 
 def judge_all(cases: Sequence[Case], workers: int, done: Callable[[int], None]) -> list[Judged]:

@@ -1,4 +1,4 @@
-"""Members on rooms that training did and did not see, for each number of labelled ladder groups (Spec F1, Figure 3).
+"""Figure 3: members on rooms that training did and did not see, for each number of labelled ladder groups (Spec F1).
 
 The paper scores the best member on files that hold training rooms too, and picks it on the same files. Here every
 score stands on unseen rooms and on all rooms, and beside the best member are the mean, the worst and the one that the
@@ -7,26 +7,66 @@ rooms of the labelled groups, the only ones whose labels were to be had, would h
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.accuracy import best_mean_worst, member_scores, ranking
-from hypogoal.evaluation.ensembles import ensemble_names
-from hypogoal.evaluation.statistics import aggregate_with_deviation
+from hypogoal.evaluation.numbers import METHODS, ORACLE, Metrics, Rows, by_groups, by_method, method_rank, over, pairs
+from hypogoal.evaluation.page import (
+    Block,
+    Drawn,
+    Entry,
+    Material,
+    Question,
+    comparison_tables,
+    deviation,
+    fixed,
+    interval,
+    label,
+    listed,
+    number,
+    percent,
+    section,
+    shown,
+    table,
+    terminal,
+)
+from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, legend_below, styled
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hypogoal.evaluation.judging import Judgement, Work
 
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or
 # among the labelled ones.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
-TABLED = ("unseen", "all")  # scopes of the table and of Figure 3
-FIGURE = ("balanced_accuracy", "accuracy")  # scores of the table
+TABLED = {"unseen": "unseen rooms", "all": "all rooms"}  # scopes of the table and of Figure 3
+FIGURE = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}  # scores of the table
 SCORED = (*FIGURE, "ranking")  # of which best, mean, ... are told
-WHICH = ("best", "validated", "mean", "worst")
+WHICH = {
+    "best": "best member",
+    "validated": "validated member",
+    "mean": "mean of members",
+    "worst": "worst member",
+}
+SHARE = "share of states"
+PICKED = ("best", "validated", "mean")  # members that methods are compared by
+SEEN = {0: "no", 1: "unlabelled", 2: "labelled"}
+PAPER = (
+    "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
+    "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
+    "positive is not said, so look at the differences between methods and N rather than at the level."
+)
+STYLES = ("-", "--", "-.", ":", (0, (5, 1)))  # 5 beside 6 colours: both come again together after 30
+BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 
 
 def room_metrics(
@@ -139,21 +179,6 @@ def _false_positives(
     return rows
 
 
-def groups_of(config: Mapping[str, Any]) -> int | None:
-    """N, the number of labelled ladder groups that an ensemble's data have; None where its domain has no such thing."""
-    found = (config.get("domain_config") or {}).get("groups")
-    return found if isinstance(found, int) else None
-
-
-def method_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names of ensembles as methods: as ``ensembles.ensemble_names``, with all N under one name."""
-    alike = []
-    for config in configs:
-        inner = {key: value for key, value in (config.get("domain_config") or {}).items() if key != "groups"}
-        alike.append({**config, "domain_config": inner})
-    return ensemble_names(alike)
-
-
 def rooms_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
@@ -162,7 +187,7 @@ def rooms_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Returns:
         Rows with ``scores``: scope -> score -> best, validated, mean, worst (see
-        ``statistics.aggregate_with_deviation``); ``positives`` and ``always_no`` (the accuracy
+        ``numbers.over``); ``positives`` and ``always_no`` (the accuracy
         of never saying yes) per scope; ``tied``: mean number of members
         among which the validation rooms could not tell; disagreement on unlabelled and held-out states.
     """
@@ -172,8 +197,8 @@ def rooms_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             if "rooms" in row:
                 cells.setdefault((ensemble["method"], ensemble["groups"], row["sub_goal"]), []).append(row)
     table = []
-    for (method, groups, sub_goal), rows in sorted(cells.items(), key=lambda item: _order(*item[0])):
-        over = partial(_over_seeds, f"{method} {groups} {sub_goal}")
+    for (method, groups, sub_goal), rows in sorted(cells.items(), key=lambda item: by_method(item[0])):
+        cell = f"{method} {groups} {sub_goal}"
         scopes = [row["rooms"]["scopes"] for row in rows]
         table.append(
             {
@@ -186,7 +211,15 @@ def rooms_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "scores": {
                     scope: {
                         score: {
-                            which: over([own[scope]["scores"][score][which] for own in scopes], score, scope, which)
+                            which: over(
+                                [own[scope]["scores"][score][which] for own in scopes],
+                                score,
+                                cell,
+                                score,
+                                scope,
+                                which,
+                                deviation=True,
+                            )
                             for which in WHICH
                         }
                         for score in SCORED
@@ -197,7 +230,12 @@ def rooms_table(ensembles: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "tied": float(np.mean([row["rooms"]["validated"]["tied"] for row in rows])),
                 **{
                     f"disagreement_{states}": over(
-                        [row["disagreement"][states] for row in rows], "share of states", states
+                        [row["disagreement"][states] for row in rows],
+                        SHARE,
+                        cell,
+                        SHARE,
+                        states,
+                        deviation=True,
                     )
                     for states in ("unlabelled", "heldout")
                 },
@@ -211,15 +249,577 @@ def _always_no(scope: Mapping[str, Any]) -> float:
     return 1 - scope["positives"] / scope["states"] if scope["states"] else float("nan")
 
 
-def _over_seeds(cell: str, values: list[float], unit: str, *names: str) -> dict[str, Any]:
-    return aggregate_with_deviation(values, [0] * len(values), unit, rng_for(0, "bootstrap", cell, unit, *names))
+def look(work: Work, judgement: Judgement) -> None:
+    """Members room by room, where held-out states say which rooms training saw."""
+    split, judged = judgement.split, judgement.judged
+    if "seen" in split.origins:
+        judgement.row["rooms"] = room_metrics(
+            judged.verdicts, split.labels, split.origins, judgement.kinds, judged.probabilities
+        )
 
 
-def method_rank(method: str) -> int:
-    """The order of methods in tables and figures: the paper's method, its control, the single CNN, anything else."""
-    starts = ("dbat", "divdis", "no diversity", "single CNN")
-    return next((rank for rank, start in enumerate(starts) if method.startswith(start)), len(starts))
+def missing(work: Work) -> list[str]:
+    """Spec F1: the methods that are not there, of a run with ladders."""
+    rooms = work.metrics["rooms"]
+    if not rooms and not work.found.ladders:
+        return []
+    there = [entry["method"] for entry in rooms]
+    return [
+        f"no ensemble artefact of {name} (Figure 3)"
+        for start, name in METHODS.items()
+        if not any(method.startswith(start) for method in there)
+    ]
 
 
-def _order(method: str, groups: int | None, sub_goal: str) -> tuple[str, int, str, int]:
-    return sub_goal, method_rank(method), method, -1 if groups is None else groups
+def against(ensembles: Sequence[Entry], *, ranked: bool = True) -> Rows:
+    """Spec F1: methods by their members' balanced accuracy on unseen rooms, at each N, paired by seed, which are units.
+
+    Args:
+        ensembles: what was computed of each; those not judged by room are left out.
+        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
+    """
+    judged = [one for one in ensembles if any("rooms" in goal for goal in one["sub_goals"])]
+    judged.sort(key=lambda one: method_rank(one["method"]) if ranked else 0)
+    found: Rows = []
+    for groups in by_groups(judged):
+        for which in PICKED:
+            measured = [
+                (
+                    one["method"],
+                    (goal["sub_goal"], one["seed"]),
+                    goal["rooms"]["scopes"]["unseen"]["scores"]["balanced_accuracy"][which],
+                )
+                for one in judged
+                for goal in one["sub_goals"]
+                if one["groups"] == groups and "rooms" in goal
+            ]
+            where = "" if groups is None else f"N={groups}"
+            found += pairs(measured, f"balanced accuracy on unseen rooms, {which} member", where)
+    return found
+
+
+METHOD = label("method", "method", once=True)
+
+
+def group_name(entry: Entry) -> str:
+    """N as a table shows it."""
+    return "–" if entry["groups"] is None else str(entry["groups"])
+
+
+N = label("N", group_name)
+UNSEEN = (
+    *(number(which, f"scores.unseen.balanced_accuracy.{which}", deviation, 2) for which in WHICH),
+    number("acc., all", "scores.all.accuracy.best", deviation, 2),
+    number("seeds", "ensembles"),
+)
+SUMMARY = (
+    METHOD,
+    N,
+    *(number(f"unseen: {which}", f"scored.scores.unseen.balanced_accuracy.{which}", deviation, 2) for which in PICKED),
+    number("all: best acc.", "scored.scores.all.accuracy.best", deviation, 2),
+    number("distance: best", "distance.best", deviation, 1),
+    number("mean", "distance.mean", deviation, 1),
+    number("at base: best", "distance.reached_base.mean", percent),
+)
+INTERVALS = (
+    METHOD,
+    N,
+    *(
+        number(f"{scope}: {which}", f"scores.{scope}.balanced_accuracy.{which}", interval, 3)
+        for scope in TABLED
+        for which in PICKED
+    ),
+)
+DIFFERENCES = (
+    METHOD,
+    N,
+    number("disagree, unlabelled", "disagreement_unlabelled", deviation, 3),
+    number("disagree, held-out", "disagreement_heldout", deviation, 3),
+    number("tied on validation", "tied", fixed, 1),
+    *(
+        # which an evaluation of before does not have
+        number(
+            f"ranking, {which}",
+            lambda entry, which=which: entry["scores"]["unseen"].get("ranking", {}).get(which),
+            deviation,
+            3,
+        )
+        for which in ("best", "mean", "worst")
+    ),
+)
+SHORT = {"balanced_accuracy": "bal. acc.", "accuracy": "acc.", "precision": "prec.", "recall": "recall"}
+MEMBERS = (
+    label("ensemble", "path", once=lambda entry: (entry["path"], entry["sub_goal"])),
+    label("member", "name"),
+    *(number(f"{scope}: {short}", f"{scope}.{score}", fixed, 3) for scope in TABLED for score, short in SHORT.items()),
+    number("validation: bal. acc.", "labelled.balanced_accuracy", fixed, 3),
+    number("yes, unlabelled", "says_yes_unlabelled", fixed, 3),
+)
+
+
+def summary(metrics: Metrics) -> list[Table]:
+    """Figure 3 by method and N: on unseen rooms, and the paper's number."""
+    rows = metrics["rooms"]
+    several = len({row["sub_goal"] for row in rows}) > 1
+    method = label("method", lambda row: f"{row['method']} ({row['sub_goal']})" if several else row["method"])
+    title = "Balanced accuracy on unseen rooms; the best member's accuracy on all rooms"
+    return [terminal(title, (method, number("N", group_name), *UNSEEN), rows)] if rows else []
+
+
+def sections(material: Material) -> list[Block]:
+    """What was asked of ladders and what came out; Figure 3."""
+    return [ladders_section(material), rooms_section(material)] if material.of_ladders() else []
+
+
+def ladders_section(material: Material) -> Block:
+    """The question, the answer in two sentences, and the headline table."""
+    metrics = material.metrics
+    asked = (
+        "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
+        "several hypotheses about what the sub-goal is. Does one of them hold in rooms that training never saw, can it "
+        "be found, and does an option that ends where it says so end at the base of a ladder?"
+    )
+    alone = not metrics["agents"]
+    identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
+    rows, stops = metrics["rooms"], metrics["distance"]["over_ladders"]
+    scored, stopped = ({(one["method"], one["groups"], one["sub_goal"]): one for one in own} for own in (rows, stops))
+    headline = table(
+        SUMMARY,
+        [
+            {"method": key[0], "groups": key[1], "scored": scored.get(key), "distance": stopped.get(key)}
+            for key in dict.fromkeys([*scored, *stopped])
+        ],
+        tight=True,
+        caption="Unseen: balanced accuracy on rooms that no training state came from, of the best, the "
+        "validated and the mean member. All: accuracy of the best member on all held-out rooms, training "
+        "rooms included: the paper's Figure 3. Distance, in units of position: where options stop, from the "
+        "nearest true base, mean over ladders, of the best member (the paper's Figure 4, lower is better) and of "
+        "the mean one; and the share of the best one's executions that got to a base. Mean over seeds ± standard "
+        "deviation; N: labelled ladder groups.",
+    )
+    answer = " ".join(filter(None, [_scored(rows), _stopped(stops)]))
+    return section(identity, title, [asked, answer], [headline], metrics["missing"] if alone else [])
+
+
+def _scored(rows: Sequence[Entry]) -> str:
+    few = [entry for entry in rows if entry["groups"] == min((one["groups"] or 0 for one in rows), default=0)]
+    parts = []
+    for entry in few:
+        found = entry["scores"]["unseen"]["balanced_accuracy"]
+        if found["best"]["mean"] is not None:
+            best, validated = (fixed(found[which]["mean"], 2) for which in ("best", "validated"))
+            parts.append(f"{entry['method']}: {best} (validated {validated})")
+    if not parts:
+        return ""
+    return (
+        f"With the fewest labels (N={few[0]['groups']}), balanced accuracy of the best member on rooms that training "
+        f"never saw: {'; '.join(parts)}; 0.5 is chance."
+    )
+
+
+def _stopped(rows: Sequence[Entry]) -> str:
+    known = [entry for entry in rows if entry["best"]["mean"] is not None]
+    learned = [entry for entry in known if not entry["method"].startswith(ORACLE)]
+    if not learned:
+        return ""
+    near = min(learned, key=lambda entry: entry["best"]["mean"])
+    oracle = next((entry for entry in known if entry["method"].startswith(ORACLE)), None)
+    beside = f"; options that end at the true sub-goal: {fixed(oracle['best']['mean'], 0)}" if oracle else ""
+    return (
+        f"The best member's options stop {fixed(near['best']['mean'], 0)} units of position from a true base at best, "
+        f"the mean member's {fixed(near['mean']['mean'], 0)} ({near['method']}, N={near['groups']}), mean over "
+        f"{len(near['ladders'])} ladders{beside}."
+    )
+
+
+def rooms_section(material: Material) -> Block:
+    """Figure 3, its tables, every room and every kind of false positive."""
+    title = "Hypotheses against labelled ladders"
+    if not material.metrics["rooms"]:
+        lacking = ["Figure 3: it needs ensemble artefacts of data whose held-out states say which rooms training saw."]
+        return section("rooms", title, [], [], lacking)
+    text = (
+        "N is the number of ladder groups with labels. Members are judged on held-out states of rooms that no training "
+        "state came from (unseen), and of all rooms, training rooms included, as in the paper. The best member is "
+        "picked on the very states that it is scored on, so it rises with the number of members by chance alone; the "
+        "validated member is the one with the highest balanced accuracy on held-out states in the rooms of labelled "
+        "groups, which a user could pick too."
+    )
+    blocks = []
+    for own in _by_sub_goal(material):
+        blocks += [shown(material, _best(material, own)), shown(material, _four(material, own))]
+        blocks += [*(_table(own, scope) for scope in TABLED), *_over_seeds(own)]
+        blocks += kinds_tables(material, own) + room_tables(material, own)
+    blocks += comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
+    blocks.append(members_table(material))
+    return section("rooms", title, [text], blocks)
+
+
+def _by_sub_goal(material: Material) -> list[list[Entry]]:
+    rows = material.metrics["rooms"]
+    goals = dict.fromkeys(entry["sub_goal"] for entry in rows)
+    return [[entry for entry in rows if entry["sub_goal"] == goal] for goal in goals]
+
+
+def _table(rows: Sequence[Entry], scope: str) -> Block:
+    return table(
+        (
+            METHOD,
+            N,
+            *(
+                number(f"{name} {which}", f"scores.{scope}.{score}.{which}", deviation, 2)
+                for score, name in (("balanced_accuracy", "bal."), ("accuracy", "acc."))
+                for which in WHICH
+            ),
+            number("seeds", "ensembles"),
+        ),
+        rows,
+        tight=True,
+        heading=f"On held-out states of {TABLED[scope]}",
+        caption="Balanced accuracy (bal.) and accuracy (acc.) of the best, the validated, the mean and the "
+        f"worst member: mean over ensemble seeds ± standard deviation over them. {_never(rows, scope)}"
+        f"{_why_dashes(rows) if scope == 'unseen' else PAPER}",
+    )
+
+
+def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
+    intervals = table(
+        INTERVALS,
+        rows,
+        tight=True,
+        folded="Interquartile means of balanced accuracy with intervals",
+        caption="Interquartile mean over ensemble seeds with its 95 % bootstrap interval (2,000 resamples of seeds); "
+        "no interval with one seed.",
+    )
+    differences = table(
+        DIFFERENCES,
+        rows,
+        tight=True,
+        heading="How different the members are, and what they know",
+        caption="Share of states on which two members' verdicts differ, mean over pairs; mean over seeds ± standard "
+        "deviation. Tied: members with the same, highest balanced accuracy in the rooms of labelled groups, of which "
+        "the first counts as validated; where all are tied, validation chooses nothing. Ranking: share of pairs of a "
+        "positive and a negative of unseen rooms in which a member gives the positive the higher probability (area "
+        "under the ROC curve); what lies between that and balanced accuracy is where its threshold is.",
+    )
+    return [intervals, differences]
+
+
+def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
+    """What accuracy is worth here: that of a member that never says yes, by N."""
+    found = {entry["groups"]: entry["always_no"][scope] for entry in rows if entry["always_no"][scope] is not None}
+    told = [
+        f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in sorted(found.items(), key=str)
+    ]
+    return f"Never saying yes has accuracy {listed(told)}. " if told else ""
+
+
+def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
+    bare = sorted({entry["groups"] for entry in rows if entry["positives"]["unseen"] == 0 and entry["groups"]})
+    if not bare:
+        return ""
+    return (
+        f"At N={listed(bare)} no unseen room has a ladder base left, so balanced accuracy on them is not defined (–) "
+        "and accuracy there is the share of negatives called negative. "
+    )
+
+
+def _seeds(material: Material, rows: Sequence[Mapping[str, Any]]) -> str:
+    names = set(_names(rows))
+    seeds = sorted({one["seed"] for one in material.metrics["ensembles"] if one.get("method") in names})
+    return f"Ensemble seed{'s' if len(seeds) > 1 else ''} {listed(seeds)}."
+
+
+def figures(material: Material) -> Iterator[Drawn]:
+    """Figure 3, and what it leaves out."""
+    for own in _by_sub_goal(material):
+        yield _best(material, own)
+        yield _four(material, own)
+
+
+def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
+    panels = [
+        panel(rows, f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
+        for score in ("accuracy", "balanced_accuracy")
+        for scope in ("all", "unseen")
+    ]
+    name = f"figure3{_suffix(material, rows)}"
+    caption = (
+        "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
+        f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
+        f"{_seeds(material, rows)} {_why_dashes(rows)}{PAPER}"
+    )
+    nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
+    return Drawn(name, "Figure 3: the best member against labelled ladder groups", _drawn(panels), caption, nothing)
+
+
+def _four(material: Material, rows: Sequence[Entry]) -> Drawn:
+    panels = [panel(rows, name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
+    name = f"unseen{_suffix(material, rows)}"
+    caption = (
+        "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
+        f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
+        "Only the second can be had without labels from the rooms it is for."
+    )
+    title = "Balanced accuracy on unseen rooms"
+    return Drawn(name, title, _drawn(panels), caption, "As above.", file=f"figure3-{name}")
+
+
+def _drawn(panels: Sequence[Panel]) -> Figure | None:
+    """The figure; None where no data say N."""
+    known = any(len(series.groups) for panel in panels for series in panel.series)
+    return scores_over_groups(panels, [series.name for series in panels[0].series]) if known else None
+
+
+def _suffix(material: Material, rows: Sequence[Entry]) -> str:
+    """What a figure's name ends with where there are several sub-goals."""
+    several = len({entry["sub_goal"] for entry in material.metrics["rooms"]}) > 1
+    return f"-{rows[0]['sub_goal']}" if several else ""
+
+
+def _names(rows: Sequence[Entry]) -> list[str]:
+    return list(dict.fromkeys(entry["method"] for entry in rows))
+
+
+def panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str, which: str) -> Panel:
+    """One plot of Figure 3: a score of one kind of member over N, a line per method of the rows."""
+    series = []
+    for name in _names(rows):
+        own = [entry for entry in rows if entry["method"] == name and entry["groups"] is not None]
+        found = [entry["scores"][scope][score][which] for entry in own]
+        series.append(
+            Series(
+                name,
+                np.array([entry["groups"] for entry in own], dtype=np.int64),
+                np.array([np.nan if one["mean"] is None else one["mean"] for one in found], dtype=np.float64),
+                np.array(
+                    [np.nan if one["standard_deviation"] is None else one["standard_deviation"] for one in found],
+                    dtype=np.float64,
+                ),
+            )
+        )
+    blind = {}
+    for entry in sorted(rows, key=lambda entry: entry["groups"] or 0):
+        never = entry["always_no"][scope] if score == "accuracy" else 0.5 if entry["positives"][scope] else None
+        if entry["groups"] is not None and never is not None:
+            blind[entry["groups"]] = never
+    return Panel(title, blind, series)
+
+
+def bands(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What a figure of these rows shows spread by: a method with one N has a bar in place of a band."""
+    alone = [
+        len({entry["groups"] for entry in rows if entry["method"] == name and entry["groups"] is not None}) == 1
+        for name in _names(rows)
+    ]
+    if all(alone):
+        return "bars (methods side by side, all at the same N)"
+    return "bands, and bars where a method has one N (those methods side by side)" if any(alone) else "bands"
+
+
+@dataclass(frozen=True)
+class Series:
+    """One method over N: arrays (n,), the mean and the standard deviation over seeds; NaN where there is none."""
+
+    name: str
+    groups: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One small plot: its title, by N what it takes no seeing to score (dotted), and a series per method."""
+
+    title: str
+    blind: Mapping[int, float]
+    series: Sequence[Series]
+
+
+def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
+    """Figure 3: scores against the number of labelled ladder groups; bands of one standard deviation.
+
+    A method with one N has an error bar instead of a band, a little beside the other methods'.
+
+    Args:
+        panels: two in a row.
+        names: all methods, in the order of their colours.
+    """
+    with styled():
+        rows = -(-len(panels) // 2)
+        figure = Figure(figsize=(WIDTH, 2.25 * rows + 0.05), layout="constrained")
+        axes = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
+        values = [series.mean - np.nan_to_num(series.deviation) for panel in panels for series in panel.series]
+        known = np.concatenate([*values, [0.5]])
+        ticks = sorted({int(group) for panel in panels for series in panel.series for group in series.groups})
+        for place, panel in zip(axes.flat, panels, strict=False):
+            for series in panel.series:
+                _draw_series(place, series, names.index(series.name), len(names))
+            if len(panel.blind) == 1:  # of one N a line is a point, which a method's marker may hide
+                place.axhline(*panel.blind.values(), color=GREY, linewidth=1.2, linestyle=":", zorder=0)
+            else:
+                place.plot(list(panel.blind), list(panel.blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
+            place.set_title(panel.title, fontsize=9.5)
+            place.set_ylim(max(0.0, float(np.nanmin(known)) - 0.03), 1.03)
+            place.set_xticks(ticks)
+            place.set_xlim(min(ticks, default=0) - 0.4, max(ticks, default=1) + 0.4)
+        for place in axes[-1]:
+            place.set_xlabel("labelled ladder groups, N")
+        for place in axes[:, 0]:
+            place.set_ylabel("fraction")
+        for place in axes.flat[len(panels) :]:
+            place.set_visible(False)
+        legend_below(figure, list(axes.flat), 3, handlelength=2.6)
+        return figure
+
+
+def _draw_series(axes: Axes, series: Series, index: int, count: int) -> None:
+    """The series of method ``index`` of ``count``."""
+    colour, line = METHOD_COLOURS[index % len(METHOD_COLOURS)], STYLES[index % len(STYLES)]
+    marker = MARKERS[index % len(MARKERS)]
+    groups = series.groups.astype(np.float64)
+    if len(groups) == 1:  # the others with one N lie at the same place
+        groups += (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
+    axes.plot(groups, series.mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=series.name)
+    shown = ~(np.isnan(series.mean) | np.isnan(series.deviation))
+    mean, deviation = series.mean[shown], series.deviation[shown]
+    if len(mean) == 1:  # a band would have no width
+        axes.errorbar(groups[shown], mean, deviation, color=colour, capsize=3, linewidth=1.2)
+    else:
+        axes.fill_between(groups[shown], mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
+
+
+def _judged(material: Material, entry: Entry) -> list[Entry]:
+    """What the rooms say of all ensembles (seeds) behind a row of the table."""
+    return [
+        goal["rooms"]
+        for ensemble in material.metrics["ensembles"]
+        if ensemble.get("method") == entry["method"] and ensemble["groups"] == entry["groups"]
+        for goal in ensemble["sub_goals"]
+        if goal["sub_goal"] == entry["sub_goal"]
+    ]
+
+
+def kinds_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
+    """A table for each N: what share of each kind of negatives members call reached."""
+    blocks: list[Block] = []
+    for place, groups in enumerate(by_groups(rows)):
+        here = [entry for entry in rows if entry["groups"] == groups]
+        found = [_judged(material, entry) for entry in here]
+        kinds = {
+            (one["scope"], one["kind"]): one["negatives"]
+            for own in found
+            for rooms in own
+            for one in rooms["false_positives"]
+        }
+        lines = []
+        for (scope, kind), negatives in kinds.items():
+            shares = [[_shares(rooms, scope, kind) for rooms in own] for own in found]
+            cells = [
+                _percent(values)
+                for own in shares
+                for values in (
+                    [float(np.mean(share)) for share, _ in own],
+                    [picked for _, picked in own if picked is not None],
+                )
+            ]
+            lines.append({"scope": scope, "kind": kind, "states": f"{negatives:,}", "cells": cells})
+        names = [f"{entry['method']}: {which}" for entry in here for which in ("mean", "validated")]
+        columns = [
+            label("held-out states of", lambda line: TABLED[line["scope"]], once=True),
+            label("negatives", "kind"),
+            number("states", "states"),
+            *(number(name, lambda line, index=index: line["cells"][index]) for index, name in enumerate(names)),
+        ]
+        name = f"False positives by kind, N={group_name(here[0])}"
+        caption = (
+            "Share of each kind of negatives that a member calls reached, in %: mean over members and "
+            "seeds, and of the validated member, mean over seeds. Balanced accuracy hides these: a "
+            "member that says yes on the ladder ends an option half-way."
+        )
+        heading, folded = ("", name) if place else (name, "")
+        blocks += [table(columns, lines, tight=True, heading=heading, folded=folded, caption=caption)] if lines else []
+    return blocks
+
+
+def _shares(rooms: Mapping[str, Any], scope: str, kind: str) -> tuple[list[float], float | None]:
+    """Of one ensemble every member's share, and the validated member's."""
+    for one in rooms["false_positives"]:
+        if (one["scope"], one["kind"]) == (scope, kind):
+            validated = rooms["validated"]["member"]
+            return one["share"], None if validated is None else one["share"][validated]
+    return [float("nan")], None
+
+
+def _percent(values: Sequence[float]) -> str:
+    known = [value for value in values if not np.isnan(value)]
+    return f"{100 * float(np.mean(known)):.1f}" if known else "–"
+
+
+def room_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
+    """A folded table for each N: accuracies in every room."""
+    blocks: list[Block] = []
+    for groups in by_groups(rows):
+        here = [entry for entry in rows if entry["groups"] == groups]
+        found = [[rooms["by_room"] for rooms in _judged(material, entry)] for entry in here]
+        lines = []
+        for index, room in enumerate(found[0][0] if found and found[0] else ()):
+            cells = []
+            for own in found:
+                for score in FIGURE:
+                    values = [value for by_room in own for value in by_room[index][score] if value is not None]
+                    cells.append(fixed(float(np.mean(values)) if values else None, 2))
+            lines.append({**room, "cells": cells})
+        names = [f"{entry['method']}: {name}" for entry in here for name in ("bal. acc.", "accuracy")]
+        columns = [
+            label("room", lambda line: str(line["room"])),
+            label("in training", lambda line: SEEN.get(line["seen"], str(line["seen"]))),
+            number("states", "states", "{:,}".format),
+            number("positives", "positives", "{:,}".format),
+            *(number(name, lambda line, index=index: line["cells"][index]) for index, name in enumerate(names)),
+        ]
+        caption = (
+            "Mean over members and ensemble seeds, on the room's held-out states. Rooms without a "
+            "ladder base have no positives and so no balanced accuracy."
+        )
+        folded = f"Every room, N={group_name(here[0])}"
+        blocks += [table(columns, lines, tight=True, folded=folded, caption=caption)] if lines else []
+    return blocks
+
+
+def members_table(material: Material) -> Block:
+    """A folded table of every member of every ensemble."""
+    goals = [
+        (ensemble["path"], goal)
+        for ensemble in material.metrics["ensembles"]
+        for goal in ensemble["sub_goals"]
+        if "rooms" in goal
+    ]
+    lines = []
+    for path, goal in goals:
+        for index, member in enumerate(goal["members"]):
+            name = f"{index}{' (validated)' if index == goal['rooms']['validated']['member'] else ''}"
+            scopes = {scope: own["members"][index] for scope, own in goal["rooms"]["scopes"].items()}
+            lines.append({**member, **scopes, "path": path, "sub_goal": goal["sub_goal"], "name": name})
+    return table(
+        MEMBERS,
+        lines,
+        tight=True,
+        folded=f"Every member of {len(goals)} ensembles",
+        caption="Validation: held-out states in rooms of labelled groups. The last column is the share of unlabelled "
+        "states that the member calls positive.",
+    )
+
+
+QUESTION = Question(
+    look=look,
+    numbers=lambda work: {"rooms": rooms_table(work.ensembles)},
+    missing=missing,
+    pairs=lambda metrics: {"rooms": against(metrics["ensembles"])},
+    summary=summary,
+    sections=sections,
+    figures=figures,
+    needed={
+        "figure3": "ensemble artefacts of data of 1 to 7 labelled ladder groups: run montezuma-ladders --preset figure3"
+    },
+)

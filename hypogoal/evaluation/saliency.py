@@ -1,180 +1,369 @@
-"""What in a state a member goes by: DeepLift attributions and the check that they are complete (Spec F2, Figures 2, 9).
-
-Attributed is the log-odds of "reached", the difference of a member's two logits: its sign is the verdict at a threshold
-of 0.5, so positive attributions speak for "reached" whatever the member says. The attributions of a state, summed over
-pixels and frames, must be the difference between its log-odds and the baseline's; how far they are off is reported.
-"""
+"""Figures 2 and 9: held-out states worth looking at, and what in them each member goes by (Spec F2)."""
 
 from __future__ import annotations
 
-import copy
-import warnings
-from collections.abc import Sequence
+import base64
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from hypogoal.hypotheses.networks import as_input
+from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question, pick, picture, section, texts, verdict
+from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
+from hypogoal.evaluation.plots import BLUE, VERMILLION, grid_of_pictures, show_picture, styled
 
 if TYPE_CHECKING:
-    from hypogoal.hypotheses.ensemble import Ensemble
+    from hypogoal.evaluation.judging import Judgement, Work
 
 BASELINE = "the mean of what members see of the unlabelled states"
+KINDS = {
+    "true positive": "a true positive",
+    "disagree": "members disagree",
+    "false positive": "a false positive",
+}
+EXAMPLES = {
+    "disagree": "members disagree",
+    "wrong": "all members wrong",
+    "right yes": "all right",
+    "right no": "all right",
+}
+NEEDED = "an ensemble artefact with a member that calls a held-out state reached: train-ensemble"
+SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
+KEY = 0.75  # inches below all pictures
+
+
+def look(work: Work, judgement: Judgement) -> None:
+    """Example states and attributions of the ensemble that is shown; from unseen rooms where positives are in them.
+
+    ``examples/<sub-goal>`` and ``saliency/<sub-goal>`` are written: the states, and of the latter ``attributions``
+    float32 (n, K, h, w, C), in log-odds, to what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``.
+    """
+    if judgement.number != work.shown:
+        return
+    split, sub_goal, judged = judgement.split, judgement.case.sub_goal, judgement.judged
+    strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
+    among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
+    labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
+    examples = pick_examples(probabilities, labels, verdicts=verdicts)
+    explained = pick_to_explain(probabilities, verdicts, labels)
+    for name, picked in (("examples", examples), ("saliency", explained)):
+        picked = [(int(among[index]), kind) for index, kind in picked]
+        judgement.write_states(work.arrays.create_group(f"{name}/{sub_goal}"), picked)
+    states: list[dict[str, Any]] = []
+    if explained:
+        from hypogoal.evaluation.deep_lift import deep_lift, explanation
+
+        ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
+        found = deep_lift(ensemble, seen, baseline)
+        group = work.arrays[f"saliency/{sub_goal}"]
+        values = found.values.astype(np.float32)
+        group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
+        group["seen"], group["baseline"] = seen, baseline
+        states = explanation(found, explained)
+    work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
+
+
+def numbers(work: Work) -> dict[str, Any]:
+    """What is said of the attributions of one ensemble."""
+    if work.shown is None:
+        return {"saliency": None}
+    source = work.ensembles[work.shown]
+    about = {"ensemble": source["path"], "seed": source["seed"], "baseline": BASELINE}
+    return {"saliency": {**about, "sub_goals": work.looked["saliency"]}}
+
+
+def pick_examples(
+    probabilities: NDArray[np.float32],
+    labels: NDArray[np.bool_],
+    per_kind: int = 2,
+    threshold: float = 0.5,
+    verdicts: NDArray[np.bool_] | None = None,
+) -> list[tuple[int, str]]:
+    """States on which members disagree, all err, or all are right, so that a reader sees each.
+
+    Args:
+        probabilities: float (N, K), every member's P(sub-goal reached).
+        labels: bool (N,).
+        per_kind: states of each kind at most.
+        threshold: above which a member says yes.
+        verdicts: bool (N, K), what members say, where not all have that threshold.
+
+    Returns:
+        (index, kind) with kind ``disagree`` (the widest spread of probabilities first, true and false states in
+        turn), ``wrong`` (the most sure errors first), ``right yes`` and ``right no``; fewer where there are none.
+    """
+    verdicts = probabilities > threshold if verdicts is None else verdicts
+    correct = verdicts == labels[:, None]
+    spread = probabilities.max(1) - probabilities.min(1)
+    disagree = ~(verdicts.all(1) | (~verdicts).all(1))
+    wrong = ~correct.any(1)
+    error = np.abs(probabilities - labels[:, None]).min(1)
+    right = correct.all(1)
+    half = -(-per_kind // 2)
+    picked = [
+        *_first(disagree & labels, -spread, half, "disagree"),
+        *_first(disagree & ~labels, -spread, per_kind - half, "disagree"),
+        *_first(wrong & labels, -error, half, "wrong"),
+        *_first(wrong & ~labels, -error, per_kind - half, "wrong"),
+        *_first(right & labels, error, 1, "right yes"),
+        *_first(right & ~labels, error, 1, "right no"),
+    ]
+    return [(int(index), kind) for index, kind in picked]
+
+
+def pick_to_explain(
+    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]
+) -> list[tuple[int, str]]:
+    """Figures 2 and 9: the few states whose attributions are drawn.
+
+    Args:
+        probabilities: float (N, K), every member's P(sub-goal reached).
+        verdicts: bool (N, K).
+        labels: bool (N,).
+
+    Returns:
+        (index, kind), no state twice: ``true positive``, where the most members are right and, of those, the surest on
+        average; ``disagree``, where members differ and their probabilities are the furthest apart; ``false positive``,
+        where the most members err, and the surest. Fewer where there are none.
+    """
+    yes, mean = verdicts.sum(1), probabilities.mean(1)
+    spread = probabilities.max(1) - probabilities.min(1)
+    picked: list[tuple[int, str]] = []
+    for kind, mask, order in (
+        ("true positive", labels & (yes > 0), -(yes + mean)),
+        ("disagree", (yes > 0) & (yes < verdicts.shape[1]), -spread),
+        ("false positive", ~labels & (yes > 0), -(yes + mean)),
+    ):
+        free = mask.copy()
+        free[[index for index, _ in picked]] = False
+        picked += _first(free, order, 1, kind)
+    return picked
+
+
+def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], count: int, kind: str) -> list[tuple[int, str]]:
+    candidates = np.flatnonzero(mask)
+    ranked = candidates[np.argsort(order[candidates], kind="stable")]
+    return [(int(index), kind) for index in ranked[:count]]
+
+
+def sections(material: Material) -> list[Block]:
+    """States with each member's verdict, and what members look at."""
+    return [examples_section(material), saliency_section(material)]
+
+
+def examples_section(material: Material) -> Block:
+    """Held-out states with each member's verdict beside the truth."""
+    names = [name for name in material.arrays if name.startswith("examples/") and name.endswith("/observations")]
+    if not names:
+        missing = ["No example states: they need an ensemble artefact."]
+        return section("examples", "Example states", [], [], missing)
+    shown = material.metrics["saliency"]["ensemble"]
+    source = pick(material.metrics["ensembles"], "path", shown)
+    text = (
+        f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
+        "probability that the sub-goal is reached. Orange: verdicts that differ from the truth. Chosen to show "
+        "each kind, so their frequency here says nothing."
+    )
+    order = [goal["sub_goal"] for goal in source["sub_goals"]]
+    names.sort(key=lambda name: order.index(name.split("/")[1]))
+    return section(
+        "examples", "Example states", [text], [_example_cards(material, name.split("/")[1]) for name in names]
+    )
+
+
+def _example_cards(material: Material, sub_goal: str) -> Block:
+    arrays = _arrays(material, "examples", sub_goal)
+    cards = []
+    for index, kind in enumerate(texts(arrays["kinds"])):
+        truth = bool(arrays["labels"][index])
+        lines = []
+        for member, probability in enumerate(arrays["probabilities"][index]):
+            said = verdict(probability, bool(arrays["verdicts"][index, member]), truth)
+            lines.append({**said, "text": f"member {member}: {said['text']}"})
+        place = texts(arrays["places"])[index]
+        title = f"{EXAMPLES[kind]}; truth: {'yes' if truth else 'no'}{f', {place}' if place else ''}"
+        cards.append(_state_card(arrays["observations"][index], sub_goal, truth, title, lines))
+    return {"kind": "cards", "heading": sub_goal, "cards": cards}
+
+
+def _arrays(material: Material, group: str, sub_goal: str) -> dict[str, Any]:
+    start = f"{group}/{sub_goal}/"
+    return {name.removeprefix(start): own for name, own in material.arrays.items() if name.startswith(start)}
+
+
+def _state_card(
+    state: NDArray[np.uint8], sub_goal: str, truth: bool, title: str, lines: list[dict[str, str]]
+) -> dict[str, Any]:
+    alt = f"A held-out state; {sub_goal} is {'reached' if truth else 'not reached'}."
+    return {"png": picture(state), "alt": alt, "title": title, "lines": lines}
+
+
+def saliency_section(material: Material) -> Block:
+    """DeepLift of every member of one ensemble on a few held-out states."""
+    found = material.metrics["saliency"]
+    title = "What members look at"
+    if found is None:
+        return section("saliency", title, [], [], ["Attributions: they need an ensemble artefact: train-ensemble."])
+    states = [state for goal in found["sub_goals"] for state in goal["states"]]
+    errors = [member["completeness_error"] for state in states for member in state["members"]]
+    text = (
+        f"DeepLift attributions (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
+        f"{found['seed']}) on a few held-out states, against {found['baseline']}: what a state has in common with the "
+        "usual one gets none. Orange speaks for 'reached', blue against it, each picture on its own scale; the state "
+        "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
+        "that goes by what will not be there elsewhere cannot transfer."
+    )
+    check = (
+        f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
+        f"{max(errors):.0e} (log-odds)."
+        if errors
+        else ""
+    )
+    blocks = [
+        _cards(material, goal["sub_goal"], index, state)
+        for goal in found["sub_goals"]
+        for index, state in enumerate(goal["states"])
+    ]
+    missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
+    return section("saliency", title, [text, check], blocks, missing)
+
+
+def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block:
+    arrays = _arrays(material, "saliency", sub_goal)
+    observation, truth = arrays["observations"][index], bool(arrays["labels"][index])
+    place = [{"class": "no", "text": part} for part in (texts(arrays["places"])[index],) if part]
+    cards = [_state_card(observation, sub_goal, truth, f"truth: {'yes' if truth else 'no'}", place)]
+    for member in state["members"]:
+        number = member["member"]
+        said = verdict(arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth)
+        lines = [said]
+        if observation.shape[-1] != 3 and member["last_frame"] is not None:
+            lines.append({"class": "no", "text": f"last frame: {100 * member['last_frame']:.0f} %"})
+        values = flat(arrays["attributions"][index, number])
+        drawn = attribution_png(values, brightness(arrays["seen"][index]) / 255)
+        cards.append(
+            {
+                "png": base64.b64encode(drawn).decode("ascii"),
+                "alt": f"Attributions of member {number}, which says {said['text']}.",
+                "title": f"member {number}",
+                "lines": lines,
+            }
+        )
+    return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
+
+
+def figures(material: Material) -> Iterator[Drawn]:
+    """Figures 2 and 9: of each sub-goal the first state that is explained, a true positive where there is one."""
+    found = material.metrics["saliency"]
+    goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
+    for goal in goals:
+        arrays = _arrays(material, "saliency", goal["sub_goal"])
+        names = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")
+        state = Explained(*(arrays[name][0] for name in names))
+        suffix = f"-{goal['sub_goal']}" if len(goals) > 1 else ""
+        place = texts(arrays["places"])[0]
+        error = max(member["completeness_error"] for member in goal["states"][0]["members"])
+        about = (
+            f"DeepLift attributions of each member of {found['ensemble']} (seed {found['seed']}) on a held-out state "
+            f"of {goal['sub_goal']}{f' ({place})' if place else ''}: {KINDS[goal['states'][0]['kind']]}. Against "
+            f"{found['baseline']}. Orange speaks for 'reached', blue against it; each picture has a scale of its own. "
+            f"They add up to the difference in log-odds within {error:.0e}."
+        )
+        colours = state.seen.shape[-1] == 3
+        every = "Colour by colour." if colours else "Every frame that members see."
+        last = "" if colours else " Of the stack of frames the last."
+        members, frames = attributions_of_members(state), attributions_of_every_frame(state)
+        yield Drawn(f"figure2{suffix}", "Figure 2", members, f"Figure 2 of the paper. {about}{last}")
+        yield Drawn(f"figure9{suffix}", "Figure 9", frames, f"Figure 9 of the paper. {about} {every}")
 
 
 @dataclass(frozen=True)
-class Attributions:
-    """DeepLift of every member on n states.
+class Explained:
+    """A state and each member's attributions.
 
     Attributes:
-        values: float64 (n, K, H, W, C), in log-odds; they speak for "reached" where positive.
-        log_odds: float64 (n, K), each member's of each state.
-        baseline_log_odds: float64 (K,), of the baseline.
+        observation: uint8 (H, W, C).
+        seen: uint8 (h, w, C), what members see of it.
+        values: float (K, h, w, C), log-odds.
+        probabilities: float (K,).
+        verdicts: bool (K,).
+        truth: the sub-goal is reached.
     """
 
-    values: NDArray[np.float64]
-    log_odds: NDArray[np.float64]
-    baseline_log_odds: NDArray[np.float64]
+    observation: NDArray[np.uint8]
+    seen: NDArray[np.uint8]
+    values: NDArray[np.floating]
+    probabilities: NDArray[np.floating]
+    verdicts: NDArray[np.bool_]
+    truth: bool | np.bool_
 
-    def completeness_error(self) -> NDArray[np.float64]:
-        """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
-        return np.abs(self.values.sum(axis=(2, 3, 4)) - (self.log_odds - self.baseline_log_odds))
-
-
-def mean_state(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The baseline: the mean of observations (N, H, W, C), rounded, uint8 (H, W, C).
-
-    A black image would be a baseline that is a state of no domain: what all states share (walls, the floor) would get
-    most of the attribution, and what is black in a state (a pit, an open door) none. Against the mean state, what is
-    usual gets none, and what makes the state differ from the usual gets all.
-    """
-    return observations.mean(axis=0, dtype=np.float64).round().astype(np.uint8)
+    def said(self, member: int) -> str:
+        """A member's verdict and probability."""
+        verdict = "yes" if self.verdicts[member] else "no"
+        return f"member {member}: {verdict} {self.probabilities[member]:.2f}"
 
 
-def explanation(found: Attributions, picked: Sequence[tuple[int, str]]) -> list[dict[str, Any]]:
-    """Spec F2: the check, state by state and member by member.
+def attributions_of_members(state: Explained, columns: int = 4) -> Figure:
+    """Figure 2: what each member goes by in one state; of a stack of frames the last.
 
     Args:
-        found: of n states.
-        picked: (index, kind) of each of them.
+        state: of K members.
+        columns: pictures in a row, the state itself being the first.
     """
-    errors, sums = found.completeness_error(), found.values.sum(axis=(2, 3, 4))
-    last = np.abs(found.values[..., -1]).sum(axis=(2, 3))
-    everywhere = np.abs(found.values).sum(axis=(2, 3, 4))
-    share = np.divide(last, everywhere, out=np.full_like(last, np.nan), where=everywhere > 0)
-    return [
-        {
-            "kind": kind,
-            "members": [
-                {
-                    "member": member,
-                    "log_odds": float(found.log_odds[state, member]),
-                    "baseline_log_odds": float(found.baseline_log_odds[member]),
-                    "attributed": float(sums[state, member]),
-                    "completeness_error": float(errors[state, member]),
-                    "last_frame": float(share[state, member]),
-                }
-                for member in range(found.values.shape[1])
-            ],
-        }
-        for state, (_, kind) in enumerate(picked)
-    ]
+    members = len(state.values)
+    columns = min(columns, members + 1)
+    figure, places = grid_of_pictures(-(-(members + 1) // columns), columns, KEY)
+    show_picture(places[0], state.observation, f"truth: {'yes' if state.truth else 'no'}")
+    grey = brightness(state.seen) / 255
+    for member in range(members):
+        image = attribution_image(flat(state.values[member]), grey)
+        show_picture(places[member + 1], image, state.said(member))
+    _key(figure, places)
+    return figure
 
 
-def deep_lift(ensemble: Ensemble, observations: NDArray[np.uint8], baseline: NDArray[np.uint8]) -> Attributions:
-    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) of every member on some states.
-
-    Args:
-        ensemble: its members are plain ``nn.Sequential`` of modules used once.
-        observations: uint8 (n, H, W, C), what members see of a few states.
-        baseline: uint8 (H, W, C), what that is compared with.
-    """
-    inputs = as_input(torch.from_numpy(observations)).double().requires_grad_()
-    reference = as_input(torch.from_numpy(baseline[None])).double()
-    found = [_of_member(member, inputs, reference) for member in ensemble.members]
-    values, log_odds, baselines = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
-    return Attributions(np.moveaxis(values, -1, 1), log_odds, baselines[0])
-
-
-def _of_member(
-    member: nn.Module, inputs: Tensor, reference: Tensor
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Attributions (n, H, W, C), log-odds (n,) and the baseline's (1,); in double, where rounding is no matter."""
-    from captum.attr import DeepLift
-
-    network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r"\s*Setting forward, backward hooks", category=UserWarning)
-        values = DeepLift(network).attribute(inputs, reference, target=0)
-    with torch.no_grad():
-        log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
-    return values.detach().permute(0, 2, 3, 1).numpy(), log_odds.numpy(), baseline.numpy()
+def attributions_of_every_frame(state: Explained) -> Figure:
+    """Figure 9: a row per member, a column per frame, oldest first, above them the frames; of colours one of each."""
+    channels, members = state.seen.shape[-1], len(state.values)
+    figure, places = grid_of_pictures(members + 1, channels, KEY)
+    for channel, name in enumerate(_channels(channels)):
+        frame = state.seen[..., channel]
+        show_picture(places[channel], frame, name)
+        for member in range(members):
+            image = attribution_image(state.values[member, ..., channel], frame / 255)
+            show_picture(places[(member + 1) * channels + channel], image, state.said(member) if channel == 0 else "")
+    _key(figure, places)
+    return figure
 
 
-def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
-    """The log-odds of a member as a chain of modules that Captum's rules are right for.
-
-    Its rule for max pooling gives a pixel to the last of the windows that it is the maximum of, and loses what it gave
-    to the others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum
-    is taken over windows that do not overlap.
-
-    Args:
-        network: an ``nn.Sequential``, (n, C, H, W) -> logits (n, 2).
-        example: an input, for the shapes inside.
-
-    Returns:
-        (n, C, H, W) -> (n, 1).
-    """
-    layers: list[nn.Module] = []
-    values = example
-    with torch.no_grad():
-        for layer in network.children():
-            after = layer(values)
-            window = _window_of(layer, values)
-            if window is None:
-                layers.append(layer)
-            else:
-                side, stride = window
-                layers += [_Windows(side, stride), nn.MaxPool1d(side[0] * side[1])]
-                layers += [nn.Flatten(), nn.Unflatten(1, after.shape[1:])]
-            values = after
-    return nn.Sequential(*layers, _LogOdds())
+def _channels(count: int) -> list[str]:
+    if count == 3:
+        return ["red", "green", "blue"]
+    ages = range(count - 1, -1, -1)
+    return ["newest frame" if age == 0 else f"{age} step{'s' if age > 1 else ''} before" for age in ages]
 
 
-def _window_of(layer: nn.Module, values: Tensor) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Sides and strides of a pooling whose windows can be taken apart; None for any other module."""
-    height, width = values.shape[-2:] if values.ndim == 4 else (0, 0)
-    if isinstance(layer, nn.AdaptiveMaxPool2d) and layer.output_size in (1, (1, 1)):
-        return (height, width), (1, 1)
-    if isinstance(layer, nn.MaxPool2d) and not layer.ceil_mode and layer.padding == 0 and layer.dilation == 1:
-        return _pair(layer.kernel_size), _pair(layer.stride)
-    return None
+def _key(figure: Figure, places: Sequence[Axes]) -> None:
+    """What the colours mean; each picture has a scale of its own, so it has no numbers."""
+    with styled():
+        bar = figure.colorbar(
+            ScalarMappable(Normalize(-1, 1), SIGNED),
+            ax=list(places),
+            location="bottom",
+            fraction=0.05,
+            shrink=0.6,
+            aspect=40,
+        )
+        bar.set_ticks([-1, 0, 1], labels=["against", "0", "for 'reached'"])
+        bar.set_label("attribution in log-odds, each picture on its own scale")
 
 
-def _pair(value: int | tuple[int, ...]) -> tuple[int, int]:
-    return (value, value) if isinstance(value, int) else (value[0], value[1])
-
-
-class _Windows(nn.Module):
-    """(n, C, H, W) -> (n, C * windows, pixels of a window)."""
-
-    def __init__(self, side: tuple[int, int], stride: tuple[int, int]):
-        super().__init__()
-        self.side, self.stride = side, stride
-
-    def forward(self, values: Tensor) -> Tensor:
-        """Copies of the pixels, window by window."""
-        windows = values.unfold(2, self.side[0], self.stride[0]).unfold(3, self.side[1], self.stride[1])
-        return windows.reshape(len(values), -1, self.side[0] * self.side[1])
-
-
-class _LogOdds(nn.Module):
-    """Logits (n, 2) -> log-odds (n, 1)."""
-
-    def forward(self, logits: Tensor) -> Tensor:
-        """Their difference."""
-        return logits[:, 1:] - logits[:, :1]
+QUESTION = Question(
+    look=look, numbers=numbers, sections=sections, figures=figures, needed={"figure2": NEEDED, "figure9": NEEDED}
+)

@@ -1,12 +1,74 @@
-"""Which members the meta-policy prefers, and whether they are the good ones (Spec F6, the paper's question 5)."""
+"""Question 5, Figures 7 and 8: which members the meta-policy prefers, and whether they are the good ones (Spec F6)."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
+
+from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import Engine, load_domain, step_of
+from hypogoal.evaluation.accuracy import member_scores
+from hypogoal.evaluation.curves import (
+    LEARNED,
+    PRETRAINING,
+    RANDOM,
+    base_name,
+    control_of,
+    variants,
+    which,
+)
+from hypogoal.evaluation.numbers import Metrics, Row, over, rows_of
+from hypogoal.evaluation.page import (
+    Block,
+    Drawn,
+    Entry,
+    Material,
+    Question,
+    fixed,
+    interval,
+    label,
+    listed,
+    number,
+    picture,
+    section,
+    shown,
+    table,
+)
+from hypogoal.evaluation.pictures import overlay
+from hypogoal.evaluation.plots import (
+    GREY,
+    MARKERS,
+    PALETTE,
+    PICTURE_TITLE,
+    WIDTH,
+    grid_of_pictures,
+    legend_below,
+    show_picture,
+    styled,
+)
+from hypogoal.evaluation.run import Choices, read_choices, read_terminations, within
+
+if TYPE_CHECKING:
+    from hypogoal.evaluation.judging import Work
+
+LATE = 0.25  # the last part of training that is looked at by itself
+PARTS = 20  # of training, in which choices are counted apart
+SELECTED = (LEARNED, RANDOM, PRETRAINING)  # agents whose options are members: the others have nothing to select
+QUANTITIES = {
+    "preference": "preference",
+    "late_preference": "preference, last quarter",
+    "share": "raw share (confounded)",
+}
+NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
+SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth, on a run's layout
 
 
 def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -74,3 +136,433 @@ def most_and_least(values: NDArray[np.float64]) -> tuple[int | None, int | None]
     if len(known) == 0:
         return None, None
     return int(known[values[known].argmax()]), int(known[values[known].argmin()])
+
+
+def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[str, NDArray[np.float64]]:
+    """Spec E5, F6: choices counted in equal parts of training, in the order of time.
+
+    Args:
+        choices: windows, each counted in the part in which it ends.
+        options: O.
+        parts: at most; as many as there are windows where those are fewer.
+
+    Returns:
+        ``step``, where each part ends (P,), and ``chosen`` and ``expected``, (P, O) each.
+    """
+    windows = np.unique(choices.step)
+    parts = min(parts, len(windows))
+    ends = np.array([part[-1] for part in np.array_split(windows, parts)]) if parts else np.zeros(0)
+    part = np.searchsorted(ends, choices.step)
+    found = {"step": ends.astype(np.float64)}
+    for name in ("chosen", "expected"):
+        counts = np.bincount(part * options + choices.option, getattr(choices, name), minlength=parts * options)
+        found[name] = counts.reshape(parts, options).astype(np.float64)
+    return found
+
+
+def selection_of_run(
+    choices: Choices, match: NDArray[np.float64], sub_goals: Sequence[str], members: int
+) -> dict[str, Any]:
+    """Spec F6: how often each member was offered and chosen, beside how well it matches the true sub-goal here.
+
+    Args:
+        choices: the run's table of choices.
+        match: float (G*K,), each member's balanced accuracy on the layout's reachable states.
+        sub_goals: G names.
+        members: K.
+
+    Returns:
+        ``sub_goals``: a row per member (option, offered, chosen, expected, preference, late_preference, share, reached,
+        mean duration in steps, match), the most and the least preferred member; ``rank_correlation`` of preference,
+        late preference (the last quarter of training) and raw share with the match, each over all options and within
+        sub-goals. NaN where not defined.
+    """
+    options = len(sub_goals) * members
+    names = ("offered", "chosen", "expected", "reached", "duration")
+    totals = {name: choices.total(name, options) for name in names}
+    begin, end = (choices.step.min(), choices.step.max()) if len(choices.step) else (0, 0)
+    late = choices.since(end - LATE * (end - begin))
+    values = {
+        "preference": preference(totals["chosen"], totals["expected"]),
+        "late_preference": preference(late.total("chosen", options), late.total("expected", options)),
+        "share": shares(totals["chosen"]),
+    }
+    duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
+    by_goal = []
+    for index, sub_goal in enumerate(sub_goals):
+        start = index * members
+        most, least = most_and_least(values["preference"][start : start + members])
+        rows = [
+            {
+                "member": option - start,
+                "option": option,
+                "offered": int(totals["offered"][option]),
+                "chosen": int(totals["chosen"][option]),
+                "expected": float(totals["expected"][option]),
+                "reached": int(totals["reached"][option]),
+                "duration": float(duration[option]),
+                "match": float(match[option]),
+                **{name: float(value[option]) for name, value in values.items()},
+            }
+            for option in range(start, start + members)
+        ]
+        by_goal.append({"sub_goal": sub_goal, "members": rows, "most": most, "least": least})
+    correlations = {name: rank_correlations(value, match, members) for name, value in values.items()}
+    return {"sub_goals": by_goal, "rank_correlation": correlations}
+
+
+def numbers(work: Work) -> dict[str, Any]:
+    """Spec F6: for each agent whose options are members: choices against match, per run and over runs."""
+    found = work.found
+    artefacts = {found.name(artefact): artefact for artefact in found.agents}
+    matches: dict[tuple[Path, int], NDArray[np.float64]] = {}
+    metrics = []
+    for agent in work.metrics["agents"]:
+        rows = []
+        for about in agent["runs"]:
+            work.progress.advance()
+            artefact = artefacts[about["path"]]
+            if base_name(artefact.kind, artefact.config) not in SELECTED:
+                continue
+            source = open_artefact(artefact.input("ensemble"), "ensemble")
+            key = (source.path, about["layout_seed"])
+            if key not in matches:
+                matches[key] = match_on_layout(source, about["layout_seed"])
+            config, choices = artefact.config, read_choices(artefact.path / "choices.csv")
+            for option, states in read_terminations(artefact.path / "terminations.h5").items():
+                place = f"terminations/{about['path']}/{option}"
+                work.arrays[place] = overlay(states)
+                work.arrays[place].attrs["states"] = len(states)
+            for column, counts in over_training(choices, len(config["sub_goals"]) * config["members"]).items():
+                work.arrays[f"choices/{about['path']}/{column}"] = counts
+            of = {name: about[name] for name in ("path", "seed", "layout_seed")}
+            chosen = selection_of_run(choices, matches[key], config["sub_goals"], config["members"])
+            rows.append({**of, "ensemble": within(found, source), **chosen})
+        if rows:
+            metrics.append({"name": agent["name"], "runs": rows, "rank_correlation": _over_runs(agent["name"], rows)})
+    return {"selection": metrics}
+
+
+def match_on_layout(source: Artefact, layout_seed: int) -> NDArray[np.float64]:
+    """Spec F6: every member's balanced accuracy on the states of a layout, float (G*K,).
+
+    NaN where the domain does not have the sub-goal, which the user's own labels told: its truth there is not known.
+    """
+    from hypogoal.hypotheses.storage import read_ensemble  # with PyTorch, which a report needs not
+
+    domain = load_domain(source.config["domain"])
+    engine = domain.make_engine(layout_seed, 1, 500, **domain.world(source.config["domain_config"]))
+    ids = states_of_layout(engine)
+    images, labels = engine.images(ids), engine.labels(ids)
+    known_goals = list(domain.sub_goals)
+    match = []
+    for sub_goal in source.config["sub_goals"]:
+        if sub_goal not in known_goals:
+            match.append(np.full(source.config["members"], np.nan))
+            continue
+        ensemble = read_ensemble(source.path, source.config, sub_goal)
+        verdicts = ensemble.verdicts(images, engine.positions(ids) if ensemble.needs_positions else None)
+        match.append(member_scores(verdicts, labels[:, known_goals.index(sub_goal)])["balanced_accuracy"])
+    return np.concatenate(match)
+
+
+def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
+    """The states of a fresh engine's layout: those that can be reached, or, where nobody knows them, what so many
+    steps of random play meet; each once.
+    """
+    if (known := engine.reachable()) is not None:
+        return known
+    rng = rng_for(0, "states-of-layout")
+    met = [
+        step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids
+        for _ in range(steps // engine.count)
+    ]
+    return np.unique(np.concatenate([engine.ids, *met]))
+
+
+def _over_runs(name: str, rows: Sequence[Entry]) -> dict[str, Any]:
+    layouts = [row["layout_seed"] for row in rows]
+
+    def of(quantity: str, scope: str) -> dict[str, Any]:
+        values = [row["rank_correlation"][quantity][scope] for row in rows]
+        return over(values, "Spearman's rho", name, quantity, scope, strata=layouts)
+
+    return {quantity: {scope: of(quantity, scope) for scope in ("all", "within")} for quantity in QUANTITIES}
+
+
+def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
+    """Every member as an option of every run."""
+    for agent in metrics["selection"]:
+        for run in agent["runs"]:
+            about = {"method": agent["name"], "layout": run["layout_seed"], "seed": run["seed"], "scope": SCOPE}
+            for goal in run["sub_goals"]:
+                for member in goal["members"]:
+                    own = {name: value for name, value in member.items() if name not in ("member", "option")}
+                    place = {"sub_goal": goal["sub_goal"], "member": member["member"], "artefact": run["path"]}
+                    yield from rows_of(own, **about, **place)
+
+
+def missing(work: Work) -> list[str]:
+    """Sub-goals of which the domain does not know where they are reached."""
+    goals = [goal for agent in work.metrics["selection"] for run in agent["runs"] for goal in run["sub_goals"]]
+    unknown = [goal for goal in goals if all(math.isnan(member["match"]) for member in goal["members"])]
+    names = dict.fromkeys(goal["sub_goal"] for goal in unknown)
+    return [f"no truth of {name} in its domain, to match members with" for name in names]
+
+
+CORRELATIONS = (
+    label("chooser", "chooser", once=True),
+    label("ranked by", "ranked by"),
+    number("within sub-goals", "within", interval, 2),
+    number("over all options", "all", interval, 2),
+    number("runs", "within.n"),
+)
+MEMBERS = (
+    label("sub-goal", "sub_goal", once=True),
+    label("member", "name"),
+    number("offered", "offered"),
+    number("chosen", "chosen"),
+    number("expected", "expected", fixed, 0),
+    number("preference", "preference", fixed, 2),
+    number("late", "late_preference", fixed, 2),
+    number("share, %", "share", lambda share: fixed(None if share is None else 100 * share, 1)),
+    number("steps", "duration", fixed, 1),
+    number("match", "match", fixed, 2),
+)
+
+
+def sections(material: Material) -> list[Block]:
+    """Where options stop and which are chosen, of a run with agents."""
+    return [terminations_section(material), choices_section(material)] if material.of_agents() else []
+
+
+def _agent(material: Material) -> Entry | None:
+    """The variant of the option agent that is shown."""
+    return next(iter(variants(material.metrics["selection"])), None)
+
+
+def _name(run: Entry) -> str:
+    return f"layout seed {run['layout_seed']}, run seed {run['seed']}"
+
+
+def terminations_section(material: Material) -> Block:
+    """Figures 7 and 8: where the most and the least preferred member's options stopped."""
+    agent, title = _agent(material), "Where options stop"
+    if agent is None:
+        lacking = ["Overlaid termination states: they need a meta artefact with learned terminations: train-meta."]
+        return section("terminations", title, [], [], lacking)
+    text = (
+        "The states in which a member's classifier ended its option, laid over each other: what all of them share is "
+        "sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
+        "it prefers least; match is the member's balanced accuracy against the true sub-goal on that layout."
+    )
+    blocks = []
+    for index, run in enumerate(agent["runs"]):
+        name = _name(run)
+        blocks.append(
+            {
+                "kind": "pairs",
+                "heading": name if index == 0 else "",
+                "folded": "" if index == 0 else name[0].upper() + name[1:],
+                "pairs": [_pair(material, run, goal) for goal in run["sub_goals"]],
+                "caption": f"Figures 7 and 8 of the paper, for all sub-goals: {run['path']}, {name}. The last "
+                "states, 128 at most, in which the option's own classifier said yes.",
+            }
+        )
+    return section("terminations", title, [text, which(agent, material.metrics["selection"])], blocks)
+
+
+def _pair(material: Material, run: Entry, goal: Entry) -> dict[str, Any]:
+    sides = []
+    for word in ("most", "least"):
+        if goal[word] is None:
+            sides.append({"png": "", "nothing": "never offered", "title": f"{word} preferred: none", "note": ""})
+            continue
+        title, note, image = _side(material, run["path"], goal, word)
+        side = {"png": "", "nothing": "its classifier never ended it", "title": title, "note": note}
+        if image is not None:
+            alt = f"Overlaid termination states of {goal['sub_goal']}, member {goal[word]}"
+            side = {"png": picture(image), "alt": alt, "title": title, "note": note}
+        sides.append(side)
+    return {"title": goal["sub_goal"], "sides": sides}
+
+
+def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, str, NDArray[np.uint8] | None]:
+    """Title, note and picture of the most or the least preferred member."""
+    member = goal["members"][goal[word]]
+    note = f"preference {fixed(member['preference'], 2)}, match {fixed(member['match'], 2)}"
+    image = material.arrays.get(f"terminations/{path}/{member['option']}")
+    return f"{word} preferred: member {goal[word]}", note, image
+
+
+def choices_section(material: Material) -> Block:
+    """Question 5: does reward lead to the hypotheses that transfer?"""
+    agent, title, selection = _agent(material), "Which hypotheses are chosen", material.metrics["selection"]
+    drawn = shown(material, _scatter(material))
+    if agent is None:
+        return section("choices", title, [], [drawn])
+    text = (
+        "Preference is how often an option was chosen over how often a uniform choice among the options offered "
+        "would have chosen it. Raw shares are confounded by availability: a member that fires everywhere is masked "
+        "nearly always, one that never fires is always offered. The random chooser's numbers show what no preference "
+        "looks like."
+    )
+    correlations = table(
+        CORRELATIONS,
+        [
+            {"chooser": one["name"], "ranked by": name, **one["rank_correlation"][key]}
+            for one in selection
+            for key, name in QUANTITIES.items()
+        ],
+        heading="Rank correlation with the match",
+        caption="Spearman's rank correlation between how a member is ranked and its match with the true sub-goal on "
+        "the run's layout; interquartile mean over runs, 95 % bootstrap interval. Within: mean over sub-goals of the "
+        "correlation among a sub-goal's members. 1 would mean that reward picks out the hypotheses that transfer, 0 "
+        "that it does not.",
+    )
+    members = [_members(run, folded=index > 0) for index, run in enumerate(agent["runs"])]
+    control, one = control_of(material, agent, selection), which(agent, selection)
+    lacking = "No random chooser beside it: it needs a meta artefact with chooser=random."
+    if one:
+        one = f"{one} Rank correlations are those of every variant."
+        lacking = f"No random choice among the options of {agent['name']} was run."
+    return section("choices", title, [text, one], [drawn, correlations, *members], [] if control else [lacking])
+
+
+def _members(run: Entry, *, folded: bool) -> Block:
+    lines = []
+    for goal in run["sub_goals"]:
+        for index, member in enumerate(goal["members"]):
+            notes = [word for word in ("most", "least") if goal[word] == index]
+            name = f"{index}{' (' + notes[0] + ')' if notes else ''}"
+            lines.append({**member, "sub_goal": goal["sub_goal"], "name": name})
+    name = f"Every member: {_name(run)}"
+    return table(
+        MEMBERS,
+        lines,
+        heading="" if folded else name,
+        folded=name if folded else "",
+        caption="Decisions at which the option was offered and chosen; expected under uniform choice; preference "
+        "over all and over the last quarter of training; raw share of decisions; mean steps of an execution; match "
+        "on this layout.",
+    )
+
+
+def figures(material: Material) -> Iterator[Drawn]:
+    """Preference against match; Figures 7 and 8 and the other sub-goals', of the agent's first run."""
+    yield _scatter(material)
+    agent, selection = _agent(material), material.metrics["selection"]
+    run = agent["runs"][0] if agent else {"sub_goals": []}
+    for goal in run["sub_goals"]:
+        sides = [_side(material, run["path"], goal, word) for word in ("most", "least") if goal[word] is not None]
+        if not sides:
+            continue
+        name = NUMBERED.get(goal["sub_goal"], f"terminations-{goal['sub_goal']}")
+        title = name.replace("figure", "Figure ") if name in NUMBERED.values() else "As Figures 7 and 8"
+        caption = (
+            f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
+            f"prefers most and of the one it prefers least ({run['path']}, {_name(run)}); the last states, 128 at "
+            "most, in which the member's classifier ended its option. "
+            "Preference: chosen / expected under uniform choice; match: balanced accuracy on that layout. "
+            f"{which(agent, selection) if agent else ''}"
+        ).rstrip()
+        drawn = termination_states([(f"{title}\n{note}", image) for title, note, image in sides])
+        yield Drawn(name, title, drawn, caption)
+
+
+def _values(agent: Mapping[str, Any], key: str) -> NDArray[np.float64]:
+    """Float (runs, sub-goals, members)."""
+    return np.array(
+        [
+            [
+                [np.nan if member[key] is None else member[key] for member in goal["members"]]
+                for goal in run["sub_goals"]
+            ]
+            for run in agent["runs"]
+        ],
+        dtype=np.float64,
+    )
+
+
+def _scatter(material: Material) -> Drawn:
+    agent, selection = _agent(material), material.metrics["selection"]
+    if agent is None:
+        needed = "It needs a meta artefact with learned terminations: train-meta."
+        return Drawn("preference", "Which hypotheses are chosen", None, missing=needed)
+    control = control_of(material, agent, selection)
+    uncaring = (_values(control, "match").ravel(), _values(control, "preference").ravel()) if control else None
+    names = [goal["sub_goal"] for goal in agent["runs"][0]["sub_goals"]]
+    drawn = preference_against_match(names, _values(agent, "match"), _values(agent, "preference"), uncaring)
+    layouts = sorted({run["layout_seed"] for run in agent["runs"]})
+    caption = (
+        "Question 5 of the paper: a point per member and run, over all of training; up: chosen more often than by a "
+        f"uniform chooser; right: closer to the true sub-goal on that layout (layout seed {listed(layouts)}; runs: "
+        f"{len(agent['runs'])}). {which(agent, selection)}"
+    ).rstrip()
+    return Drawn("preference", "Preference against match", drawn, caption)
+
+
+def preference_against_match(
+    sub_goals: Sequence[str],
+    match: NDArray[np.float64],
+    preference: NDArray[np.float64],
+    control: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+) -> Figure:
+    """Question 5 of the paper: is the member that is chosen more often the one that fits the true sub-goal?
+
+    Args:
+        sub_goals: G names.
+        match: float (R, G, K), a member's balanced accuracy on the run's layout.
+        preference: float (R, G, K), chosen / expected under uniform choice.
+        control: the same two arrays, flat, of the random chooser.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
+        axes = figure.subplots()
+        if control is not None:
+            x, y = control
+            axes.plot(x, y, ".", color=GREY, markersize=5, alpha=0.6, label="random choice")
+        for index, name in enumerate(sub_goals):
+            colour, marker = PALETTE[index % len(PALETTE)], MARKERS[index % len(MARKERS)]
+            x, y = match[:, index].ravel(), preference[:, index].ravel()
+            axes.plot(x, y, marker, color=colour, markersize=6, alpha=0.85, linestyle="none", label=name)
+        axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=":")
+        axes.set_yscale("symlog", base=2, linthresh=0.25)
+        top = max(2.0, float(np.nanmax(preference))) if np.isfinite(preference).any() else 2.0
+        ticks = [0, 0.25, 0.5, *(2.0**power for power in range(int(np.ceil(np.log2(top))) + 1))]
+        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+        axes.set_ylim(-0.04, ticks[-1] * 1.1)
+        axes.set_xlabel("match: balanced accuracy on the run's layout")
+        axes.set_ylabel("preference: chosen / expected")
+        legend_below(figure, [axes], 3, handletextpad=0.3)
+        return figure
+
+
+def termination_states(sides: Sequence[tuple[str, NDArray[np.uint8] | None]]) -> Figure:
+    """Figures 7 and 8: overlaid termination states of some members, the most preferred first.
+
+    Args:
+        sides: title and overlay uint8 (H, W, C), None where its classifier never ended an execution.
+    """
+    figure, places = grid_of_pictures(1, max(2, len(sides)), PICTURE_TITLE)
+    for place, (title, image) in zip(places, sides, strict=False):
+        if image is None:
+            place.set_title(title, fontsize=9)
+            place.text(0.5, 0.5, "never ended\nby its classifier", ha="center", va="center", color=GREY)
+        else:
+            show_picture(place, image, title)
+    return figure
+
+
+QUESTION = Question(
+    numbers=numbers,
+    missing=missing,
+    rows=rows,
+    sections=sections,
+    figures=figures,
+    needed={
+        "figure7": "a meta artefact with learned terminations that has open-red-door: train-meta",
+        "figure8": "a meta artefact with learned terminations that has go-to-goal: train-meta",
+    },
+)

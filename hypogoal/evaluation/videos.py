@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.evaluation.figures import PALETTE
+from hypogoal.evaluation.plots import PALETTE
 
 SIDE = 336  # pixels that the state is enlarged to, or a little less
 LINE, MARGIN, BAR = 18, 8, 8  # pixels

@@ -12,7 +12,7 @@ from pathlib import Path
 from hypogoal.core.artefacts import MANIFEST, Artefact, check_files, find_input, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
-from hypogoal.evaluation.found import find
+from hypogoal.evaluation.run import find
 from hypogoal.experiments.cells import DERIVED, Cell
 
 

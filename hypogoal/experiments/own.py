@@ -21,13 +21,13 @@ from hypogoal.core.files import parse_toml, path_part, plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_cell
-from hypogoal.experiments.results import Number
+from hypogoal.experiments.results import COLUMNS
 
 FORMAT_VERSION = 1
 KEYS = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
 CELL_KEYS = {"name": str, "command": str, "axes": list, "minutes": (int, float), "memory_gb": (int, float)}
 RESERVED = ("--out", "--force", "--resume")
-TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *Number._fields)  # axes become columns
+TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *COLUMNS)  # axes become columns
 TAKEN_NAMES = ("evaluation", "report", "logs", "slurm")  # what else is in a run's folder
 MAX_CELLS = 20_000
 MOST = 1e7  # minutes, gigabytes

@@ -1,39 +1,29 @@
 """``results.csv``: every number of a sweep, one a row, with its place in the experiment (Spec G4).
 
-Made from the cells' own artefacts, and for the members of ensembles from the evaluation, which judged them. Nothing
-that differs between two runs of the same commands is in it: no time, no machine, no path.
+Made from the sweep's evaluation, and from the cells' own artefacts where that has nothing of them. Nothing that differs
+between two runs of the same commands is in it: no time, no machine, no path.
 """
 
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_text, write_table
 from hypogoal.dataset import open_dataset
-from hypogoal.evaluation.curves import run_numbers
-from hypogoal.evaluation.distance import ladder_numbers
-from hypogoal.evaluation.reading import read_episodes, read_executions, read_layout
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import RESULTS
 from hypogoal.experiments.status import done_of
 
+if TYPE_CHECKING:
+    from hypogoal.evaluation.numbers import Row
+
 AGAIN = "Make the artefact again."
-
-
-class Number(NamedTuple):
-    """One number of a cell: of which sub-goal, member and set of states, where that is said of it."""
-
-    number: str
-    value: float | int
-    sub_goal: str = ""
-    member: int | str = ""
-    scope: str = ""
+COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # behind those of the cell
 
 
 def write_results(plan: Plan, run: Path) -> Path:
@@ -43,103 +33,96 @@ def write_results(plan: Plan, run: Path) -> Path:
         UserError: an artefact is damaged.
     """
     names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
-    columns = ["cell", "stage", *names, *Number._fields[2:], *Number._fields[:2]]
     path = run / RESULTS
     try:
-        write_table(path, columns, _rows(plan, run, names))
+        write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"an artefact is damaged ({type(error).__name__} {error})"
         raise UserError(what, run, "'hypogoal verify' says which.") from None
     return path
 
 
-def _rows(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
-    done = done_of(plan)
-    judged = _judged([cell for cell in plan.cells if cell.out in done])
-    for cell in plan.cells:
-        if cell.out not in done:
-            continue
+def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
+    there = done_of(plan)
+    done = [cell for cell in plan.cells if cell.out in there]
+    evaluated: dict[str, list[Row]] = {}
+    for cell in done:
+        if cell.stage == "evaluate":
+            for row in _of_metrics(read_json(cell.out / "metrics.json", "the evaluation's numbers are", AGAIN)):
+                evaluated.setdefault(row.artefact, []).append(row)
+    for cell in done:
         axes = dict(cell.axes)
         about = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
-        for number in (*_numbers(cell), *judged.get(cell.out.relative_to(run).as_posix(), ())):
-            if math.isfinite(number.value):
-                yield [*about, *number[2:], number.number, number.value]
+        own = evaluated.get(cell.out.relative_to(run).as_posix())
+        for row in (*_logged(cell), *(own or _unevaluated(cell)), *_by_chance(cell)):
+            yield [*about, row.sub_goal, row.member, row.scope, row.quantity, row.value]
 
 
-def _numbers(cell: Cell) -> Iterator[Number]:
+def _of_metrics(metrics: dict[str, Any]) -> Iterator[Row]:
+    """What stands in ``metrics.json`` of each artefact: members, options, runs."""
+    from hypogoal.evaluation import curves, distance, hypotheses
+
+    metrics = {"ensembles": [], "agents": [], "layouts": [], "distance": {"options": []}, **metrics}
+    for rows in (hypotheses.rows, distance.rows, curves.rows):
+        yield from rows(metrics, {})
+
+
+def _logged(cell: Cell) -> Iterable[Row]:
+    """How many states were collected; the last that was logged of each sub-goal's ensemble."""
     if cell.stage == "collect":
-        yield from _states(cell.out)
-        return
+        return _states(cell.out)
     artefact = open_artefact(cell.out)
-    files = artefact.manifest["files"]
-    if artefact.kind == "ensemble":
-        yield from _losses(artefact)
-    if "executions.csv" in files:
-        yield from _distances(artefact)
-    elif "episodes.csv" in files and artefact.kind in ("options", "meta", "baseline"):
-        layout = read_layout(artefact.path / "layout.json")
-        numbers = run_numbers(read_episodes(artefact.path / "episodes.csv"), layout["shortest_path"])
-        facts = {name: layout[name] for name in ("shortest_path", "random_success")}
-        steps = artefact.config["steps"] + artefact.manifest["config"].get("options_steps", 0)
-        yield from _named({"steps": steps, **numbers, **facts})
+    return _losses(artefact) if artefact.kind == "ensemble" else ()
 
 
-def _named(numbers: Mapping[str, Any], **place: Any) -> Iterator[Number]:
-    for name, value in numbers.items():
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            yield Number(name, value, **place)
+def _by_chance(cell: Cell) -> Iterator[Row]:
+    """How random play does where an agent was trained."""
+    from hypogoal.evaluation.numbers import rows_of
+    from hypogoal.evaluation.run import read_layout
+
+    if _has(cell, "episodes.csv") and not _has(cell, "executions.csv"):
+        yield from rows_of({"random_success": read_layout(cell.out / "layout.json")["random_success"]})
 
 
-def _states(path: Path) -> Iterator[Number]:
+def _has(cell: Cell, table: str) -> bool:
+    """Whether it is what plays, with such a table."""
+    played = cell.stage in ("train-options", "train-meta", "train-baseline")
+    return played and table in open_artefact(cell.out).manifest["files"]
+
+
+def _states(path: Path) -> Iterator[Row]:
+    from hypogoal.evaluation.numbers import rows_of
+
     counts = open_dataset(path).counts()
     for split in ("labelled", "heldout"):
         for sub_goal, row in counts[split].items():
-            yield from _named(row, sub_goal=sub_goal, scope=split)
-    yield Number("states", counts["unlabelled"], scope="unlabelled")
+            yield from rows_of(row, sub_goal=sub_goal, scope=split)
+    yield from rows_of({"states": counts["unlabelled"]}, scope="unlabelled")
 
 
-def _losses(artefact: Artefact) -> Iterator[Number]:
-    """The last that was logged of each sub-goal."""
+def _losses(artefact: Artefact) -> Iterator[Row]:
+    from hypogoal.evaluation.numbers import rows_of
+
     last: dict[str, dict[str, Any]] = {}
     for line in read_text(artefact.path / "metrics.jsonl", "the log is", AGAIN).splitlines():
         row = json.loads(line)
         last[row["sub_goal"]] = row
     for sub_goal, row in last.items():
-        yield from _named(row, sub_goal=sub_goal)
+        yield from rows_of(row, sub_goal=sub_goal)
 
 
-def _distances(artefact: Artefact) -> Iterator[Number]:
-    config = artefact.config
-    executions = read_executions(artefact.path / "executions.csv")
-    masked = config["mask_reached"]
-    for row in ladder_numbers(executions, config["sub_goals"], config["members"], {}, masked=masked):
-        for option in row["options"]:
-            numbers = {name: value for name, value in option.items() if name not in ("member", "option")}
-            yield from _named(numbers, sub_goal=row["sub_goal"], member=option["member"])
+def _unevaluated(cell: Cell) -> Iterator[Row]:
+    """What an evaluation would say of a run or of options: it has not been made, or takes them for a part of others."""
+    from hypogoal.evaluation.curves import Run, agent_metrics
+    from hypogoal.evaluation.distance import rows_of_ladder
+    from hypogoal.evaluation.run import read_episodes, read_executions, read_layout
 
-
-def _judged(cells: Iterable[Cell]) -> dict[str, list[Number]]:
-    """What the sweep's evaluation says of each ensemble, by its path within the run; empty where there is none yet."""
-    found: dict[str, list[Number]] = {}
-    for cell in cells:
-        if cell.stage != "evaluate":
-            continue
-        metrics = read_json(cell.out / "metrics.json", "the evaluation's numbers are", AGAIN)
-        for ensemble in metrics["ensembles"]:
-            found[ensemble["path"]] = [number for row in ensemble["sub_goals"] for number in _of_sub_goal(row)]
-    return found
-
-
-def _of_sub_goal(row: Mapping[str, Any]) -> Iterator[Number]:
-    """Spec F1: every member on held-out states; on the ladders apart for rooms that no training set holds."""
-    yield from _members(row["sub_goal"], row["members"], "heldout")
-    for scope, own in row.get("rooms", {}).get("scopes", {}).items():
-        yield from _members(row["sub_goal"], own["members"], scope)
-    for states in ("heldout", "unlabelled"):
-        yield from _named({"disagreement": row["disagreement"][states]}, sub_goal=row["sub_goal"], scope=states)
-
-
-def _members(sub_goal: str, rows: Iterable[Mapping[str, Any]], scope: str) -> Iterator[Number]:
-    for row in rows:
-        numbers = {name: value for name, value in row.items() if name != "member"}
-        yield from _named(numbers, sub_goal=sub_goal, member=row["member"], scope=scope)
+    artefact = open_artefact(cell.out) if _has(cell, "episodes.csv") or _has(cell, "executions.csv") else None
+    if artefact is not None and _has(cell, "executions.csv"):
+        about = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
+        found = rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
+        yield from _of_metrics({"distance": {"options": [{**about, **row} for row in found]}})
+    elif artefact is not None:
+        episodes, layout = read_episodes(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
+        run = Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
+        yield from _of_metrics({"agents": [agent_metrics("", [run])]})

@@ -9,9 +9,8 @@ from typing import Any
 
 from hypogoal.core.artefacts import claim, create_artefact, versions
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.comparing import compare_runs, differences, domains_of, labels_of, shared, why_not
-from hypogoal.evaluation.evaluated import fitting, read_evaluation
-from hypogoal.evaluation.quantities import QUANTITIES, plain
+from hypogoal.evaluation.numbers import plain
+from hypogoal.evaluation.run import fitting, read_evaluation
 
 
 def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
@@ -29,8 +28,17 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
         UserError: fewer than two runs, one twice, one that was not evaluated, runs that cannot be compared, or ``out``
             exists.
     """
+    from hypogoal.evaluation.compare import (
+        compare_runs,
+        compared_sections,
+        differences,
+        domains_of,
+        labels_of,
+        shared,
+        why_not,
+    )
     from hypogoal.evaluation.page import Material, draw_page
-    from hypogoal.evaluation.page.compared import compared_sections
+    from hypogoal.evaluation.questions import meanings
 
     claim(out, kind="comparison", inputs=runs, force=force)
     if len({run.resolve() for run in runs}) < max(2, len(runs)):
@@ -56,7 +64,7 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
                 table: {label: own[table] for label, own in metrics.items()}
                 for table in ("agents", "hypotheses", "rooms", "distance")
             },
-            "quantities": QUANTITIES,
+            "quantities": meanings(),
         }
         material = Material(about, {})
         sections = compared_sections(metrics, {label: one.arrays for label, one in found.items()}, about, material)

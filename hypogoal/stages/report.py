@@ -9,7 +9,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.evaluated import fitting, read_evaluation
+from hypogoal.evaluation.run import fitting, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
 
@@ -30,8 +30,9 @@ def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = Fa
         UserError: the run was not evaluated, the evaluation is damaged, the report exists, or there are to be videos
             and there is no agent.
     """
-    from hypogoal.evaluation.figures import to_png
-    from hypogoal.evaluation.page import Material, render
+    from hypogoal.evaluation.page import Material
+    from hypogoal.evaluation.plots import to_png
+    from hypogoal.evaluation.questions import render
 
     out = run / "report"
     found = read_evaluation(run)
@@ -101,16 +102,16 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
     Raises:
         UserError: no such kind, the run was not evaluated, or a file is there already.
     """
-    from hypogoal.evaluation.figures import slug, to_file
     from hypogoal.evaluation.page import Material
-    from hypogoal.evaluation.page.paper import paper_figures
+    from hypogoal.evaluation.plots import slug, to_file
+    from hypogoal.evaluation.questions import paper_figures
 
     if kind not in KINDS:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(KINDS)}.")
     found = read_evaluation(run)
     with fitting(found.source.path):
         drawn, missing = paper_figures(Material(found.metrics, found.arrays))
-    files = {folder / f"{slug(one.name)}.{kind}": one for one in drawn}
+    files = {folder / f"{slug(one.stem)}.{kind}": one for one in drawn}
     captions = folder / "captions.md"
     for path in (*files, captions):
         if path.exists() and not force:
@@ -118,7 +119,8 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path, one in files.items():
-            path.write_bytes(to_file(one.figure, one.name, kind))
+            if one.figure is not None:
+                path.write_bytes(to_file(one.figure, one.stem, kind))
         text = [f"## {path.name}\n\n{escape(one.caption, quote=False)}\n" for path, one in files.items()]
         captions.write_text("\n".join([*text, *(f"{line}\n" for line in missing)]), encoding="utf-8")
     except OSError as error:

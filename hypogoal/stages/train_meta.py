@@ -20,7 +20,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation import reading
+from hypogoal.evaluation import run as tables
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.playing import build, layout_facts, play, start_arguments, visited_by
 from hypogoal.meta.ppo import MetaPolicy
@@ -124,7 +124,7 @@ def train_meta(
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     """The rows of an ``episodes.csv``: step, length, reward, terminated."""
-    found = reading.read_episodes(path)
+    found = tables.read_episodes(path)
     columns = (found.step, found.length, found.reward, found.terminated.astype(int))
     return list(zip(*(column.tolist() for column in columns), strict=True))
 

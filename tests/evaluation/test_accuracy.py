@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.accuracy import METRICS, best_mean_worst, member_scores, ranking, scores_by_layout
-from hypogoal.evaluation.disagreement import mean_disagreement, pairwise_disagreement
-from hypogoal.evaluation.examples import overlay, pick_examples
+from hypogoal.evaluation.accuracy import (
+    METRICS,
+    best_mean_worst,
+    mean_disagreement,
+    member_scores,
+    pairwise_disagreement,
+    ranking,
+    scores_by_layout,
+)
+from hypogoal.evaluation.pictures import overlay
+from hypogoal.evaluation.saliency import pick_examples
 from hypogoal.evaluation.selection import most_and_least, preference, rank_correlation, rank_correlations, shares
 
 YES, NO = True, False

@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.agents import Run, agent_curves, agent_metrics, common_grid, group_runs
-from hypogoal.evaluation.choices import Choices, over_training, selection_of_run
-from hypogoal.evaluation.curves import Episodes
-from hypogoal.evaluation.page.agents import curves_section, summary_section
-from hypogoal.evaluation.page.blocks import Material
-from hypogoal.evaluation.page.choices import choices_section, terminations_section
-from hypogoal.evaluation.page.explorer import _options
-from hypogoal.evaluation.page.paper import paper_figures
-from hypogoal.evaluation.quantities import plain
+from hypogoal.evaluation.curves import (
+    Run,
+    agent_curves,
+    agent_metrics,
+    common_grid,
+    curves_section,
+    group_runs,
+    summary_section,
+)
+from hypogoal.evaluation.explorer import _options
+from hypogoal.evaluation.numbers import plain
+from hypogoal.evaluation.page import Material
+from hypogoal.evaluation.questions import paper_figures
+from hypogoal.evaluation.run import Choices, Episodes
+from hypogoal.evaluation.selection import choices_section, over_training, selection_of_run, terminations_section
 
 SUB_GOALS = ["open-red-door"]
 
@@ -36,7 +42,13 @@ def material_of(*runs):
     agents = [agent_metrics(name, same) for name, same in groups.items()]
     metrics = {"agents": agents, "layouts": [runs[0].layout], "settings": {"window": 100}, "missing": []}
     metrics["selection"] = [chosen(name, same, arrays) for name, same in groups.items()]
-    nothing = {"hypotheses": [], "rooms": [], "saliency": None, "distance": {"options": [], "shown": []}}
+    nothing = {
+        "hypotheses": [],
+        "ensembles": [],
+        "rooms": [],
+        "saliency": None,
+        "distance": {"options": [], "shown": []},
+    }
     return Material(plain({**metrics, **nothing}), arrays)
 
 

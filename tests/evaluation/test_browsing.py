@@ -5,9 +5,10 @@ import io
 import numpy as np
 from PIL import Image
 
-from hypogoal.evaluation.browsing import pick_to_browse, take_turns
-from hypogoal.evaluation.choices import Choices, over_training
+from hypogoal.evaluation.explorer import pick_to_browse, take_turns
 from hypogoal.evaluation.pictures import attribution_png, brightness, flat, image_png, reduced, to_bytes
+from hypogoal.evaluation.run import Choices
+from hypogoal.evaluation.selection import over_training
 
 
 def test_groups_take_turns():

@@ -3,15 +3,10 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.comparisons import (
-    ALL,
-    compare_agents,
-    compare_distances,
-    compare_hypotheses,
-    compare_rooms,
-)
-from hypogoal.evaluation.page.comparisons import comparison_tables
-from hypogoal.evaluation.statistics import compare_pairs
+from hypogoal.evaluation import curves, distance, hypotheses, rooms
+from hypogoal.evaluation.hypotheses import ALL
+from hypogoal.evaluation.numbers import compare_pairs
+from hypogoal.evaluation.page import comparison_tables
 
 
 def pairs(first, second, units=None, **more):
@@ -78,7 +73,7 @@ def test_agents_are_paired_by_layout_and_seed():
     own = {"name": "options", "runs": [run(100, 0, 12), run(100, 1, 14), run(101, 0, 20), run(102, 0, 5)]}
     other = {"name": "random", "runs": [run(101, 0, 30), run(100, 0, 24), run(100, 1, 13)]}
     alone = {"name": "elsewhere", "runs": [run(500, 0, 1)]}
-    rows = compare_agents([own, other, alone])
+    rows = curves.against([own, other, alone])
     assert [(row["first"], row["second"], row["quantity"]) for row in rows] == [
         ("options", "random", quantity) for quantity in ("success", "length", "discounted_return")
     ]
@@ -86,7 +81,7 @@ def test_agents_are_paired_by_layout_and_seed():
     assert (success["ties"], success["probability"]) == (3, 0.5)
     assert (length["n"], length["wins"]) == (3, 2)
     assert length["difference"] == pytest.approx((-12 + 1 - 10) / 3)
-    assert compare_agents([]) == compare_agents([own]) == []
+    assert curves.against([]) == curves.against([own]) == []
 
 
 def ensemble(name, seed, **best):
@@ -96,7 +91,7 @@ def ensemble(name, seed, **best):
 
 def test_ensembles_are_paired_by_seed_and_sub_goal():
     """Spec F1: D-BAT first, whatever comes first on disk; over all sub-goals and for each."""
-    rows = compare_hypotheses(
+    rows = hypotheses.against(
         [
             ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
             ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
@@ -121,7 +116,7 @@ def judged(method, groups, seed, best):
 def test_methods_on_ladders_are_paired_at_each_number_of_groups():
     """Spec F1: N=1 with N=1; where nothing could be validated there is no pair."""
     bests = {"none": 0.5, "dbat": 0.6}
-    rows = compare_rooms([judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)])
+    rows = rooms.against([judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)])
     found = {(row["where"], row["quantity"].split(", ")[1]): row for row in rows}
     assert found["N=2", "best member"]["difference"] == pytest.approx(0.1)
     assert found["N=1", "best member"]["n"] == 1
@@ -136,7 +131,7 @@ def stopped(method, ladder, seed, distance):
 
 def test_options_are_paired_by_ladder_and_seed():
     """Spec F3: the nearer is the better; oracle terminations are not a method."""
-    rows = compare_distances(
+    rows = distance.against(
         [
             stopped("none", "1L", 0, 40), stopped("none", "1R", 0, 10), stopped("dbat", "1L", 0, 10),
             stopped("dbat", "1R", 0, 20), stopped("oracle termination", "1L", 0, 0),
@@ -152,17 +147,26 @@ def test_the_mean_member_does_not_gain_by_being_one_of_many():
     """Spec F3: of many alike the nearest is near; their mean is not."""
     many, one = stopped("dbat", "1L", 0, 10), stopped("cnn", "1L", 0, 50)
     many["options"] = [{"distance": value} for value in (10, 50, 90, float("nan"))]
-    found = {row["quantity"]: row["difference"] for row in compare_distances([many, one])}
+    found = {row["quantity"]: row["difference"] for row in distance.against([many, one])}
     assert found["distance, best member"] == -40
     assert found["distance, mean member"] == 0
     assert np.isnan(found["distance, validated member"])
+
+
+def test_a_member_that_was_never_executed_has_no_distance():
+    """Spec F3, F7: as metrics.json has it, null: runs with such a member are compared by the others."""
+    many, one = stopped("dbat", "1L", 0, 10), stopped("cnn", "1L", 0, 50)
+    many["options"] = [{"distance": value} for value in (10, None)]
+    many["validated"] = one["validated"] = 0
+    found = {row["quantity"]: row["difference"] for row in distance.against([many, one])}
+    assert found == dict.fromkeys((f"distance, {which} member" for which in ("best", "validated", "mean")), -40)
 
 
 def test_what_is_alike_in_all_counts_each_for_itself():
     """Spec F5: options of three ensembles, all with the same seed: three pairs, not the last one read."""
     runs = [run(5, 0, length) for length in (10, 20, 30)]
     others = [run(5, 0, length) for length in (11, 22, 33)]
-    rows = compare_agents([{"name": "a", "runs": runs}, {"name": "b", "runs": others}])
+    rows = curves.against([{"name": "a", "runs": runs}, {"name": "b", "runs": others}])
     length = next(row for row in rows if row["quantity"] == "length")
     assert (length["n"], length["wins"], length["units"]) == (3, 3, 1)
     assert length["difference"] == pytest.approx(-2)
@@ -170,7 +174,7 @@ def test_what_is_alike_in_all_counts_each_for_itself():
 
 def test_the_table_says_each_method_once():
     """Spec F7: with digits and signs; where nothing is told apart by N or sub-goal that column is not there."""
-    rows = compare_agents(
+    rows = curves.against(
         [{"name": "a", "runs": [run(1, 0, 10)]}, *({"name": name, "runs": [run(1, 0, 12)]} for name in "bc")]
     )
     rows = [{**row, "interval": [None, None], "difference_interval": [None, None]} for row in rows]

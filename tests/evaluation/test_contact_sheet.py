@@ -10,7 +10,7 @@ from PIL import Image
 
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import Collected, Split, States, write_dataset
-from hypogoal.evaluation.contact_sheet import (
+from hypogoal.evaluation.pictures import (
     BACKGROUND,
     CAPTION_HEIGHT,
     COLUMNS,

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.curves import Episodes, curves, discounted_return, run_numbers, steps_to_solve, trailing_mean
-from hypogoal.evaluation.statistics import aggregate, bootstrap_interval, interquartile_mean, mean_and_error
+from hypogoal.evaluation.curves import curves, discounted_return, run_numbers, steps_to_solve, trailing_mean
+from hypogoal.evaluation.numbers import bootstrap_interval, interquartile_mean, mean_and_error, over
+from hypogoal.evaluation.run import Episodes
 
 
 def episodes(terminated, length=10):
@@ -116,10 +117,10 @@ def test_bootstrap_interval_covers():
 
 def test_aggregate_leaves_out_what_is_not_a_number():
     """Spec F5: n says how many runs there were a number of."""
-    found = aggregate([1.0, float("nan"), 3.0], [5, 6, 7], "steps", np.random.default_rng(0))
+    found = over([1.0, float("nan"), 3.0], "steps", strata=[5, 6, 7])
     assert (found["mean"], found["n"], found["unit"], found["interval_over"]) == (2.0, 2, "steps", "runs")
     assert found["interval"] == [1.0, 3.0]
-    empty = aggregate([], [], "steps", np.random.default_rng(0))
+    empty = over([], "steps")
     assert empty["n"] == 0
     assert np.isnan(empty["mean"])
     assert np.isnan(empty["iqm"])

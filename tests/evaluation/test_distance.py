@@ -16,7 +16,7 @@ from hypogoal.evaluation.distance import (
     ladder_numbers,
     option_numbers,
 )
-from hypogoal.evaluation.reading import read_executions
+from hypogoal.evaluation.run import read_executions
 from hypogoal.options.recording import EXECUTION_COLUMNS, write_table
 
 

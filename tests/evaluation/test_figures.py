@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.figures import (
-    BLUE,
-    VERMILLION,
-    Line,
-    best_mean_worst_members,
-    learning_curves,
-    preference_against_match,
-    to_png,
-    to_svg,
-)
+from hypogoal.evaluation.curves import Line, learning_curves
+from hypogoal.evaluation.hypotheses import best_mean_worst_members
 from hypogoal.evaluation.pictures import image_png
+from hypogoal.evaluation.plots import BLUE, VERMILLION, to_png, to_svg
+from hypogoal.evaluation.selection import preference_against_match
 
 GRID = np.arange(0, 1_001, 100)
 

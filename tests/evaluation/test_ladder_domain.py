@@ -6,9 +6,8 @@ import pytest
 from ladder_run import COLUMNS
 
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.distance import at_base, distance_tables, fates, ladder_numbers
-from hypogoal.evaluation.reading import read_executions
-from hypogoal.evaluation.shown import show_stops
+from hypogoal.evaluation.distance import at_base, distance_tables, fates, ladder_numbers, show_stops
+from hypogoal.evaluation.run import read_executions
 from hypogoal.options.recording import write_table
 
 

@@ -3,17 +3,9 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.figures import to_png, to_svg
-from hypogoal.evaluation.ladder_figures import (
-    Bar,
-    Panel,
-    Series,
-    Stops,
-    distance_bars,
-    scores_over_groups,
-    stops_over_rooms,
-)
-from hypogoal.evaluation.page.rooms import bands
+from hypogoal.evaluation.distance import Bar, Stops, distance_bars, stops_over_rooms
+from hypogoal.evaluation.plots import to_png, to_svg
+from hypogoal.evaluation.rooms import Panel, Series, bands, scores_over_groups
 
 GROUPS = np.array([1, 2, 7])
 

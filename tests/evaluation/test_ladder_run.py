@@ -1,5 +1,6 @@
 """Spec A5, F1-F4, F7: a small run with ladders, in the real file formats, is evaluated and drawn end to end."""
 
+import csv
 import io
 import json
 import re
@@ -15,7 +16,7 @@ from toy_data import reseal
 from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
-from hypogoal.evaluation import judging
+from hypogoal.evaluation import explorer, judging
 from hypogoal.evaluation.accuracy import member_scores, ranking
 from hypogoal.hypotheses.storage import read_ensemble
 from hypogoal.stages.evaluate import evaluate, summary_table
@@ -26,9 +27,11 @@ QUIET = {"quiet": True}
 
 @pytest.fixture(scope="module", autouse=True)
 def trusted():
-    """Spec B6, G2: the data name ladder_run:DOMAIN, code that the user must allow."""
+    """Spec B6, G2: the data name ladder_run:DOMAIN, code that the user must allow; few states are explained."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HYPOGOAL_TRUST", "ladder_run:DOMAIN")
+        for name, value in {"MOST_STATES": 48, "MOST_EXPLAINED": 8}.items():
+            patch.setattr(explorer, name, value)
         yield
 
 
@@ -141,6 +144,28 @@ def test_distances_are_those_of_the_tables(metrics):
     assert {row["where"] for row in metrics["comparisons"]["rooms"]} == {"N=1", "N=2", "N=3"}
     assert metrics["agents"] == metrics["selection"] == []
     assert metrics["missing"] == []
+
+
+def test_every_number_is_a_row_of_one_table(run, metrics):
+    """Spec A5: numbers.csv says of each number what it is of, and has those of metrics.json."""
+    with (run / "evaluation/numbers.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    place = {"method": "dbat, K=2", "sub_goal": SUB_GOAL, "member": "1", "seed": "1", "N": "2"}
+
+    def of(quantity, **where):
+        wanted = {**place, **where, "quantity": quantity}
+        (row,) = [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+        return float(row["value"])
+
+    assert of("distance", ladder="2-6") == 2 * (10 * 2 + 1)
+    ensemble = next(one for one in metrics["ensembles"] if one["path"] == "ensemble/dbat/groups-2-seed-1")
+    member = ensemble["sub_goals"][0]["rooms"]["scopes"]["unseen"]["members"][1]
+    assert of("ranking", scope="unseen") == member["ranking"]
+    assert {row["quantity"] for row in rows} <= set(metrics["quantities"])
+    assert {row["artefact"] for row in rows} == {
+        *(one["path"] for one in metrics["ensembles"]),
+        *(one["path"] for one in metrics["distance"]["options"]),
+    }
 
 
 def test_stops_are_kept_to_be_drawn(run, metrics):

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from works import named, work_of
 
-from hypogoal.evaluation.agents import (
+from hypogoal.evaluation.curves import (
     LEARNED,
     ORACLE,
     RANDOM,
@@ -13,12 +14,11 @@ from hypogoal.evaluation.agents import (
     base_name,
     common_grid,
     group_runs,
-    missing_agents,
+    missing,
 )
-from hypogoal.evaluation.choices import Choices, selection_of_run
-from hypogoal.evaluation.curves import Episodes
-from hypogoal.evaluation.ensembles import ensemble_names
-from hypogoal.evaluation.naming import name_apart
+from hypogoal.evaluation.numbers import ensemble_names, name_apart
+from hypogoal.evaluation.run import Choices, Episodes
+from hypogoal.evaluation.selection import selection_of_run
 
 META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_steps": 200, "option_gamma": 0.95}
 
@@ -46,7 +46,7 @@ def test_agents_are_named_after_how_they_choose():
     assert list(groups) == [LEARNED, RANDOM, ORACLE, "PPO tuned", "DQN paper"]
     assert len(groups[LEARNED]) == 2
     assert base_name("options", {}) == "random choice while options learn"
-    assert missing_agents(list(groups)) == ["no agent 'PPO paper'", "no agent 'DQN tuned'"]
+    assert missing(work_of(agents=named(*groups))) == ["no agent 'PPO paper'", "no agent 'DQN tuned'"]
 
 
 def test_a_setting_that_differs_splits_an_agent():
@@ -57,7 +57,7 @@ def test_a_setting_that_differs_splits_an_agent():
         f"{LEARNED}, door_label=open",
         f"{LEARNED}, option_gamma=0.9",
     ]
-    assert "no agent 'options (learned members)'" not in missing_agents(list(groups))
+    assert "no agent 'options (learned members)'" not in missing(work_of(agents=named(*groups)))
 
 
 def test_numbers_over_runs():

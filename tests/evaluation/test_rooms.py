@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from works import methods, work_of
 
-from hypogoal.evaluation.ladders import ladder_names, missing_ladders, rooms_shown
-from hypogoal.evaluation.rooms import choose, groups_of, method_names, room_metrics, rooms_table, with_validated
+from hypogoal.evaluation import distance
+from hypogoal.evaluation.distance import ladder_names, rooms_shown
+from hypogoal.evaluation.numbers import groups_of, method_names
+from hypogoal.evaluation.rooms import choose, missing, room_metrics, rooms_table, with_validated
 
 YES, NO = True, False
 # Rooms 1 (labelled), 9 (unlabelled), 6 (unseen): two positives and two negatives each; 20 (unseen): two negatives.
@@ -162,18 +165,25 @@ def test_options_are_named_after_their_ensembles_method():
     ]
 
 
+def lacking(scored, stopped):
+    """What a run with these methods is said to lack."""
+    work = work_of(rooms=methods(*scored), distance={"options": methods(*stopped)})
+    return [*missing(work), *distance.missing(work)]
+
+
 def test_what_a_ladder_run_lacks_is_named():
     """Spec F: each missing artefact by its name; nothing is missing from a whole run."""
-    methods = [{"method": name} for name in ("dbat, K=6", "no diversity, K=6, steps=9", "single CNN")]
-    assert missing_ladders(methods, [*methods, {"method": "oracle termination"}]) == []
-    assert missing_ladders(methods[:2], []) == [
+    names = ("dbat, K=6", "no diversity, K=6, steps=9", "single CNN")
+    assert lacking(names, (*names, "oracle termination")) == []
+    assert lacking(names[:2], ()) == [
         "no ensemble artefact of a single CNN (Figure 3)",
         "no options artefact of a ladder (Figures 4 and 5)",
     ]
-    assert missing_ladders(methods, methods[1:]) == [
+    assert lacking(names, names[1:]) == [
         "no options artefact of D-BAT (Figures 4 and 5)",
         "no options artefact with oracle terminations beside them",
     ]
+    assert lacking((), ()) == []
 
 
 def test_the_rooms_that_are_drawn():

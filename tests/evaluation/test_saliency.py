@@ -7,10 +7,11 @@ import torch
 from torch import nn
 
 from hypogoal.dataset import Split
-from hypogoal.evaluation.examples import pick_to_explain
+from hypogoal.evaluation.deep_lift import Attributions, attributable, deep_lift, explanation, mean_state
+from hypogoal.evaluation.judging import Case, Judged, Judgement, Unlabelled, Work
 from hypogoal.evaluation.pictures import attribution_png
-from hypogoal.evaluation.saliency import Attributions, attributable, deep_lift, explanation, mean_state
-from hypogoal.evaluation.shown import Unlabelled, show_states
+from hypogoal.evaluation.run import Found
+from hypogoal.evaluation.saliency import look, pick_to_explain
 from hypogoal.hypotheses.ensemble import Ensemble
 
 SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4)}
@@ -148,14 +149,22 @@ def test_attributions_are_to_what_members_see(tmp_path):
             seen_at.append(positions)
             return observations[:, :, 1:]
 
+    class Here(Case):
+        def read(self):
+            return ensemble
+
     seen_at = []
     ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
     observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
     where = {name: np.arange(3) for name in ("room", "x", "y")}
     split = Split(observations, np.array([True, False, False]), where)
-    judged = np.array([[0.9], [0.8], [0.1]], np.float32), np.array([[True], [True], [False]])
+    yes = np.array([[True], [True], [False]])
+    judged = Judged(np.array([[0.9], [0.8], [0.1]], np.float32), yes, yes[2:])
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
-        found = show_states(ensemble, "down", split, judged, Unlabelled(observations[2:], None), arrays)
+        here = Here(tmp_path, "down", tmp_path, {})
+        work = Work(Found(tmp_path, [], [], [], [], []), arrays, None, shown=0)
+        look(work, Judgement(0, here, split, Unlabelled(observations[2:], None), (), judged))
+        (found,) = work.looked["saliency"]
         group = arrays["saliency/down"]
         assert group["observations"].shape == (2, 1, 3, 1)
         assert group["seen"].shape == (2, 1, 2, 1)

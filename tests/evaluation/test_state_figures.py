@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.figures import to_file, to_svg
-from hypogoal.evaluation.state_figures import (
-    Explained,
-    attributions_of_every_frame,
-    attributions_of_members,
-    termination_states,
-)
+from hypogoal.evaluation.plots import to_file, to_svg
+from hypogoal.evaluation.saliency import Explained, attributions_of_every_frame, attributions_of_members
+from hypogoal.evaluation.selection import termination_states
 
 
 def explained(members, channels):

@@ -27,8 +27,9 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5, fixed, set_attribute
 from hypogoal.dataset import Collected, States, write_dataset
-from hypogoal.evaluation.evaluated import fitting, read_evaluation
-from hypogoal.evaluation.page import Material, render
+from hypogoal.evaluation.page import Material
+from hypogoal.evaluation.questions import render
+from hypogoal.evaluation.run import fitting, read_evaluation
 from hypogoal.options.recording import CHOICE_COLUMNS, EPISODE_COLUMNS
 from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate

@@ -11,7 +11,7 @@ from toy_data import fill, reseal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.comparing import labels_of, on_grid
+from hypogoal.evaluation.compare import labels_of, on_grid
 from hypogoal.options.recording import write_table
 from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate
@@ -152,9 +152,9 @@ def test_curves_on_another_grid():
 
 def test_rewards_of_any_size_are_seen(runs, compared):
     """Spec F5: the reward axis of several runs has limits that fit rewards that are no shares of episodes."""
-    from hypogoal.evaluation.evaluated import read_evaluation
-    from hypogoal.evaluation.page.blocks import Material
-    from hypogoal.evaluation.page.compared import compared_sections
+    from hypogoal.evaluation.compare import compared_sections
+    from hypogoal.evaluation.page import Material
+    from hypogoal.evaluation.run import read_evaluation
 
     read = {name: read_evaluation(runs / name) for name in ("slow", "fast")}
     for factor, limits in ((1, (-0.02, 1.04)), (20, None)):

@@ -15,9 +15,9 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
-from hypogoal.evaluation.evaluated import read_evaluation
-from hypogoal.evaluation.found import find
-from hypogoal.evaluation.summary import hypotheses_summary
+from hypogoal.evaluation import hypotheses
+from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.run import find, read_evaluation
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import write_plan
 from hypogoal.hypotheses.config import TrainEnsembleConfig
@@ -103,7 +103,8 @@ def test_cells_of_a_sweep_that_are_not_done_are_said(run, metrics, tmp_path):
     shutil.copytree(run / "ensemble", tmp_path / "ensemble")
     cells = [Cell(name, ("train-ensemble", "d"), tmp_path / name) for name in ("ensemble", "other")]
     write_plan(tmp_path, Plan("own", cells, 1), 1.0)
-    assert "1 of the sweep's cells are not done: other" in missing(find(tmp_path), [], [], {"options": []}, [])
+    nothing = {"agents": [], "rooms": [], "selection": [], "distance": {"options": []}}
+    assert "1 of the sweep's cells are not done: other" in missing(Work(find(tmp_path), None, None, metrics=nothing))
 
 
 def test_members_are_judged_on_heldout_states(run, metrics):
@@ -245,7 +246,7 @@ def test_numbers_of_a_stranger_are_shown_as_they_are():
 
 def test_tables_fit_a_terminal(metrics):
     """Spec A5: the summary is readable at 80 columns."""
-    for table in (summary_table(metrics), hypotheses_summary(metrics)):
+    for table in (summary_table(metrics), *hypotheses.summary(metrics)):
         console = Console(width=80, record=True, file=io.StringIO())
         console.print(table)
         lines = console.export_text().splitlines()

@@ -10,7 +10,7 @@ from browser import document_of, needs_browser, title_of
 
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
-from hypogoal.evaluation.browsing import MOST_EXPLAINED, MOST_STATES
+from hypogoal.evaluation.explorer import MOST_EXPLAINED, MOST_STATES
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.stages.collect import collect
@@ -42,7 +42,7 @@ def run(tmp_path_factory):
 def metrics(run):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in FEW.items():
-            patch.setattr(f"hypogoal.evaluation.browsing.{name}", value)
+            patch.setattr(f"hypogoal.evaluation.explorer.{name}", value)
         return evaluate(run, run / "evaluation", **QUIET)
 
 

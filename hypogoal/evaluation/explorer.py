@@ -1,22 +1,108 @@
-"""The section in which held-out states are browsed: what each member says, goes by and leads to (Spec F2, F6, F7).
+"""Held-out states to browse: what each member says, goes by and leads to (Spec F2, F6, F7).
 
-The page holds the states as data; ``templates/explorer.js`` shows those that its filters let through.
+What members say of most states is right, so a sample as it comes would hardly show an error. Here the kinds of outcome
+take turns, and within each the places that states are from; how often a kind comes up therefore says nothing. The page
+holds the states as data; ``templates/explorer.js`` shows those that its filters let through.
 """
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hypogoal.evaluation.page.blocks import Block, Material, fixed, pick, picture, section, texts
-from hypogoal.evaluation.page.variants import settings_of, variants
-from hypogoal.evaluation.pictures import FULL, attribution_png, reduced
-from hypogoal.evaluation.summary import percent
+from hypogoal.core.seeding import rng_for
+from hypogoal.evaluation.curves import settings_of, variants
+from hypogoal.evaluation.page import Block, Material, Question, fixed, percent, pick, picture, section, texts
+from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
+from hypogoal.evaluation.saliency import BASELINE
 
+if TYPE_CHECKING:
+    from hypogoal.evaluation.judging import Judgement, Work
+
+MOST_STATES = 300  # over all sub-goals, for the page's sake
+MOST_OF_ONE = 180  # of one sub-goal
+MOST_EXPLAINED = 120  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
+PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 TITLE = "Explore the hypotheses"
+
+
+def look(work: Work, judgement: Judgement) -> None:
+    """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
+    if judgement.number != work.browsed:
+        return
+    from hypogoal.evaluation.deep_lift import deep_lift
+
+    split, sub_goal, verdicts = judgement.split, judgement.case.sub_goal, judgement.judged.verdicts
+    sub_goals = len(judgement.case.config["sub_goals"])
+    most = min(MOST_OF_ONE, MOST_STATES // sub_goals)  # all sub-goals share the page
+    places = [split.origins[name] for name in PLACES if name in split.origins]
+    picked = pick_to_browse(verdicts, split.labels, places, most, rng_for(0, "browse", sub_goal))
+    kind, kinds = split.origins.get("kind"), judgement.kinds
+    names = [kinds[kind[index]] if kind is not None and kind[index] < len(kinds) else "" for index in picked]
+    group = work.arrays.create_group(f"explorer/{sub_goal}")
+    judgement.write_states(group, list(zip(picked.tolist(), names, strict=True)))
+    group["rows"] = picked
+    explained = picked[: min(len(picked), MOST_EXPLAINED // sub_goals)]
+    ensemble, seen, baseline = judgement.see(explained)
+    values = [to_bytes(flat(deep_lift(ensemble, seen[i : i + 8], baseline).values)) for i in range(0, len(seen), 8)]
+    shape = (0, len(ensemble), *seen.shape[1:3])
+    group["attributions"] = np.concatenate([np.zeros(shape, np.int8), *values])
+    group["brightness"] = brightness(seen)
+    counts = {"states": len(split.labels), "shown": len(picked), "explained": len(explained)}
+    work.looked["explorer"].append({"sub_goal": sub_goal, **counts})
+
+
+def numbers(work: Work) -> dict[str, Any]:
+    """Of each sub-goal ``states`` (of how many), ``shown`` and ``explained``, and the ensemble."""
+    if work.browsed is None:
+        return {"explorer": None}
+    source = work.ensembles[work.browsed]
+    about = {"ensemble": source["path"], "seed": source["seed"], "baseline": BASELINE}
+    return {"explorer": {**about, "sub_goals": work.looked["explorer"]}}
+
+
+def pick_to_browse(
+    verdicts: NDArray[np.bool_],
+    labels: NDArray[np.bool_],
+    places: Sequence[NDArray[np.int64]],
+    most: int,
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """Which states are shown, int64 (n,) with n at most ``most``, no state twice.
+
+    Args:
+        verdicts: bool (N, K).
+        labels: bool (N,).
+        places: int (N,) each; states alike in all of them are from the same place.
+        most: states.
+        rng: draws among states alike.
+    """
+    errors = (verdicts != labels[:, None]).sum(1)
+    outcome = np.where(errors == 0, 0, np.where(errors == verdicts.shape[1], 2, 1)) * 2 + labels
+    order = rng.permutation(len(labels))
+    if places:
+        _, place = np.unique(np.stack(places, axis=1), axis=0, return_inverse=True)
+        order = take_turns(order, place.reshape(-1))
+    return take_turns(order, outcome)[:most]
+
+
+def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The same states (n,), reordered so that groups take turns: the first of each, then the second of each, ...
+
+    Args:
+        order: indices, the better first.
+        groups: int (N,), each state's.
+    """
+    own = groups[order]
+    turn = np.zeros(len(order), dtype=np.int64)
+    for group in np.unique(own):
+        here = own == group
+        turn[here] = np.arange(here.sum())
+    return order[np.argsort(turn, kind="stable")]
 
 
 def explorer_section(material: Material) -> Block:
@@ -171,3 +257,6 @@ def _overlay(material: Material, path: str, option: int) -> str:
 
 def _png(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
+
+
+QUESTION = Question(look=look, numbers=numbers, sections=lambda material: [explorer_section(material)])

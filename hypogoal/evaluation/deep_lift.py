@@ -1,0 +1,178 @@
+"""What in a state a member goes by: DeepLift attributions and the check that they are complete (Spec F2, Figures 2, 9).
+
+Attributed is the log-odds of "reached", the difference of a member's two logits: its sign is the verdict at a threshold
+of 0.5, so positive attributions speak for "reached" whatever the member says. The attributions of a state, summed over
+pixels and frames, must be the difference between its log-odds and the baseline's; how far they are off is reported.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hypogoal.hypotheses.networks import as_input
+
+if TYPE_CHECKING:
+    from hypogoal.hypotheses.ensemble import Ensemble
+
+
+@dataclass(frozen=True)
+class Attributions:
+    """DeepLift of every member on n states.
+
+    Attributes:
+        values: float64 (n, K, H, W, C), in log-odds; they speak for "reached" where positive.
+        log_odds: float64 (n, K), each member's of each state.
+        baseline_log_odds: float64 (K,), of the baseline.
+    """
+
+    values: NDArray[np.float64]
+    log_odds: NDArray[np.float64]
+    baseline_log_odds: NDArray[np.float64]
+
+    def completeness_error(self) -> NDArray[np.float64]:
+        """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
+        return np.abs(self.values.sum(axis=(2, 3, 4)) - (self.log_odds - self.baseline_log_odds))
+
+
+def mean_state(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The baseline: the mean of observations (N, H, W, C), rounded, uint8 (H, W, C).
+
+    A black image would be a baseline that is a state of no domain: what all states share (walls, the floor) would get
+    most of the attribution, and what is black in a state (a pit, an open door) none. Against the mean state, what is
+    usual gets none, and what makes the state differ from the usual gets all.
+    """
+    return observations.mean(axis=0, dtype=np.float64).round().astype(np.uint8)
+
+
+def explanation(found: Attributions, picked: Sequence[tuple[int, str]]) -> list[dict[str, Any]]:
+    """Spec F2: the check, state by state and member by member.
+
+    Args:
+        found: of n states.
+        picked: (index, kind) of each of them.
+    """
+    errors, sums = found.completeness_error(), found.values.sum(axis=(2, 3, 4))
+    last = np.abs(found.values[..., -1]).sum(axis=(2, 3))
+    everywhere = np.abs(found.values).sum(axis=(2, 3, 4))
+    share = np.divide(last, everywhere, out=np.full_like(last, np.nan), where=everywhere > 0)
+    return [
+        {
+            "kind": kind,
+            "members": [
+                {
+                    "member": member,
+                    "log_odds": float(found.log_odds[state, member]),
+                    "baseline_log_odds": float(found.baseline_log_odds[member]),
+                    "attributed": float(sums[state, member]),
+                    "completeness_error": float(errors[state, member]),
+                    "last_frame": float(share[state, member]),
+                }
+                for member in range(found.values.shape[1])
+            ],
+        }
+        for state, (_, kind) in enumerate(picked)
+    ]
+
+
+def deep_lift(ensemble: Ensemble, observations: NDArray[np.uint8], baseline: NDArray[np.uint8]) -> Attributions:
+    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) of every member on some states.
+
+    Args:
+        ensemble: its members are plain ``nn.Sequential`` of modules used once.
+        observations: uint8 (n, H, W, C), what members see of a few states.
+        baseline: uint8 (H, W, C), what that is compared with.
+    """
+    inputs = as_input(torch.from_numpy(observations)).double().requires_grad_()
+    reference = as_input(torch.from_numpy(baseline[None])).double()
+    found = [_of_member(member, inputs, reference) for member in ensemble.members]
+    values, log_odds, baselines = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
+    return Attributions(np.moveaxis(values, -1, 1), log_odds, baselines[0])
+
+
+def _of_member(
+    member: nn.Module, inputs: Tensor, reference: Tensor
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Attributions (n, H, W, C), log-odds (n,) and the baseline's (1,); in double, where rounding is no matter."""
+    from captum.attr import DeepLift
+
+    network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"\s*Setting forward, backward hooks", category=UserWarning)
+        values = DeepLift(network).attribute(inputs, reference, target=0)
+    with torch.no_grad():
+        log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
+    return values.detach().permute(0, 2, 3, 1).numpy(), log_odds.numpy(), baseline.numpy()
+
+
+def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
+    """The log-odds of a member as a chain of modules that Captum's rules are right for.
+
+    Its rule for max pooling gives a pixel to the last of the windows that it is the maximum of, and loses what it gave
+    to the others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum
+    is taken over windows that do not overlap.
+
+    Args:
+        network: an ``nn.Sequential``, (n, C, H, W) -> logits (n, 2).
+        example: an input, for the shapes inside.
+
+    Returns:
+        (n, C, H, W) -> (n, 1).
+    """
+    layers: list[nn.Module] = []
+    values = example
+    with torch.no_grad():
+        for layer in network.children():
+            after = layer(values)
+            window = _window_of(layer, values)
+            if window is None:
+                layers.append(layer)
+            else:
+                side, stride = window
+                layers += [_Windows(side, stride), nn.MaxPool1d(side[0] * side[1])]
+                layers += [nn.Flatten(), nn.Unflatten(1, after.shape[1:])]
+            values = after
+    return nn.Sequential(*layers, _LogOdds())
+
+
+def _window_of(layer: nn.Module, values: Tensor) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Sides and strides of a pooling whose windows can be taken apart; None for any other module."""
+    height, width = values.shape[-2:] if values.ndim == 4 else (0, 0)
+    if isinstance(layer, nn.AdaptiveMaxPool2d) and layer.output_size in (1, (1, 1)):
+        return (height, width), (1, 1)
+    if isinstance(layer, nn.MaxPool2d) and not layer.ceil_mode and layer.padding == 0 and layer.dilation == 1:
+        return _pair(layer.kernel_size), _pair(layer.stride)
+    return None
+
+
+def _pair(value: int | tuple[int, ...]) -> tuple[int, int]:
+    return (value, value) if isinstance(value, int) else (value[0], value[1])
+
+
+class _Windows(nn.Module):
+    """(n, C, H, W) -> (n, C * windows, pixels of a window)."""
+
+    def __init__(self, side: tuple[int, int], stride: tuple[int, int]):
+        super().__init__()
+        self.side, self.stride = side, stride
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Copies of the pixels, window by window."""
+        windows = values.unfold(2, self.side[0], self.stride[0]).unfold(3, self.side[1], self.stride[1])
+        return windows.reshape(len(values), -1, self.side[0] * self.side[1])
+
+
+class _LogOdds(nn.Module):
+    """Logits (n, 2) -> log-odds (n, 1)."""
+
+    def forward(self, logits: Tensor) -> Tensor:
+        """Their difference."""
+        return logits[:, 1:] - logits[:, :1]

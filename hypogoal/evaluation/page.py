@@ -1,0 +1,420 @@
+"""The kit of pages: sections made of blocks, plain dictionaries that a template draws (Spec F7).
+
+A table is said once, as columns, and drawn here for the page and for the terminal.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from hashlib import sha256
+from importlib import resources
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hypogoal.evaluation.pictures import image_png, reduced
+from hypogoal.evaluation.plots import COLOURS, slug, to_svg
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hypogoal.evaluation.judging import Judgement, Work
+    from hypogoal.evaluation.numbers import Row, Rows
+
+Block = dict[str, Any]
+Entry = Mapping[str, Any]
+# What a browser may do with the page. Attributes of style are matplotlib's; they run and fetch nothing.
+POLICY = (
+    "default-src 'none'; script-src {script}; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'"
+)
+CAPTION = (
+    "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
+    "better, a tie counting half, with its 95 % bootstrap interval (2,000 resamples {drawn}); 0.5: neither is. An "
+    "interval without width means that every pair came out alike, not that it is certain: see the sign test "
+    "(two-sided, ties left out) and over how many {units} it is, each of which counts once, by its mean: pairs of one "
+    "are not independent. Difference: mean of first − second, with its 95 % interval."
+)
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a page is made from.
+
+    Attributes:
+        metrics: what ``metrics.json`` holds.
+        arrays: what ``arrays.h5`` holds, by name.
+        figures: filled while the page is made, to be written as files too; ``drawings`` with their SVG.
+    """
+
+    metrics: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+    figures: dict[str, Figure] = field(default_factory=dict)
+    drawings: dict[str, str] = field(default_factory=dict)
+
+    def comparisons(self, of: str) -> list[Entry]:
+        """One method against the others; none in evaluations from before there were any."""
+        return list(self.metrics.get("comparisons", {}).get(of, ()))
+
+    def of_ladders(self) -> bool:
+        """Whether the run has anything of labelled ladders."""
+        return bool(self.metrics["rooms"] or self.metrics["distance"]["options"])
+
+    def of_agents(self) -> bool:
+        """Whether it has agents; one with neither, an ensemble alone, say, is taken for one whose are still to come."""
+        return bool(self.metrics["agents"]) or not self.of_ladders()
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure, or what it would have needed.
+
+    Attributes:
+        name: the file's name in a report, and the id on the page.
+        label: what it shows.
+        figure: None where it cannot be drawn.
+        caption: with seeds and intervals.
+        missing: which artefact would be needed.
+        folded: what is shown of it on the page until asked for.
+        file: the file's name among the paper's figures, where that is another.
+        heading: above it on the page.
+    """
+
+    name: str
+    label: str
+    figure: Figure | None
+    caption: str = ""
+    missing: str = ""
+    folded: str = ""
+    file: str = ""
+    heading: str = ""
+
+    @property
+    def stem(self) -> str:
+        """The file's name among the paper's figures, without its ending."""
+        return self.file or self.name
+
+
+class Column(NamedTuple):
+    """A column of tables: its title, a row's cell, whether it is a number, and of what it is shown once only."""
+
+    title: str
+    of: Callable[[Any], Any]
+    number: bool = False
+    once: Callable[[Any], Any] | None = None
+
+
+def label(title: str, key: Any, *, once: Any = None) -> Column:
+    """A column of text.
+
+    Args:
+        title: its heading.
+        key: the entry's key, several with dots between, or a function of the entry.
+        once: leave the cell empty where this is what it was in the row above: True, the cell itself.
+    """
+    of = key if callable(key) else partial(at, key=key)
+    return Column(title, of, once=of if once is True else once)
+
+
+def number(title: str, key: Any, show: Callable[..., Any] = str, *more: Any) -> Column:
+    """A column of numbers: ``show(what the entry has there, *more)``; key as of :func:`label`."""
+    of = label(title, key).of
+    return Column(title, lambda entry: show(of(entry), *more), True)
+
+
+def at(entry: Any, key: str) -> Any:
+    """``entry["a"]["b"]`` for ``a.b``; None where the entry is None."""
+    for part in key.split("."):
+        entry = None if entry is None else entry[part]
+    return entry
+
+
+def table(
+    columns: Sequence[Column],
+    entries: Iterable[Any],
+    *,
+    caption: str = "",
+    heading: str = "",
+    folded: str = "",
+    wrap: bool = False,
+    tight: bool = False,
+    main: Callable[[Any], bool] = lambda entry: False,
+) -> Block:
+    """A table for the page: a row per entry.
+
+    Long texts are broken where ``wrap``; columns are nearer to each other where ``tight``; ``main`` rows stand out.
+    """
+    rows: list[dict[str, Any]] = []
+    before: list[Any] = [rows] * len(columns)  # which no entry has
+    for entry in entries:
+        now = [column.once(entry) if column.once else None for column in columns]
+        new = [column.once is not None and now[index] != before[index] for index, column in enumerate(columns)]
+        cells = [
+            "" if column.once and not fresh else column.of(entry) for column, fresh in zip(columns, new, strict=True)
+        ]
+        rows.append({"cells": cells, "mark": "main" if main(entry) else "first" if any(new) else ""})
+        before = now
+    return {
+        "kind": "table",
+        "columns": [{"name": column.title, "number": column.number} for column in columns],
+        "rows": rows,
+        "caption": caption,
+        "heading": heading,
+        "folded": folded,
+        "class": "wrap" if wrap else "tight" if tight else "",
+    }
+
+
+def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, sections: bool = False) -> Table:
+    """The same table for a terminal, 79 columns wide; a line between groups of rows where ``sections``."""
+    from rich.table import Table
+
+    drawn = table(columns, entries)
+    found = Table(title=title, title_justify="left", width=79)
+    for column in columns:
+        if column.number:
+            found.add_column(column.title, justify="right", no_wrap=True)
+        else:
+            found.add_column(column.title, ratio=1, overflow="fold")
+    for index, row in enumerate(drawn["rows"]):
+        if sections and index and row["mark"]:
+            found.add_section()
+        found.add_row(*(cell["text"] if isinstance(cell, dict) else cell for cell in row["cells"]))
+    return found
+
+
+def section(
+    identity: str,
+    title: str,
+    paragraphs: Iterable[str],
+    blocks: Iterable[Block],
+    missing: Iterable[str] = (),
+) -> Block:
+    """A section of the page."""
+    return {
+        "id": identity,
+        "title": title,
+        "paragraphs": [text for text in paragraphs if text],
+        "blocks": list(blocks),
+        "missing": list(missing),
+    }
+
+
+def shown(material: Material, drawn: Drawn) -> Block:
+    """A figure on the page; it is added to the material's ``figures`` by the :func:`slug` of its name."""
+    name, svg = slug(drawn.name), ""
+    if drawn.figure is not None:
+        material.figures[name] = drawn.figure
+        svg = material.drawings[name] = to_svg(drawn.figure, name)
+        svg = re.sub(r"<style.*?</style>", "", svg, flags=re.S)  # the page allows its own alone, which says the same
+        for colour, variable in COLOURS.items():
+            svg = svg.replace(colour, f"var(--{variable})")
+    about = {"label": drawn.label, "caption": drawn.caption, "missing": drawn.missing, "folded": drawn.folded}
+    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, "heading": drawn.heading, **about}
+
+
+def pick(rows: Iterable[Entry], key: str, value: Any) -> Entry:
+    """The first of the rows with this value.
+
+    Raises:
+        LookupError: none has it.
+    """
+    for one in rows:
+        if one[key] == value:
+            return one
+    raise LookupError(f"nothing whose {key!r} is {value!r}")
+
+
+def picture(image: NDArray[np.uint8]) -> str:
+    """An observation as base64 PNG, see :func:`reduced`; of a stack (H, W, C) with C other than 3 the last frame."""
+    if image.ndim == 3 and image.shape[2] != 3:
+        image = image[..., -1]
+    return base64.b64encode(image_png(reduced(image))).decode("ascii")
+
+
+def texts(packed: Any) -> list[str]:
+    """A JSON list of texts out of the arrays."""
+    raw = packed.item() if isinstance(packed, np.ndarray) else packed
+    return list(json.loads(raw.decode() if isinstance(raw, bytes) else raw))
+
+
+def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "", opened: bool = False) -> Block:
+    """A list of names and texts, folded until asked for."""
+    return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading, "open": opened}
+
+
+def cell(text: str, small: str = "", mark: str = "") -> dict[str, str]:
+    """A cell with a small remark beside its text."""
+    return {"text": text, "small": small, "class": mark}
+
+
+def listed(items: Sequence[Any]) -> str:
+    """1, 2 and 3."""
+    texts = [str(item) for item in items]
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}" if texts else "none"
+
+
+def fixed(value: float | None, digits: int) -> str:
+    """A number with a fixed number of decimals; a dash where there is none."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def percent(value: float | None) -> str:
+    """0.953 -> '95 %'; a dash for None."""
+    return "–" if value is None else f"{100 * value:.0f} %"
+
+
+def thousands(value: float | None) -> str:
+    """123456 -> '123 k'; a dash for None."""
+    return "–" if value is None else f"{value / 1000:.0f} k"
+
+
+def spread(aggregated: Entry | None, digits: int, scale: float = 1.0, error: str = "standard_error") -> dict[str, str]:
+    """Mean, and beside it the standard error where there are several runs; a dash where there is none."""
+    if aggregated is None or aggregated["mean"] is None:
+        return cell("–")
+    mean, wide = aggregated["mean"], aggregated.get(error)
+    return cell(fixed(scale * mean, digits), "" if wide is None else f"± {scale * wide:.{digits}f}")
+
+
+def deviation(aggregated: Entry | None, digits: int) -> dict[str, str]:
+    """Mean, and beside it the standard deviation over seeds where there are several."""
+    return spread(aggregated, digits, error="standard_deviation")
+
+
+def interval(aggregated: Entry, digits: int, scale: float = 1.0) -> str:
+    """Interquartile mean and its 95 % interval."""
+    if aggregated["iqm"] is None:
+        return "–"
+    low, high = aggregated["interval"]
+    around = "" if low is None else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
+    return f"{scale * aggregated['iqm']:.{digits}f}{around}"
+
+
+def verdict(probability: float, says: bool, truth: bool) -> dict[str, str]:
+    """A member's answer on a card: marked where it is wrong."""
+    return {"class": "wrong" if says != truth else "yes" if says else "no", "text": f"{_yes(says)} {probability:.2f}"}
+
+
+def _yes(says: bool) -> str:
+    return "yes" if says else "no"
+
+
+def comparison_tables(
+    rows: Sequence[Entry], shared: str, units: str = "seeds", digits: Mapping[str, int] | None = None
+) -> list[Block]:
+    """The table of one method against the others, pair by pair, where there are pairs (Spec F5).
+
+    Args:
+        rows: what ``numbers.pairs`` found.
+        shared, units: what pairs share, and what is independent of each other.
+        digits: decimals of a quantity's difference, 3 where it is not named.
+    """
+    found = [entry for entry in rows if entry["n"]]
+    if not found:
+        return []
+    firsts = {entry["first"] for entry in found}
+    names: dict[str, Callable[[Entry], str]] = {"quantity": _quantity}
+    names |= {"of": itemgetter("where")} if any(entry["where"] for entry in found) else {}
+    names |= {"first": itemgetter("first")} if len(firsts) > 1 else {}
+
+    def alike(entry: Entry) -> tuple[str, ...]:
+        return tuple(of(entry) for of in names.values())
+
+    def difference(entry: Entry) -> dict[str, str]:
+        places = max((digits or {}).get(entry["quantity"], 3), 1)  # may be small where the numbers are not
+        return cell(_signed(entry["difference"], places), _between(entry["difference_interval"], places))
+
+    columns = [
+        *(label(name, of, once=alike) for name, of in names.items()),
+        label("second", "second"),
+        number("P(first better)", lambda e: cell(fixed(e["probability"], 2), _between(e["interval"], 2)), dict),
+        number("won–lost–tied", lambda e: f"{e['wins']}–{e['n'] - e['wins'] - e['ties']}–{e['ties']}"),
+        number("sign test p", lambda e: cell(fixed(e["sign_test"], 3), f"n = {e['units']}"), dict),
+        number("difference", difference, dict),
+    ]
+    drawn = "within layouts where each has several" if units == "layouts" else "of seeds"
+    caption = CAPTION.format(shared=shared, units=units, drawn=drawn)
+    title = f"Seed by seed: {firsts.pop()} against the others" if len(firsts) == 1 else "Seed by seed"
+    return [table(columns, found, tight=True, heading=title, caption=caption)]
+
+
+def _quantity(entry: Mapping[str, Any]) -> str:
+    name = str(entry["quantity"]).replace("_", " ")
+    return name if entry["higher"] else f"{name} (lower is better)"
+
+
+def _between(bounds: Sequence[float | None], digits: int) -> str:
+    low, high = bounds
+    return "" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def _signed(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{round(value, digits) + 0.0:+.{digits}f}"  # + 0.0: no "-0"
+
+
+def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str) -> str:
+    """Sections as one HTML file that needs nothing else.
+
+    Every text in it is escaped but our own style and script and what matplotlib drew; should a text of a file ever slip
+    through, the page's policy still lets nothing run and nothing be fetched.
+    """
+    import jinja2
+
+    loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    css, script = (
+        resources.files("hypogoal.evaluation").joinpath(f"templates/{name}").read_text(encoding="utf-8")
+        for name in ("report.css", "explorer.js")
+    )
+    return environment.get_template("report.html").render(
+        title=title,
+        subtitle=subtitle,
+        version=version,
+        policy=POLICY.format(script=_digest(script), style=_digest(css)),
+        css=css,
+        script=script,
+        sections=sections,
+        footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
+    )
+
+
+def _digest(text: str) -> str:
+    """As a policy names a script or a style that is in the page."""
+    return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question of the paper, whole: its numbers, figures, sections. What one has not, it leaves as it is here.
+
+    Attributes:
+        look: is shown every ensemble on every sub-goal's states as it is judged; fills ``row`` and ``work.looked``.
+        numbers: by their key in ``metrics.json``; what was found before is in ``work.metrics``.
+        missing: a line for everything that the run has no artefacts for.
+        rows: what stands in ``numbers.csv``, of the metrics and the arrays.
+        pairs: methods against each other, by their key in ``comparisons``.
+        meanings: of its quantities, those that ``numbers.QUANTITIES`` does not have.
+        summary: tables for a terminal.
+        sections: of the page, those that the run has anything for.
+        figures: for a paper; ``needed`` says of each by name what it needs.
+    """
+
+    look: Callable[[Work, Judgement], None] = lambda work, judgement: None
+    numbers: Callable[[Work], dict[str, Any]] = lambda work: {}
+    missing: Callable[[Work], list[str]] = lambda work: []
+    rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()
+    pairs: Callable[[Entry], dict[str, Rows]] = lambda metrics: {}
+    meanings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    summary: Callable[[Entry], list[Table]] = lambda metrics: []
+    sections: Callable[[Material], list[Block]] = lambda material: []
+    figures: Callable[[Material], Iterable[Drawn]] = lambda material: ()
+    needed: Mapping[str, str] = field(default_factory=dict)

@@ -1,0 +1,159 @@
+"""The kit of figures: their look, and how they are written. Colours are Okabe and Ito's, told apart by all readers."""
+
+from __future__ import annotations
+
+import io
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from hashlib import blake2b
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+INK, RULE = "#24272b", "#d4d7dc"
+BLUE, VERMILLION, GREEN = "#0072b2", "#d55e00", "#009e73"
+PURPLE, ORANGE, SKY, GREY = "#cc79a7", "#e69f00", "#56b4e9", "#808890"
+COLOURS = {
+    INK: "ink", RULE: "rule", BLUE: "blue", VERMILLION: "vermillion", GREEN: "green", PURPLE: "purple",
+    ORANGE: "orange", SKY: "sky", GREY: "soft",
+}  # fmt: skip
+PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, GREY)
+MARKERS = "osD^vPX*<>p"  # 11, so that a colour has the same one again late
+METHOD_COLOURS = PALETTE[:-1]  # of methods in Figures 3 and 4; grey is for what is no method
+WIDTH = 5.6  # inches; readable on a phone where it is scaled to the screen
+LABEL = 60  # characters of a legend's line, which fits the figure also in capitals
+STYLE: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 10.5,
+    "text.parse_math": False,  # names are shown as they are, dollars too
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": RULE,
+    "grid.linewidth": 0.6,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "legend.columnspacing": 1.4,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "svg.fonttype": "none",
+}
+PICTURE_TITLE = 0.34  # inches above a picture
+
+
+def styled(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None]:
+    """What all figures have in common, and ``more`` of matplotlib's settings, for the time of a ``with``."""
+    settings: Any = {**STYLE, **(more or {})}
+    return matplotlib.rc_context(settings)
+
+
+def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any) -> None:
+    """A legend under the plots, for which the figure becomes higher: each label once, whichever of the plots has it.
+
+    Args:
+        figure: as wide as it is to be.
+        places: its plots.
+        most: columns; fewer where labels are too long for so many, and very long labels are broken.
+        more: matplotlib's settings of a legend.
+    """
+    handles: dict[str, Artist] = {}
+    for place in places:
+        for handle, label in zip(*place.get_legend_handles_labels(), strict=True):
+            handles.setdefault(textwrap.fill(label, LABEL), handle)
+    if not handles:
+        return
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for columns in range(most, 0, -1):
+        legend = figure.legend(handles.values(), handles.keys(), loc="outside lower left", ncols=columns, **more)
+        box = legend.get_window_extent(renderer)
+        if box.width <= figure.bbox.width or columns == 1:
+            figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
+            return
+        legend.remove()
+
+
+def grid_of_pictures(rows: int, columns: int, below: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """Places for pictures without axes, row by row; ``below``: inches of room under all of them."""
+    with styled({"axes.titlelocation": "center"}):
+        side = WIDTH / max(columns, 3)
+        size = (side * columns, rows * (side + PICTURE_TITLE) + below)
+        figure = Figure(figsize=size, layout="constrained")
+        places = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for place in places:
+        place.set_axis_off()
+    return figure, places
+
+
+def show_picture(place: Axes, image: NDArray[np.uint8], title: str) -> None:
+    """A picture; of a stack of frames the last, in grey."""
+    if image.ndim == 3 and image.shape[2] != 3:
+        image = image[..., -1]
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    place.imshow(image, interpolation="nearest")
+    place.set_title(title, fontsize=9)
+
+
+def slug(text: str) -> str:
+    """An id, or a file's name without its ending: of other signs than letters, digits, - and _ a digest is left."""
+    plain = re.sub(r"[^\w-]+", "-", text)[:80]
+    return text if plain == text else f"{plain}-{blake2b(text.encode(), digest_size=4).hexdigest()}"
+
+
+def to_svg(figure: Figure, name: str) -> str:
+    """The figure as an SVG document, the same bytes each time.
+
+    Args:
+        figure: any figure.
+        name: its :func:`slug` makes the ids inside unique among several on one page.
+    """
+    name = slug(name)
+    buffer = io.StringIO()
+    with styled({"svg.hashsalt": name}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r' id="image[0-9a-f]+"', "", text)  # a hash of the picture: the same where it is drawn twice
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r'((?:xlink:)?href)="#', rf'\1="#{name}-', text)
+    return re.sub(r"url\(#", f"url(#{name}-", text)
+
+
+def to_png(figure: Figure) -> bytes:
+    """The figure as a PNG on white, for READMEs and slides."""
+    buffer = io.BytesIO()
+    with styled():
+        figure.savefig(buffer, format="png", dpi=160, facecolor="white", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def to_pdf(figure: Figure) -> bytes:
+    """The figure as a PDF with its fonts in it as fonts, for papers; the same bytes each time."""
+    buffer = io.BytesIO()
+    with styled({"pdf.fonttype": 42}):
+        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
+    return buffer.getvalue()
+
+
+def to_file(figure: Figure, name: str, kind: str) -> bytes:
+    """The figure as ``svg``, ``pdf`` or ``png``."""
+    if kind == "svg":
+        return to_svg(figure, name).encode()
+    return to_pdf(figure) if kind == "pdf" else to_png(figure)

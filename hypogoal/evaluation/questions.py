@@ -1,0 +1,84 @@
+"""Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from hypogoal.evaluation import curves, distance, explorer, hypotheses, rooms, saliency, selection
+from hypogoal.evaluation.numbers import QUANTITIES, Metrics
+from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
+from hypogoal.evaluation.provenance import domains_of, provenance_section
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.table import Table
+
+# In the order of the page; the numbers of one are there for those below it.
+QUESTIONS: list[Question] = [
+    curves.QUESTION,
+    rooms.QUESTION,
+    distance.QUESTION,
+    hypotheses.QUESTION,
+    explorer.QUESTION,
+    saliency.QUESTION,
+    selection.QUESTION,
+]
+
+
+def agents_last() -> list[Question]:
+    """In the order in which lines are told: where a page begins with the agents, a terminal ends with them."""
+    return [*QUESTIONS[1:], QUESTIONS[0]]
+
+
+def meanings() -> dict[str, Any]:
+    """What each quantity is."""
+    return {
+        name: about for known in (QUANTITIES, *(one.meanings for one in QUESTIONS)) for name, about in known.items()
+    }
+
+
+def summary_table(metrics: Metrics) -> Table | Group:
+    """The headline numbers of a run, mean over seeds; at most 80 columns wide.
+
+    A table for each kind of thing that there is: ensembles, options on ladders, agents.
+    """
+    from rich.console import Group
+
+    tables = [table for question in agents_last() for table in question.summary(metrics)]
+    if metrics["missing"]:
+        last = tables[-1]
+        last.caption, last.caption_justify = f"In this run: {'; '.join(metrics['missing'])}.", "left"
+    return tables[0] if len(tables) == 1 else Group(*tables)
+
+
+def render(material: Material, version: str) -> str:
+    """Spec F7: the page of a run, self-contained; ``material.figures`` is filled on the way.
+
+    Args:
+        material: the evaluation's numbers and arrays.
+        version: hypogoal's.
+    """
+    metrics = material.metrics
+    count = len(metrics["provenance"]["artefacts"])
+    evaluated = f"{count} artefact{'' if count == 1 else 's'} evaluated"
+    subtitle = f"{listed(domains_of(metrics))}; {evaluated}; hypogoal {version}"
+    sections = [section for question in QUESTIONS for section in question.sections(material)]
+    return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version)
+
+
+def paper_figures(material: Material) -> tuple[list[Drawn], list[str]]:
+    """Figures 2 to 9 and those beside them that the run has artefacts for; a line for each of 2 to 9 that it has not.
+
+    Args:
+        material: the evaluation's numbers and arrays.
+    """
+    found: Iterator[Drawn] = (one for question in QUESTIONS for one in question.figures(material))
+    drawn = sorted((one for one in found if one.figure is not None), key=lambda one: one.stem)
+    needed = {name: what for question in QUESTIONS for name, what in question.needed.items()}
+    missing = [
+        f"{name.replace('figure', 'Figure ')}: not drawn. It needs {needed[name]}."
+        for name in sorted(needed)
+        if not any(one.stem == name or one.stem.startswith(f"{name}-") for one in drawn)
+    ]
+    return drawn, missing

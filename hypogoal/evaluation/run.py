@@ -1,0 +1,353 @@
+"""What a run holds: which artefacts are evaluated, their tables, and the evaluation as read back (Spec A5, A8).
+
+Each damaged file is told in one line (Spec G2).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import inspect
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import plain_name, read_json, read_text
+from hypogoal.core.hdf5 import Foreign, members, open_hdf5, read_array, walk
+
+TRAIN_AGAIN, AGAIN = "Train the agent again.", "Evaluate the run again."
+WINDOW = 100  # episodes at the end of training by which an agent is judged
+LAST = 100  # executions of an option that count
+MOST = 2**53  # integers that a float holds
+MOST_OPTIONS = 2**16
+MAX_TABLE_BYTES = 2**30
+PARTS = ("agents", "ensembles", "hypotheses", "rooms", "distance", "saliency", "selection", "settings", "provenance")
+Table = TypeVar("Table")
+
+
+@dataclass(frozen=True)
+class Found:
+    """The artefacts of a run that are evaluated.
+
+    Attributes:
+        run: its folder.
+        ensembles: every one.
+        agents: what plays a layout: metas, options that no meta continues, baselines.
+        ladders: options learned from a named start each, with a table of where they stopped.
+        silent: options learned from a named start without that table; they are not evaluated.
+        continued: options that a meta artefact continues, and so is judged by.
+    """
+
+    run: Path
+    ensembles: list[Artefact]
+    agents: list[Artefact]
+    ladders: list[Artefact]
+    silent: list[Artefact]
+    continued: list[Artefact]
+
+    def everything(self) -> list[Artefact]:
+        """All of them."""
+        return [*self.ensembles, *self.agents, *self.ladders]
+
+    def name(self, artefact: Artefact) -> str:
+        """Its path within the run."""
+        return artefact.path.relative_to(self.run).as_posix()
+
+
+def find(run: Path) -> Found:
+    """The artefacts to evaluate: options that a meta artefact continues are part of that one.
+
+    Raises:
+        UserError: there is none, or one is damaged.
+    """
+    metas = find_artefacts(run, "meta")
+    continued = {
+        (artefact.path / entry["relative"]).resolve()
+        for artefact in metas
+        for entry in artefact.manifest["inputs"]
+        if entry["kind"] == "options"
+    }
+    learned = find_artefacts(run, "options")
+    options = [artefact for artefact in learned if artefact.path.resolve() not in continued]
+    ladders = [artefact for artefact in options if "executions.csv" in artefact.manifest["files"]]
+    silent = [artefact for artefact in options if artefact not in ladders and artefact.config.get("start")]
+    others = [artefact for artefact in options if artefact not in (*ladders, *silent)]
+    agents = [*metas, *others, *find_artefacts(run, "baseline")]
+    parts = [artefact for artefact in learned if artefact not in options]
+    found = Found(run, find_artefacts(run, "ensemble"), agents, ladders, silent, parts)
+    if not found.everything():
+        raise UserError("nothing to evaluate", run, "Train something into it first, see 'hypogoal run --help'.")
+    return found
+
+
+def most_used(found: Found) -> int | None:
+    """Which of the ensembles with the most members the most artefacts were learned from; the first of several."""
+    users = [artefact.input("ensemble").resolve() for artefact in (*found.agents, *found.ladders) if takes(artefact)]
+    rank = [(artefact.config["members"], users.count(artefact.path.resolve())) for artefact in found.ensembles]
+    return max(range(len(rank)), key=lambda index: rank[index], default=None)
+
+
+def takes(artefact: Artefact) -> bool:
+    """Whether it was learned with the verdicts of an ensemble's members."""
+    return artefact.kind != "baseline" and artefact.config["termination"] == "learned"
+
+
+def within(found: Found, source: Artefact) -> str | None:
+    """An ensemble's path within the run; None where it is not one of the run's."""
+    same = (own for own in found.ensembles if own.path.resolve() == source.path.resolve())
+    return next((found.name(own) for own in same), None)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """A run's training episodes in the order in which they ended; arrays (n,).
+
+    Attributes:
+        step: environment steps when it ended, summed over parallel environments and stages.
+        length: steps.
+        reward: undiscounted.
+        terminated: it reached a terminal state; else it was cut at the cap.
+    """
+
+    step: NDArray[np.int64]
+    length: NDArray[np.int64]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+
+    @property
+    def succeeded(self) -> NDArray[np.bool_]:
+        """Spec F5: it terminated, and with a reward: an agent that dies reaches a terminal state too."""
+        return self.terminated & (self.reward > 0)
+
+    def last(self, count: int = WINDOW) -> Episodes:
+        """The last ``count`` episodes, or all where there are fewer."""
+        start = max(0, len(self.step) - count)
+        return Episodes(self.step[start:], self.length[start:], self.reward[start:], self.terminated[start:])
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Rows of ``choices.csv``, arrays (n,): one row per option and window of steps that ends at ``step``."""
+
+    step: NDArray[np.int64]
+    option: NDArray[np.int64]
+    offered: NDArray[np.int64]
+    chosen: NDArray[np.int64]
+    expected: NDArray[np.float64]
+    reached: NDArray[np.int64]
+    duration: NDArray[np.int64]
+
+    def since(self, step: float) -> Choices:
+        """The windows that end after ``step``."""
+        late = self.step > step
+        return Choices(*(getattr(self, name)[late] for name in self.__dataclass_fields__))
+
+    def total(self, name: str, options: int) -> NDArray[np.float64]:
+        """The sum of column ``name`` over all windows, (O,)."""
+        return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Executions:
+    """Executions of options in the order in which they ended, arrays (n,): the rows of ``executions.csv``.
+
+    Attributes:
+        step: environment steps when it ended.
+        option: g*K + k.
+        duration: steps.
+        reached: its own termination classifier said yes.
+        inside_at_start: that classifier said yes where it began.
+        terminated: the episode ended in a terminal state: the agent died.
+        room, x, y: where it stopped.
+        distance: from there to the nearest true sub-goal, in the domain's units.
+    """
+
+    step: NDArray[np.int64]
+    option: NDArray[np.int64]
+    duration: NDArray[np.int64]
+    reached: NDArray[np.bool_]
+    inside_at_start: NDArray[np.bool_]
+    terminated: NDArray[np.bool_]
+    room: NDArray[np.int64]
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    distance: NDArray[np.int64]
+
+    def of(self, option: int, last: int = LAST) -> Executions:
+        """The last executions of one option."""
+        rows = np.flatnonzero(self.option == option)[-last:]
+        return Executions(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def positions(self) -> NDArray[np.int64]:
+        """Where they stopped, (n, 3)."""
+        return np.stack([self.room, self.x, self.y], axis=1)
+
+
+def read_episodes(path: Path) -> Episodes:
+    """``episodes.csv``: step, length, reward, terminated."""
+    return _read(Episodes, path, {"reward": np.float64, "terminated": np.bool_})
+
+
+def read_choices(path: Path) -> Choices:
+    """``choices.csv``: one row per option and window."""
+    return _read(Choices, path, {"expected": np.float64})
+
+
+def read_executions(path: Path) -> Executions:
+    """``executions.csv``: one row per execution of an option, in the order in which they ended."""
+    return _read(Executions, path, dict.fromkeys(("reached", "inside_at_start", "terminated"), np.bool_))
+
+
+def _read(kind: type[Table], path: Path, kinds: Mapping[str, Any]) -> Table:
+    """A table with a column for each field, int64 where ``kinds`` says nothing else."""
+    names = tuple(inspect.signature(kind).parameters)
+    table = read_table(path, names)
+    return kind(**{name: table[name].astype(kinds.get(name, np.int64)) for name in names})
+
+
+def read_layout(path: Path) -> dict[str, Any]:
+    """``layout.json``: layout_seed, shortest_path, random_success, random_episodes."""
+    facts = read_json(path, "the layout's file is", AGAIN)
+    wanted = {"layout_seed": int, "shortest_path": int | None, "random_success": float | int | None}
+    fits = isinstance(facts, dict) and all(isinstance(facts.get(key, ...), kind) for key, kind in wanted.items())
+    if not fits or not 0 <= facts["layout_seed"] < MOST or type(facts.get("random_episodes")) is not int:
+        raise UserError("the layout's file is damaged", path, AGAIN)
+    return {key: facts[key] for key in (*wanted, "random_episodes")}
+
+
+def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:
+    """``terminations.h5``: option -> the last states in which its classifier ended it, uint8 (n, *obs)."""
+    with open_hdf5(path, "the file of terminations", AGAIN) as file:
+        try:
+            return {int(name): read_array(file, name, "u").astype(np.uint8) for name in members(file)}
+        except (Foreign, ValueError) as error:
+            raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, NDArray[np.float64]]:
+    """Columns of a table of numbers, float (n,) each.
+
+    Args:
+        path: a CSV file with a header.
+        columns: those that must be there; all that are where None.
+
+    Raises:
+        UserError: missing, too large, no table, or what stands in it is no finite number of at most 2^53.
+    """
+    text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
+    try:
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        columns = list(reader.fieldnames or ()) if columns is None else columns
+        if not set(columns) <= set(reader.fieldnames or ()):
+            raise KeyError(path)
+        rows = [[float(row[name]) for name in columns] for row in reader]
+    except (ValueError, KeyError, TypeError, csv.Error):
+        raise UserError("the table is damaged", path, AGAIN) from None
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
+    # NaN is no number, and of an integer column nothing may be lost.
+    if not (np.abs(values) < MOST).all():
+        raise UserError("a number in the table is missing or too large", path, AGAIN)
+    table = {name: values[:, index] for index, name in enumerate(columns)}
+    options = table.get("option", np.zeros(0))
+    if not ((options >= 0) & (options < MOST_OPTIONS)).all():
+        raise UserError("an option in the table has no possible number", path, AGAIN)
+    return table
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """A run that was evaluated: ``metrics`` of ``metrics.json``, ``arrays`` of ``arrays.h5`` by name."""
+
+    source: Artefact
+    metrics: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+
+
+@contextlib.contextmanager
+def fitting(where: object) -> Iterator[None]:
+    """Drawing an evaluation, whose numbers are a file's: what does not fit is told in one line."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise UserError("the evaluation does not fit this hypogoal, or is damaged", where, AGAIN) from error
+
+
+def read_evaluation(run: Path, start: str = "") -> Evaluated:
+    """The evaluation of a run: that in ``run/evaluation`` where there are several.
+
+    Args:
+        run: a folder with an evaluation artefact in it.
+        start: of the arrays only those whose names begin so.
+
+    What was made since is among ``missing``.
+
+    Raises:
+        UserError: the run was not evaluated, or the evaluation is damaged.
+    """
+    found = find_artefacts(run, "evaluation")
+    if not found:
+        raise UserError("this run was not evaluated", run, f"First run: hypogoal evaluate {run}")
+    source = next((artefact for artefact in found if artefact.path == run / "evaluation"), found[0])
+    source.whole()
+    metrics = _metrics(source.path / "metrics.json")
+    metrics["missing"] = [*metrics.get("missing", ()), *_since(run, source)]
+    return Evaluated(source, metrics, _arrays(source.path / "arrays.h5", start))
+
+
+def read_numbers(source: Artefact) -> Mapping[str, Any]:
+    """``metrics.json`` of an evaluation artefact.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    path = source.path / "metrics.json"
+    fault = file_fault(source.path, path.name, source.manifest["files"].get(path.name, ""))
+    if fault:
+        raise UserError(f"the evaluation's file is {fault}", path, AGAIN)
+    return _metrics(path)
+
+
+def _since(run: Path, source: Artefact) -> list[str]:
+    """A line for each artefact of the run that the evaluation does not know: it was made, or made again, since."""
+    known = {entry["sha256"] for entry in source.manifest["inputs"]}
+    try:
+        found = find(run)
+    except UserError:  # evaluations may lie where nothing else does
+        return []
+    names = [found.name(one) for one in found.everything() if sha256_of(one.path / MANIFEST) not in known]
+    return [f"{name}: made since this evaluation ('hypogoal evaluate {run} --force' reads it)" for name in names]
+
+
+def _metrics(path: Path) -> dict[str, Any]:
+    metrics = read_json(path, "the evaluation is", AGAIN)
+    if not isinstance(metrics, dict):
+        raise UserError("the evaluation is damaged", path, AGAIN)
+    lacking = [part for part in PARTS if part not in metrics]
+    if lacking:
+        raise UserError(f"evaluated by an older hypogoal (no {', '.join(lacking)})", path, AGAIN)
+    for name in _sub_goals(metrics):
+        if not plain_name(name):
+            raise UserError(f"a sub-goal in the evaluation has a name that is none, {name!r}", path, AGAIN)
+    return metrics
+
+
+def _sub_goals(part: Any) -> Iterator[Any]:
+    if isinstance(part, dict):
+        yield from [part["sub_goal"]] if "sub_goal" in part else []
+    for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
+        yield from _sub_goals(inner)
+
+
+def _arrays(path: Path, start: str) -> dict[str, NDArray[Any]]:
+    with open_hdf5(path, "the evaluation's arrays", AGAIN) as file:
+        try:
+            return {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
+        except Foreign as error:
+            raise UserError(f"the evaluation's arrays are damaged ({error})", path, AGAIN) from None

@@ -1,0 +1,49 @@
+"""docs/extending.md: a figure with its number is one file and one line."""
+
+import csv
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+from ladder_run import write_run
+
+from hypogoal.evaluation import explorer
+from hypogoal.evaluation.questions import QUESTIONS
+from hypogoal.stages.evaluate import evaluate
+from hypogoal.stages.report import draw_figures, report
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
+
+
+def test_a_figure_with_its_number_is_one_file_and_one_line(tmp_path, monkeypatch):
+    """The page's own code, as it stands there: number, meaning, section, figure, and the figure for a paper."""
+    (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    (tmp_path / "durations.py").write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("HYPOGOAL_TRUST", "ladder_run:DOMAIN")
+    monkeypatch.setattr(explorer, "MOST_EXPLAINED", 4)
+    QUESTIONS.append(importlib.import_module("durations").QUESTION)
+    try:
+        run = tmp_path / "run"
+        write_run(run, numbers=(2,), seeds=(0,), methods=("cnn",), ladders=("1L",))
+        metrics = evaluate(run, run / "evaluation", quiet=True)
+        page = report(run).read_text(encoding="utf-8")
+        drawn, _ = draw_figures(run, tmp_path / "figures")
+    finally:
+        del QUESTIONS[-1]
+    assert {entry["method"]: entry["steps"]["mean"] for entry in metrics["durations"]} == {
+        "single CNN": 7,
+        "oracle termination": 7,
+    }
+    assert metrics["quantities"]["mean_duration"]["unit"] == "steps"
+    with (run / "evaluation/numbers.csv").open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["quantity"] == "mean_duration"]
+    assert [(row["method"], float(row["value"])) for row in rows] == [
+        ("single CNN", pytest.approx(7)),
+        ("oracle termination", pytest.approx(7)),
+    ]
+    assert "<h2>How long options take</h2>" in page
+    assert 'id="figure-durations"' in page
+    assert (run / "report/figures/durations.png").is_file()
+    assert "durations" in [path.stem for path in drawn]
