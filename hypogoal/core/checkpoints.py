@@ -77,7 +77,9 @@ class Checkpoints:
             signal.signal(number, handler)
         if self._signal is not None and kind is None:
             raise KeyboardInterrupt(self._signal)
-        if self._signal is not None and self._handlers.get(self._signal) is signal.SIG_DFL:
+        if self._signal is None or isinstance(error, KeyboardInterrupt):
+            return
+        if self._handlers.get(self._signal) is signal.SIG_DFL:
             signal.raise_signal(self._signal)  # a pool's process that fails and is told to end, or it would never
 
     def _note(self, number: int, frame: FrameType | None) -> None:

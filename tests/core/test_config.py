@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hypogoal
-from hypogoal.core.config import STAGES, as_dict, describe, from_values, resolve, setting
+from hypogoal.core.config import TABLES, as_dict, describe, from_values, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import defaults_of
 from hypogoal.stages.sweep import config_class_of
@@ -115,8 +115,8 @@ def test_unknown_and_broken_presets(tmp_path: Path) -> None:
 def test_the_presets_resolve_for_every_stage(experiment: str, preset: str) -> None:
     """Every table of a preset is a stage, every key a setting, with a value in range."""
     tables = tomllib.loads((PRESETS / experiment / f"{preset}.toml").read_text())
-    assert set(tables) <= set(STAGES)
-    for stage in STAGES:
+    assert set(tables) <= set(TABLES)
+    for stage in TABLES:
         config_class, defaults = config_class_of(stage, experiment), defaults_of(experiment, stage)
         config = resolve(config_class, stage=stage, preset=preset, domain=experiment, defaults=defaults)
         assert from_values(type(config), as_dict(config), stage) == config
@@ -163,7 +163,7 @@ def test_the_paper_preset_has_the_papers_ladders() -> None:
     assert {name: getattr(ensemble, name) for name in beyond} == beyond
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", TABLES)
 def test_every_setting_has_a_meaning_and_its_default_is_allowed(stage: str) -> None:
     """'hypogoal config' says something of each setting."""
     config_class = config_class_of(stage)
