@@ -214,8 +214,9 @@ class Box:
     def command(self, stage: Stage, folder: Path) -> tuple[list[str], Path]:
         """A stage's command and output, in ``folder`` beside the run: relative paths in manifests are the same."""
         run = self.ready(*(TRAINED if stage in (EVALUATION, REPORT) else stage.needs), evaluated=stage is REPORT)
-        if stage is REPORT:
-            if not (folder / "evaluation").exists():
+        if stage is REPORT:  # which is of the folder that it lies in, whose name is on the page
+            folder /= "run"
+            if not folder.exists():
                 shutil.copytree(run / "evaluation", folder / "evaluation")
             return ["report", str(folder), "-q"], folder / "report"
         out = folder / f"{stage.name}{stage.suffix}"
