@@ -62,13 +62,15 @@ class Ended:
     def accepted(self, *codes: int) -> bool:
         """Whether it succeeded; anything but that, one line and exit code 2, or one of ``codes``, is bad."""
         lines = self.words.splitlines()
+        if self.code < 0 and self.code in codes and not lines:
+            return False
         if self.code not in (0, 2, *codes):
             raise Bad(f"ended with {self.code}: {self.words[-400:]}")
         if "Traceback" in self.words or "internal error" in self.words or "Exception ignored" in self.words:
             raise Bad(f"a traceback: {self.words[-400:]}")
         told = self.command == "verify" or (len(lines) == 1 and lines[0].startswith("hypogoal: "))
-        if self.code > 0 and not (told and lines and "".join(lines).isprintable()):
-            raise Bad(f"not one line: {self.words[-400:]}")
+        if self.code and not (told and lines and "".join(lines).isprintable()):
+            raise Bad(f"not one line, {self.code}: {self.words[-400:]}")
         return self.code == 0
 
 
@@ -212,8 +214,9 @@ class Box:
     def command(self, stage: Stage, folder: Path) -> tuple[list[str], Path]:
         """A stage's command and output, in ``folder`` beside the run: relative paths in manifests are the same."""
         run = self.ready(*(TRAINED if stage in (EVALUATION, REPORT) else stage.needs), evaluated=stage is REPORT)
-        if stage is REPORT:
-            if not (folder / "evaluation").exists():
+        if stage is REPORT:  # which is of the folder that it lies in, whose name is on the page
+            folder /= "run"
+            if not folder.exists():
                 shutil.copytree(run / "evaluation", folder / "evaluation")
             return ["report", str(folder), "-q"], folder / "report"
         out = folder / f"{stage.name}{stage.suffix}"
@@ -240,8 +243,8 @@ def pick(case: int) -> Stage:
 
 def check_whole(out: Path) -> None:
     """An output that is there is whole."""
-    if out.exists() and not run("verify", out).accepted():
-        raise Bad(f"half an output: {out.name}")
+    if out.exists() and not (ended := run("verify", out)).accepted():
+        raise Bad(f"half an output: {ended.words}")
 
 
 def check_resumed(box: Box, stage: Stage, words: list[str], out: Path) -> None:
@@ -326,8 +329,7 @@ def signals(box: Box, rng: Rng, case: int) -> bool:
                 command.send(what, group)
         ended = command.wait()
         try:
-            if ended.code > 0 or ended.words:
-                ended.accepted(128 + signal.SIGINT, 128 + signal.SIGTERM, *DEADLY)
+            ended.accepted(128 + signal.SIGINT, 128 + signal.SIGTERM, *DEADLY)
             check_whole(out)
         except Bad as bad:
             raise Bad(f"{stage.name}, {name}{' to all' * group}{', begun anew' * anew}: {bad}") from None

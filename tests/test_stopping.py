@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -97,6 +98,34 @@ def test_workers_save_when_their_stage_is_stopped(tmp_path: Path) -> None:
     assert words.count("hypogoal: stopped; the last checkpoint is kept") == 1 and "Traceback" not in words
     saved = [Checkpoints(log.with_suffix(".safetensors")).load() for log in logs]
     assert all(state and state["part"]["watch"]["done"] > 0 for state in saved)
+
+
+def test_ctrl_c_while_it_starts_says_nothing(tmp_path: Path) -> None:
+    """Spec G2: no traceback out of the middle of an import; the process dies of the signal, as the shell expects."""
+    (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    command = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]["hypogoal"]
+    installed = f"from {command.replace(':', ' import ')}"
+    for how in (["-m", "hypogoal"], ["-c", installed]):
+        done = subprocess.run([sys.executable, *how], env=environment, cwd=tmp_path, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+TWICE = """
+import os, signal, sys
+import hypogoal.cli
+
+said = hypogoal.cli.notes_of
+hypogoal.cli.app = lambda **_: os.kill(os.getpid(), signal.SIGINT)
+hypogoal.cli.notes_of = lambda error: os.kill(os.getpid(), signal.SIGINT) or said(error)
+sys.exit(hypogoal.cli.main())
+"""
+
+
+def test_ctrl_c_while_it_says_that_it_stops() -> None:
+    """Spec G2: who is in such a hurry gets no traceback either."""
+    done = subprocess.run([sys.executable, "-c", TWICE], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
 SLEEPERS = """

@@ -47,6 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
     if arguments is None:
         signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see __main__
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         open_streams()
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
@@ -71,6 +73,8 @@ def main(arguments: list[str] | None = None) -> int:
         message, code = _refused(error)
         return _fail(with_notes(message, error), code)
     except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
+        if arguments is None:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is put in order: who is in a hurry need not wait
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
         return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)

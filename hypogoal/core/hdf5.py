@@ -218,11 +218,12 @@ def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
 
 
 def walk(group: Any, prefix: str = "", depth: int = 8, seen: set[int] | None = None) -> Iterator[str]:
-    """The names of all datasets below a group.
+    """The names of all datasets below a group; of one that has several, the first.
+
+    There may be millions of names for a few groups, and so gigabytes to read for a few kilobytes.
 
     Raises:
-        Foreign: a link, unreadable parts, groups within each other more than ``depth`` deep, or something that is there
-            twice: of names there may be millions for a few groups, or gigabytes to read for a few kilobytes.
+        Foreign: a link, unreadable parts, or groups within each other more than ``depth`` deep.
     """
     import h5py
 
@@ -231,7 +232,7 @@ def walk(group: Any, prefix: str = "", depth: int = 8, seen: set[int] | None = N
         item = find(group, name)
         address = int(h5py.h5o.get_info(item.id).addr)
         if address in seen:
-            raise Foreign(f"{prefix + name!r} is there under another name too")
+            continue
         seen.add(address)
         if isinstance(item, h5py.Group):
             if depth == 0:
