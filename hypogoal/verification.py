@@ -16,6 +16,7 @@ from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_text
 from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+from hypogoal.core.kinds import NUMBERS
 from hypogoal.core.manifests import UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
@@ -117,7 +118,7 @@ def _fault(read: Callable[[], object]) -> Iterator[str]:
 def _read_table(path: Path) -> None:
     from hypogoal.evaluation.run import read_table
 
-    read_table(path)
+    read_table(path, ("value",) if path.name == NUMBERS else None)  # whose other columns are texts
 
 
 def _read_lines(path: Path) -> None:

@@ -89,7 +89,7 @@ def test_every_file_that_is_gone_is_named(copy: Path) -> None:
             (copy / "aside").rename(artefact.path / name)
             (artefact.path / MANIFEST).write_bytes(before)
             count += 1
-    assert count == 25 and faults_of(copy) == []
+    assert count == 26 and faults_of(copy) == []
     (copy / "ensemble" / "left-end.safetensors").unlink()
     reseal(copy / "ensemble", files={})
     with pytest.raises(UserError, match=r"the artefact is damaged \(left-end\.safetensors: missing"):
@@ -168,6 +168,20 @@ def test_messages_about_manifests_stay_helpful(copy: Path) -> None:
     path.write_text(json.dumps(manifest | {"format": 1}))  # as they were before
     assert faults_of(path.parent) == []
     assert notes_of(path.parent)[0].endswith("written by an earlier hypogoal, its manifest has no checksum")
+
+
+def test_an_evaluation_of_before_is_whole(copy: Path) -> None:
+    """Spec A8: an earlier hypogoal wrote no numbers.csv; its report can still be drawn."""
+    path = copy / "evaluation" / MANIFEST
+    manifest = json.loads(path.read_text())
+    (path.parent / "numbers.csv").unlink()
+    files = {name: digest for name, digest in manifest.pop("files").items() if name != "numbers.csv"}
+    reseal(path.parent, files=files)
+    assert faults_of(path.parent) == [f"{path.parent}: numbers.csv: missing, and not in the manifest"]
+    del manifest["sha256"]
+    path.write_text(json.dumps(manifest | {"format": 1, "files": files}))
+    assert faults_of(path.parent) == []
+    assert main(["report", str(copy), "--force"]) == 0
 
 
 def test_verify_looks_inside_the_folder_only(run: Path, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,7 +29,7 @@ from hypogoal.core.drafts import (
 )
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file
-from hypogoal.core.kinds import check_kind, files_of
+from hypogoal.core.kinds import NUMBERS, check_kind, files_of
 from hypogoal.core.manifests import AGAIN, FORMAT_VERSION, MANIFEST, check_writable, read_manifest, sealed
 
 PACKAGES = (
@@ -290,6 +290,7 @@ def file_faults(artefact: Artefact) -> dict[str, str]:
     listed, wanted = artefact.manifest["files"], files_of(artefact.kind, artefact.manifest["config"])
     if wanted is None:
         return {MANIFEST: f"of a kind that this hypogoal does not know ({artefact.kind!r})"}
+    wanted -= {NUMBERS} if artefact.manifest["format"] == 1 else set()
     faults = dict.fromkeys(sorted(wanted - listed.keys()), "missing, and not in the manifest")
     faults |= {name: file_fault(artefact.path, name, digest) for name, digest in listed.items()}
     return {name: fault for name, fault in faults.items() if fault}

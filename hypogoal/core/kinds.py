@@ -24,6 +24,7 @@ AWAY = "Move it away, or choose another --out."
 
 
 LOG, EPISODES, LAYOUT, OPTIONS = "metrics.jsonl", "episodes.csv", "layout.json", "options.safetensors"
+NUMBERS = "numbers.csv"  # which evaluations of format 1 have not
 
 
 def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
@@ -39,7 +40,7 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
     return {
         "ensemble": {LOG, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
         "baseline": {LOG, EPISODES, LAYOUT, "policy.safetensors"},
-        "evaluation": {"metrics.json", "arrays.h5"},
+        "evaluation": {"metrics.json", NUMBERS, "arrays.h5"},
         "report": {"index.html"},
         "comparison": {"index.html", "metrics.json"},
     }.get(kind)
