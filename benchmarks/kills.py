@@ -251,8 +251,9 @@ def _same(one: Path, other: Path) -> bool:
     if one.is_dir() or not (one.exists() and other.exists()):
         return one.is_dir() and other.is_dir()
     if one.name == "manifest.json":
-        texts = [json.loads(path.read_text(encoding="utf-8")) for path in (one, other)]
-        return {**texts[0], "command": None} == {**texts[1], "command": None}
+        one_text, other_text = (json.loads(path.read_text(encoding="utf-8")) for path in (one, other))
+        told = {"command": None, "sha256": None}  # the latter is of the whole text
+        return {**one_text, **told} == {**other_text, **told}
     return one.read_bytes() == other.read_bytes()
 
 

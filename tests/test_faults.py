@@ -235,3 +235,28 @@ def test_nothing_depends_on_the_clock() -> None:
     told = re.compile(r"\btime\.time\(|\bdatetime\b|st_[mca]time|get[mca]time")
     assert len(sources) > 50
     assert [str(path) for path in sources if told.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "the memory does not suffice"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "the memory does not suffice"),
+        (ImportError("x.so: failed to map segment from shared object"), "the memory does not suffice"),
+        (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), "Free some memory"),
+        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "ulimit -n"),
+        (BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)), "ulimit -u"),
+    ],
+)
+def test_limits_of_the_system_are_the_users_to_mend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, words: str
+) -> None:
+    """Spec G2: one line that says which; ``benchmarks/limits.py`` sets them in earnest."""
+
+    def refused(path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("hypogoal.verification.faults_of", refused)
+    assert main(["verify", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert words in line and line.count("\n") == 1 and "internal" not in line

@@ -19,6 +19,10 @@ from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
 
+NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller settings."
+# What torch, and whoever loads a library, raises in place of a MemoryError.
+MEMORY_TEXTS = ("can't allocate memory", "Cannot allocate memory", "failed to map segment")
+
 __all__ = ["app", "bringing", "main", "making", "showing", "sweeping"]
 
 
@@ -90,9 +94,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _internal(error: BaseException) -> tuple[str, int]:
-    """What to tell, and the exit code, of an error that nobody foresaw: own code's, or ours."""
+    """What to tell, and the exit code, of an error that nobody foresaw: want of memory, own code's, or ours."""
     from hypogoal.core.own_code import users_own
 
+    if isinstance(error, MemoryError) or any(text in str(error) for text in MEMORY_TEXTS):
+        return with_notes(f"the memory does not suffice. Nothing was half-written. {NO_MEMORY}", error), 2
     if (told := users_own(error)) is not None:
         return with_notes(str(told), error), 2
     first = next(iter(str(error).splitlines()), "")  # those of numbers that are none have a tensor after it
@@ -112,6 +118,10 @@ def _called(given: list[str]) -> int:
 def _refused(error: OSError) -> tuple[str, int]:
     """What to tell, and the exit code, when the system will not read or write a file."""
     known = {
+        errno.EMFILE: "Allow more open files (ulimit -n).",
+        errno.ENFILE: "Close some programs: the system has as many files open as it can.",
+        errno.ENOMEM: NO_MEMORY,
+        errno.EAGAIN: "Allow more processes (ulimit -u), or give --set workers=1.",
         errno.ENOSPC: "Free some disk space and run it again.",
         errno.EDQUOT: "Your quota is used up: remove something and run it again.",
         errno.EFBIG: "The file may not grow larger here (ulimit -f): allow more, or choose another --out.",
