@@ -80,13 +80,16 @@ def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> ND
     Raises:
         UserError: it is not what the environment's observation space says.
     """
-    with UsersCode("the environment", env, "step") as code:
-        image = np.array(observation, order="C")
-        if image.dtype != np.uint8 or with_channels(image.shape) != shape:
-            found = f"{image.dtype} {image.shape}"
-            do = f"Make the observation space and the observations agree; the former says uint8 {shape}."
-            code.refuse(f"gave another observation than its space says: {found}", do)
-        return image.reshape(shape)
+    code = UsersCode("the environment", env, "step")
+    if not isinstance(observation, np.ndarray):
+        with code:
+            observation = np.array(observation)
+    image = np.array(observation, order="C")
+    if image.dtype != np.uint8 or with_channels(image.shape) != shape:
+        found = f"{image.dtype} {image.shape}"
+        do = f"Make the observation space and the observations agree; the former says uint8 {shape}."
+        code.refuse(f"gave another observation than its space says: {found}", do)
+    return image.reshape(shape)
 
 
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
@@ -132,11 +135,12 @@ def _kinds(given: object) -> str:
 
 def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
     """Which sub-goals hold in an environment's current state, bool (G,)."""
-    told = np.empty(len(labels), np.bool_)
-    for column, label in enumerate(labels):
-        with UsersCode("a sub-goal's function", label) as code:
-            told[column] = code.truth(label(env), "the label")
-    return told
+    told = []
+    with UsersCode("a sub-goal's function") as code:
+        for label in labels:
+            code.of = label
+            told.append(code.truth(label(env), "the label"))
+    return np.array(told, dtype=np.bool_)
 
 
 class GymnasiumEngine(Engine):
