@@ -14,6 +14,7 @@ from rich.console import Console
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.terminal import draw
 from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.judging import Work
@@ -231,14 +232,13 @@ def test_hypotheses_alone_are_told_in_the_terminal(run, tmp_path, capsys, monkey
         assert "metrics.json" in said.err and "evaluation" in said.out and "balanced" not in said.out.lower()
 
 
-def test_numbers_of_a_stranger_are_shown_as_they_are():
+def test_numbers_of_a_stranger_are_shown_as_they_are(capsys):
     """Spec G2: a terminal obeys nothing that stands in an evaluation, and one of another shape is told."""
     row = {"name": "[red]x[/blue]\x1b[31m", "sub_goal": "y"}
     row |= {which: {"mean": 0.5} for which in ("best", "mean", "worst", "disagreement_heldout")}
     numbers = {"rooms": [], "hypotheses": [row], "distance": {"options": []}, "agents": [], "missing": []}
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(summary_of(numbers, "here"))
-    text = console.export_text()
+    draw(summary_of(numbers, "here"), 80)
+    text = capsys.readouterr().out
     assert "[red]x[/blue]?" in text and "\x1b" not in text
     with pytest.raises(UserError, match="the evaluation is damaged: here"):
         summary_of(numbers | {"hypotheses": [{"name": 3}]}, "here")
