@@ -140,7 +140,7 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         except BaseException as error:
             if not unfinished(out):
                 shutil.rmtree(folder, ignore_errors=True)
-            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed):
+            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed | OSError):
                 error.add_note(f"the last checkpoint is kept: {GO_ON}")
             raise
         shutil.rmtree(folder, ignore_errors=True)
