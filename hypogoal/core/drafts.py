@@ -138,7 +138,7 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         except BaseException as error:
             if not unfinished(out):
                 _clear(folder)
-            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed):
+            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed | OSError):
                 error.add_note(f"the last checkpoint is kept: {GO_ON}")
             raise
         _clear(folder)

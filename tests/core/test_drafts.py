@@ -1,5 +1,6 @@
 """Spec G1, G2: what a stage works on is its own, is gone on with only by what began it, and is never lost."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 from toy_data import reseal
 
+from hypogoal.cli import notes_of
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.drafts import LOCK, check_complete, draft, draft_folder, unfinished
@@ -123,6 +125,13 @@ def test_what_is_unfinished_is_not_begun_anew_by_mistake(tmp_path: Path) -> None
     with pytest.raises(UserError, match="an unfinished one is there"):
         finish(out)
     assert unfinished(out) and claim(out, kind="meta", resume=True) and claim(out, kind="meta", force=True)
+
+
+def test_a_full_disk_says_that_the_checkpoint_is_kept(tmp_path: Path) -> None:
+    """Spec G1: or 'run it again' is done without --resume, and refused."""
+    with pytest.raises(OSError, match="No space left") as caught:
+        stop(tmp_path / "meta", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert notes_of(caught.value) == ["the last checkpoint is kept: give the same command with --resume to go on"]
 
 
 def test_a_damaged_draft_is_one_line(tmp_path: Path) -> None:
