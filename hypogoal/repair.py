@@ -154,8 +154,9 @@ def _last_byte(dataset: Any) -> int:
     """How far into its file a dataset's values reach."""
     if dataset.chunks is None:
         return int(dataset.id.get_offset() or 0) + int(dataset.id.get_storage_size())
-    chunks = (dataset.id.get_chunk_info(index) for index in range(dataset.id.get_num_chunks()))
-    return max((chunk.byte_offset + chunk.size for chunk in chunks), default=0)
+    ends = [0]
+    dataset.id.chunk_iter(lambda chunk: ends.append(chunk.byte_offset + chunk.size))
+    return max(ends)
 
 
 def _write(
