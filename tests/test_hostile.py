@@ -120,6 +120,14 @@ def test_toml_with_keys_within_keys_is_not_parsed(tmp_path: Path, text: str) -> 
     assert preset_digest(str(path)) == ""
 
 
+def test_toml_with_a_number_that_cannot_be_printed(tmp_path: Path) -> None:
+    """Spec G2: Python reads hexadecimals of any length, and prints decimals of 4,300 digits at most."""
+    path = tmp_path / "long.toml"
+    path.write_text(f"[run]\nlayout_seeds = [0x{'f' * 9999}]\n")
+    with pytest.raises(UserError, match=r"not valid TOML \(Exceeds the limit .*long\.toml"):
+        load_preset(str(path), "run")
+
+
 def test_a_maze_of_hdf5_groups_is_walked_once(tmp_path: Path) -> None:
     """Spec G2: with ten hard links in each of eight groups there are 10^8 ways to the last."""
     path = tmp_path / "arrays.h5"

@@ -146,7 +146,9 @@ def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
         for number, line in enumerate(text.split("\n"), 1):
             if line.count(".") > MOST_DOTS:
                 raise ValueError(f"more than {MOST_DOTS} dots in line {number}")
-        return tomllib.loads(text)
+        table = tomllib.loads(text)
+        repr(table)  # hexadecimals of any length are read, and not printed
+        return table
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -25,8 +26,9 @@ KNOWN = (*NEEDED, *OPTIONAL, NAMES)
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others make gigabytes of a kilobyte
 ENCRYPTED = 1  # among the flags of an entry
 DAMAGED = (
-    ValueError, TypeError, OverflowError, KeyError, EOFError, OSError, MemoryError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip # of NumPy and zipfile: a text for a size, a size of thirty digits, an odd stream
+    ValueError, TypeError, OverflowError, KeyError, EOFError, OSError, MemoryError, SyntaxError, tokenize.TokenError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip # of NumPy and zipfile: a text for a size, a size of thirty digits, an open bracket, an odd stream
 
 
 def read_arrays(path: Path) -> Parts:

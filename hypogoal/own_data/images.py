@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, require_file
+from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.parts import Parts, require_memory
 
 if TYPE_CHECKING:
@@ -104,8 +105,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
             if getattr(image, "is_animated", False):
                 raise UserError("several pictures are in one file", file, "Write each as a file of its own.")
             values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
-    except (OSError, ValueError, SyntaxError, EOFError, OverflowError, TypeError, LookupError, struct.error,
-            PIL.Image.DecompressionBombError):  # fmt: skip
+    except (*DAMAGED, LookupError, struct.error, PIL.Image.DecompressionBombError):
         raise UserError("this is no image, or a damaged one", file, DO) from None
     return values.reshape(*values.shape[:2], -1)
 

@@ -9,7 +9,7 @@ from typing import Any
 from hypogoal.core import own_code
 from hypogoal.core.artefacts import claim
 from hypogoal.core.drafts import put_in_place
-from hypogoal.core.errors import UserError
+from hypogoal.core.errors import UserError, printable
 from hypogoal.core.kinds import ARRAYS, DATA
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
@@ -67,7 +67,7 @@ def import_data(
     warned += _too_small(domain, collected.observation_shape)
     for line in warned:
         say(f"hypogoal: {line}", err=True)
-    config = {"source": source.name, **({"labels": dict(labels)} if labels else {})}
+    config = {"source": printable(source.name), **({"labels": dict(labels)} if labels else {})}
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()
 

@@ -273,17 +273,24 @@ def test_zip_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> Non
     path.write_bytes(data)
     with pytest.raises(UserError, match="damaged"):
         read_arrays(path)
-    header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % 10**30
-    huge = b"\x93NUMPY\x02\0" + len(header).to_bytes(4, "little") + header
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("observations.npy", huge)
-    with pytest.raises(UserError, match="damaged"):
-        read_arrays(path)
+    for header in (b"(" * 99 + b"\n", b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }\n" % 10**30):
+        huge = b"\x93NUMPY\x02\0" + len(header).to_bytes(4, "little") + header
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("observations.npy", huge)
+        with pytest.raises(UserError, match="damaged"):
+            read_arrays(path)
     for name in ("positive", "negative", "unlabelled"):
         (tmp_path / "images" / name).mkdir(parents=True)
         (tmp_path / "images" / name / "x.npy").write_bytes(huge)
     with pytest.raises(UserError, match="no image, or a damaged one"):
         read_images(tmp_path / "images")
+
+
+def test_a_name_that_is_no_utf_8_is_imported(tmp_path: Path) -> None:
+    """Spec B6: what the source was called is only told; what of it cannot be is a '?'."""
+    np.savez(tmp_path / "own\udcff.npz", **arrays())
+    assert main(["import", str(tmp_path / "own\udcff.npz"), "--out", str(tmp_path / "data.h5"), "-q"]) == 0
+    assert open_dataset(tmp_path / "data.h5").config["source"] == "own?.npz"
 
 
 def test_what_is_to_be_imported_is_weighed_with_its_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
