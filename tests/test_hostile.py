@@ -175,10 +175,10 @@ def test_names_of_sub_goals_become_files(tmp_path: Path, names: Any) -> None:
         set_attribute(file, "sub_goals", json.dumps(names))
     with pytest.raises(UserError, match="not a hypogoal data file"):
         open_dataset(path)
-    out = artefact(tmp_path / "meta") / "manifest.json"
-    out.write_text(json.dumps(json.loads(out.read_text()) | {"config": {"sub_goals": names}}))
+    out = artefact(tmp_path / "meta")
+    reseal(out, config={"sub_goals": names})
     with pytest.raises(UserError, match="'sub_goals' is malformed"):
-        open_artefact(out.parent)
+        open_artefact(out)
     if isinstance(names, list):
         states = States(np.zeros((2, *SHAPE), "u1"), np.zeros((2, len(names)), bool))
         with pytest.raises(UserError, match=r"name|no sub-goals") as caught:

@@ -323,7 +323,8 @@ def pairs(
     Args:
         measured: (method, what is alike, value): layout, sub-goal or ladder, the seed last. What is alike in all of it,
             options of one seed of several ensembles say, is paired in the order in which it comes.
-        quantity, where: what the rows say that is compared.
+        quantity: what the rows say that is compared.
+        where: and of what.
         higher: the better value is the higher one.
         layouts: the first mark's values are the units, not the seeds.
 

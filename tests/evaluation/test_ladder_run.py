@@ -346,7 +346,7 @@ def test_a_domain_without_pictures(run, tmp_path, monkeypatch):
     """Spec F4: what is missing is the pictures, not the numbers."""
     from ladder_run import LadderDomain
 
-    monkeypatch.delattr(LadderDomain, "picture")
+    monkeypatch.setattr(LadderDomain, "pictures", False)
     metrics = evaluate(run, tmp_path / "evaluation", **QUIET)
     assert metrics["distance"]["shown"] == []
     assert metrics["distance"]["over_ladders"][0]["best"]["mean"] is not None

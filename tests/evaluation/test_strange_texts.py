@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import h5py
 import numpy as np
 import pytest
+import toy_data
 from browser import loaded, needs_browser, title_of
 from ladder_run import (
     DOMAIN,
@@ -20,12 +21,14 @@ from ladder_run import (
     write_members,
     write_options,
 )
+from toy_data import fill
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import MANIFEST, create_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5, fixed, set_attribute
+from hypogoal.core.manifests import sealed
 from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
@@ -108,6 +111,7 @@ def write_meta(out, source):
         write_table(folder / "choices.csv", CHOICE_COLUMNS, rows)
         with create_hdf5(folder / "terminations.h5") as file:
             file["0"] = heldout().observations[:3]
+        fill(folder, "meta", config)
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +127,7 @@ def run(tmp_path_factory):
     about = {"agent": "ppo", "setting": "tuned", "steps": 4_000, "layout_seed": 100, "domain": DOMAIN.name}
     with create_artefact(run / "ppo", kind="baseline", config=about, seed=0) as out:
         write_agent(out)
+        fill(out, "baseline", about)
     evaluate(run, run / "evaluation", quiet=True)
     return run
 
@@ -137,9 +142,8 @@ def changed(run, tmp_path):
 def reseal(path, text):
     """Another text in a file of an artefact, whose manifest says that it was written so."""
     path.write_text(text, encoding="utf-8")
-    manifest = json.loads((path.parent / MANIFEST).read_text(encoding="utf-8"))
-    manifest["files"][path.name] = sha256_of(path)
-    (path.parent / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
+    files = json.loads((path.parent / MANIFEST).read_text(encoding="utf-8"))["files"]
+    toy_data.reseal(path.parent, files=files | {path.name: sha256_of(path)})
 
 
 class Parsed(HTMLParser):
@@ -283,7 +287,7 @@ def test_every_text_that_an_evaluation_is_made_of_is_escaped(changed):
         now = {before[data]: sha256_of(data)}
         for name, manifest in value["manifests"].items():
             inputs = [{**entry, "sha256": now.get(entry["sha256"], entry["sha256"])} for entry in manifest["inputs"]]
-            (changed / name / MANIFEST).write_text(json.dumps({**manifest, "inputs": inputs}), encoding="utf-8")
+            (changed / name / MANIFEST).write_bytes(sealed({**manifest, "inputs": inputs}))
             now[before[name]] = sha256_of(changed / name / MANIFEST)
         evaluate(changed, changed / "evaluation", quiet=True, force=True)
         return drawn(changed)

@@ -132,7 +132,7 @@ def test_a_preset_file_may_not_change_under_a_sweep(tmp_path: Path, monkeypatch:
     """Spec G4: cells made before would have other settings than those made now; which cells there are may change."""
     preset, out = tmp_path / "my.toml", tmp_path / "out"
     preset.write_text("[train-ensemble]\nsteps = 7\n")
-    monkeypatch.setattr("hypogoal.stages.sweep.run_cells", lambda planned, out, say: Outcome())
+    monkeypatch.setattr("hypogoal.stages.sweep.run_cells", lambda planned, out, say, check=False: Outcome())
     monkeypatch.setattr("hypogoal.stages.sweep.gather", lambda out: None)
     sweep(plan("doorkey", out, preset=str(preset)), out, quiet=True)
     preset.write_text("# more\n[run]\nseeds = [0, 1]\n[train-ensemble]\nsteps = 7\n")

@@ -176,10 +176,10 @@ def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(
 
 
 LEAVER = """
-import os
+import ctypes, os
 from own_domain import CorridorDomain
 if os.environ.get("LEAVE"):
-    os._exit(0)
+    ctypes.CDLL(None)._exit(0)  # in C, which nobody can tell
 DOMAIN = CorridorDomain()
 """
 
