@@ -151,9 +151,20 @@ sys.exit(hypogoal.cli.main())
 """
 
 
-def test_stopped_before_a_command_is_reached() -> None:
+STOPPED_WHILE_PARSING = """
+import os, signal, sys
+import hypogoal.cli
+from hypogoal.cli.common import TyperGroup
+
+TyperGroup.parse_args = lambda *_: os.kill(os.getpid(), signal.SIGTERM)
+sys.exit(hypogoal.cli.main())
+"""
+
+
+@pytest.mark.parametrize("code", [STOPPED_AT_ONCE, STOPPED_WHILE_PARSING])
+def test_stopped_before_a_command_is_reached(code: str) -> None:
     """Spec G1, G2: one line and 128 + the signal, as later."""
-    done = subprocess.run([sys.executable, "-c", STOPPED_AT_ONCE], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 128 + signal.SIGTERM
     assert done.stderr == "hypogoal: stopped; nothing was half-written\n"
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -20,12 +21,17 @@ class Interrupted(Exception):
     """Ctrl-C or SIGTERM; its cause is the ``KeyboardInterrupt``, of which typer would make an exit code."""
 
 
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise Interrupted from error
+
+
 class _Commands(TyperGroup):
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            raise Interrupted from error
+    make_context = _interruptible()(TyperGroup.make_context)
+    invoke = _interruptible()(TyperGroup.invoke)
 
 
 app = typer.Typer(
