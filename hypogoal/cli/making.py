@@ -146,7 +146,7 @@ def train_baseline(
     out: Out,
     agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
     data: Annotated[
-        Path | None, typer.Option(help="States of the domain: play in the world that they are of (keyring=false, say).")
+        Path | None, typer.Option(help="States of the domain: play in the world that they were collected in.")
     ] = None,
     layout_seed: LayoutSeed = None,
     preset: Preset = None,
