@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.stats import t
 
@@ -33,8 +34,9 @@ from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import in_processes
 from hypogoal.dataset import Collected, Split
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.scores import cross_fitted
 from hypogoal.hypotheses.training import fit
 from hypogoal.stages.train_ensemble import score_rows
@@ -62,6 +64,41 @@ def states_of(layouts: str) -> Collected:
     return DOMAIN.collect(config, 0, Progress("collect", 1, quiet=True))
 
 
+class Looked:
+    """An ensemble that predicts the states of :func:`states_of` again and again: their patches are found once."""
+
+    def __init__(self, ensemble: Ensemble, layouts: str):
+        self.ensemble, self.layouts = ensemble, layouts
+
+    def __len__(self) -> int:
+        return len(self.ensemble)
+
+    def predict(self, observations: NDArray[np.uint8], positions: None = None) -> NDArray[np.float32]:
+        """As :meth:`Ensemble.predict`."""
+        networks = self.ensemble.eval().networks()
+        with torch.inference_mode():
+            rows = [
+                torch.stack([patches.forward(network, batch) for network in networks]).softmax(dim=-1)[..., 1].T.numpy()
+                for batch in _batches(self.layouts, observations is states_of(self.layouts).unlabelled.observations)
+            ]
+        self.ensemble.train()
+        return np.concatenate(rows)
+
+
+@lru_cache(maxsize=2)
+def _batches(layouts: str, unlabelled: bool) -> list[patches.Batch]:
+    """The distinct patches of the held-out or the unlabelled states, in the chunks of :meth:`Ensemble.predict`."""
+    split = states_of(layouts).unlabelled if unlabelled else states_of(layouts).heldout
+    observations = split.observations
+    network = Ensemble(EnsembleConfig().network, observations.shape[1:], 1, torch.Generator()).networks()[0]
+    batches = []
+    for start in range(0, len(observations), PATCH_CHUNK):
+        tables = patches.make_tables(observations[start : start + PATCH_CHUNK], network)
+        assert tables is not None
+        batches.append(patches.take(tables, np.arange(len(observations[start : start + PATCH_CHUNK]))))
+    return batches
+
+
 def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
     """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and score it on the way."""
     prepare()
@@ -71,7 +108,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
     rows: dict[tuple[int, int], Row] = {}
 
     def look(step: int, ensemble: Ensemble) -> None:
-        for scores in score_rows(ensemble, heldout, data.unlabelled.observations, None):
+        for scores in score_rows(Looked(ensemble, layouts), heldout, data.unlabelled.observations, None):
             key = (layouts, method, sub_goal, seed, step, scores["member"])
             row = rows.setdefault((step, scores["member"]), dict(zip(KEYS, key, strict=True)))
             half = "" if scores["scope"] == "all" else f"_{scores['scope']}"
