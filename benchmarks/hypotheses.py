@@ -5,7 +5,8 @@
 
 A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps. Its rows, one a look
 and member, are appended to the file as soon as it is done; a run that was cut goes on where it stopped. Layouts for
-choosing a method's length of training are others than those that it is tested on, and so are the seeds.
+choosing a method's length of training are others than those that it is tested on, and so are the seeds. With
+``--chosen`` a method is trained to its chosen length and looked at there only; without, all the way.
 
     python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --tables
 
@@ -17,21 +18,20 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import t
 
+from benchmarks.cells import Row, interval, run_cells, table
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.workers import in_processes
 from hypogoal.dataset import Collected, Split
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.hypotheses import patches
@@ -54,7 +54,6 @@ KEYS = ("layouts", "method", "sub_goal", "seed", "step", "member")
 OF_ALL = ("ranking", "balanced_accuracy", "precision", "recall", "at_q95", "at_best")
 OF_HALVES = ("ranking", "balanced_accuracy", "at_q95")
 COLUMNS = (*KEYS, *OF_ALL, *(f"{name}_{half}" for half in ("first", "second") for name in OF_HALVES))
-Row = dict[str, Any]
 
 
 @lru_cache(maxsize=1)
@@ -99,7 +98,7 @@ def _batches(layouts: str, unlabelled: bool) -> list[patches.Batch]:
     return batches
 
 
-def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
+def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequence[int] = LOOKS) -> list[Row]:
     """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and score it on the way."""
     prepare()
     data = states_of(layouts)
@@ -108,13 +107,15 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
     rows: dict[tuple[int, int], Row] = {}
 
     def look(step: int, ensemble: Ensemble) -> None:
-        for scores in score_rows(Looked(ensemble, layouts), heldout, data.unlabelled.observations, None):
+        for scores in score_rows(
+            cast(Ensemble, Looked(ensemble, layouts)), heldout, data.unlabelled.observations, None
+        ):
             key = (layouts, method, sub_goal, seed, step, scores["member"])
             row = rows.setdefault((step, scores["member"]), dict(zip(KEYS, key, strict=True)))
             half = "" if scores["scope"] == "all" else f"_{scores['scope']}"
             row |= {f"{name}{half}": scores[name] for name in (OF_HALVES if half else OF_ALL)}
 
-    config = dataclasses.replace(EnsembleConfig(steps=LOOKS[-1]), **METHODS[method])
+    config = dataclasses.replace(EnsembleConfig(steps=looks[-1]), **METHODS[method])
     fit(
         data.labelled.observations,
         data.labelled.labels[:, column],
@@ -122,7 +123,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
         config,
         seed_for(seed, "ensemble", sub_goal),
         look=look,
-        look_at=LOOKS,
+        look_at=looks,
     )
     return list(rows.values())
 
@@ -172,14 +173,6 @@ def by_seed(
     return np.array([np.mean([of(steps[step]) for steps in cells if steps]) for cells in means if all(cells)])
 
 
-def interval(values: NDArray[np.float64], digits: int = 3) -> str:
-    """A mean with Student's 95 % interval over seeds."""
-    if len(values) < 2:
-        return f"{values.mean():.{digits}f}" if len(values) else "-"
-    half = t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    return f"{values.mean():.{digits}f} [{values.mean() - half:.{digits}f}, {values.mean() + half:.{digits}f}]"
-
-
 SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
     "ranking, cross-fitted best": lambda members: crossed(members, "ranking"),
     "ranking, mean member": lambda members: float(members["ranking"].mean()),
@@ -189,13 +182,6 @@ SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
     "above the 95th percentile, mean": lambda members: float(members["at_q95"].mean()),
     "at its best threshold, mean": lambda members: float(members["at_best"].mean()),
 }
-
-
-def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Lines of Markdown, and an empty one."""
-    for cells in (titles, ["---"] * len(titles), *rows):
-        yield f"| {' | '.join(cells)} |"
-    yield ""
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -261,36 +247,31 @@ def main() -> None:
     parser.add_argument("--layouts", choices=LAYOUTS, default="test")
     parser.add_argument("--seeds", type=parse_integers, default=parse_integers("0-9"), help="0-9 or 0,2,5")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
+    parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))
         return
-    if not arguments.csv.exists():
-        arguments.csv.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-    with arguments.csv.open(encoding="utf-8", newline="") as file:
-        done = {(row["layouts"], row["method"], row["sub_goal"], int(row["seed"])) for row in csv.DictReader(file)}
-    cells = [
-        (arguments.layouts, method, sub_goal, seed)
-        for seed in arguments.seeds
-        for method in arguments.methods.split(",")
-        for sub_goal in DOMAIN.sub_goals
-    ]
-    cells = [cell for cell in cells if cell not in done]
-    with Progress("hypotheses", len(cells)) as progress:
-
-        def keep(number: int, rows: list[Row]) -> None:
-            with arguments.csv.open("a", encoding="utf-8", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-                writer.writerows({**row, **_short(row)} for row in rows)
-            progress.advance()
-
-        in_processes([partial(run_cell, *cell) for cell in cells], arguments.workers, keep)
-
-
-def _short(row: Row) -> dict[str, str]:
-    return {name: f"{value:.4f}" for name, value in row.items() if isinstance(value, float)}
+    methods = arguments.methods.split(",")
+    chosen = lengths(read(arguments.csv, "choice")) if arguments.chosen else {}
+    looks = {method: (chosen[method],) if chosen else LOOKS for method in methods}
+    run_cells(
+        arguments.csv,
+        COLUMNS,
+        KEYS[:4],
+        {
+            (arguments.layouts, method, sub_goal, str(seed)): partial(
+                run_cell, arguments.layouts, method, sub_goal, seed, looks[method]
+            )
+            for seed in arguments.seeds
+            for method in methods
+            for sub_goal in DOMAIN.sub_goals
+        },
+        lambda cell: looks[cell[1]],
+        arguments.workers,
+    )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,74 @@
+"""Experiments made of cells: one training each, its rows in a CSV as soon as it is done; what a table shows of them."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t
+
+from hypogoal.core.progress import Progress
+from hypogoal.core.workers import in_processes
+
+Row = dict[str, Any]
+Cell = tuple[str, ...]
+
+
+def run_cells(
+    path: Path,
+    columns: Sequence[str],
+    keys: Sequence[str],
+    jobs: Mapping[Cell, Callable[[], list[Row]]],
+    steps: Callable[[Cell], Sequence[int]],
+    workers: int,
+) -> None:
+    """Run the jobs whose rows are not in the file, in their order; a run that was cut goes on where it stopped.
+
+    Args:
+        path: the CSV; made where there is none.
+        columns: of its rows, ``step`` among them.
+        keys: the columns that name a cell.
+        jobs: by cell what makes its rows.
+        steps: the numbers of steps that a cell is wanted at. Rows of others are kept as they are.
+        workers: processes.
+    """
+    if not path.exists():
+        path.write_text(",".join(columns) + "\n", encoding="utf-8")
+    there: dict[Cell, set[int]] = defaultdict(set)
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            there[tuple(row[key] for key in keys)].add(int(row["step"]))
+    cells = [cell for cell in jobs if not there[cell].issuperset(steps(cell))]
+    with Progress(path.stem, len(cells)) as progress:
+
+        def keep(number: int, rows: list[Row]) -> None:
+            new = [row for row in rows if row["step"] not in there[cells[number]]]
+            with path.open("a", encoding="utf-8", newline="") as file:
+                csv.DictWriter(file, columns, lineterminator="\n").writerows({**row, **_short(row)} for row in new)
+            progress.advance()
+
+        in_processes([jobs[cell] for cell in cells], workers, keep)
+
+
+def _short(row: Row) -> dict[str, str]:
+    return {name: f"{value:.4f}" for name, value in row.items() if isinstance(value, float)}
+
+
+def interval(values: NDArray[np.float64], digits: int = 3) -> str:
+    """A mean with Student's 95 % interval over seeds."""
+    if len(values) < 2:
+        return f"{values.mean():.{digits}f}" if len(values) else "-"
+    half = t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+    return f"{values.mean():.{digits}f} [{values.mean() - half:.{digits}f}, {values.mean() + half:.{digits}f}]"
+
+
+def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Lines of Markdown, and an empty one."""
+    for cells in (titles, ["---"] * len(titles), *rows):
+        yield f"| {' | '.join(cells)} |"
+    yield ""
