@@ -34,7 +34,7 @@ class MetaConfig:
     decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2)
     epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
     meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
-    meta_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: not given", low=0.0)
+    meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
     clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0)
     entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
     value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0)
