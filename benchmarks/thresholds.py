@@ -3,9 +3,9 @@
     python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-102
     python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts test --seeds 0-4
 
-A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps; ``--tables`` draws the
-cells. A rule sees a member's probabilities on the labelled and the unlabelled states, and which of the labelled ones are
-positive.
+A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps; ``--tables`` draws
+them. A rule sees a member's probabilities on the labelled and the unlabelled states, and which labelled ones are
+positives.
 """
 
 from __future__ import annotations
