@@ -1,7 +1,8 @@
 """What members know of DoorKey's held-out layouts, by method and length of training: the cells behind the results.
 
-    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 100-102
-    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts test --seeds 0-9
+    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 100
+    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 101,102 --until 600
+    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts test --seeds 0-9 --chosen
 
 A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps. Its rows, one a look
 and member, are appended to the file as soon as it is done; a run that was cut goes on where it stopped. Layouts for
@@ -153,9 +154,10 @@ def crossed(members: dict[str, NDArray[np.float64]], name: str) -> float:
 
 
 def curve(numbers: Numbers, method: str, of: Callable[[dict[str, NDArray[np.float64]]], float]) -> dict[int, float]:
-    """By length of training, the mean of something over a method's sub-goals and seeds."""
+    """By length of training that all got to, the mean of something over a method's sub-goals and seeds."""
     cells = [steps for (name, _, _), steps in numbers.items() if name == method]
-    return {step: float(np.mean([of(steps[step]) for steps in cells])) for step in LOOKS} if cells else {}
+    looks = [step for step in LOOKS if cells and all(step in steps for steps in cells)]
+    return {step: float(np.mean([of(steps[step]) for steps in cells])) for step in looks}
 
 
 def lengths(choice: Numbers) -> dict[str, int]:
@@ -188,18 +190,16 @@ def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     choice, test = read(path, "choice"), read(path, "test")
     chosen = lengths(choice)
-    yield f"Cross-fitted ranking on the layouts for choosing, {_seeds(choice)}, by steps; in bold the length chosen."
-    yield ""
-    curves = {method: curve(choice, method, SHOWN["ranking, cross-fitted best"]) for method in chosen}
-    rows = (
-        [f"**{value:.3f}**" if step == chosen[m] else f"{value:.3f}" for step, value in curves[m].items()]
-        for m in chosen
-    )
-    yield from table(["", *map(str, LOOKS)], ([m, *cells] for m, cells in zip(chosen, rows, strict=True)))
-    yield "Balanced accuracy at 0.5 of the cross-fitted best member there."
-    yield ""
-    curves = {method: curve(choice, method, SHOWN["balanced accuracy at 0.5, cross-fitted best"]) for method in chosen}
-    yield from table(["", *map(str, LOOKS)], ([m, *(f"{v:.3f}" for v in curves[m].values())] for m in chosen))
+    for name in ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best"):
+        yield f"{name[0].upper()}{name[1:]} on the layouts for choosing by steps, {_seeds(choice)}; in bold the chosen."
+        yield ""
+        yield from _curves(choice, chosen, SHOWN[name])
+    first = min(seed for _, _, seed in choice)
+    alone = {cell: steps for cell, steps in choice.items() if cell[2] == first}
+    for name in ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best"):
+        yield f"{name[0].upper()}{name[1:]} there, seed {first} alone."
+        yield ""
+        yield from _curves(alone, dict.fromkeys(chosen, 0), SHOWN[name])
     tested = [method for method in chosen if any(name == method for name, _, _ in test)]
     if not tested:
         return
@@ -225,6 +225,20 @@ def tables(path: Path) -> Iterator[str]:
     yield from table(["", "difference", "seeds in which D-BAT is above"], _differences(test, chosen, tested))
 
 
+def _curves(
+    numbers: Numbers, chosen: dict[str, int], of: Callable[[dict[str, NDArray[np.float64]]], float]
+) -> Iterator[str]:
+    curves = {method: curve(numbers, method, of) for method in chosen}
+    looks = sorted(set().union(*curves.values()))
+    texts = {
+        method: {
+            step: f"**{value:.3f}**" if step == chosen[method] else f"{value:.3f}" for step, value in steps.items()
+        }
+        for method, steps in curves.items()
+    }
+    yield from table(["", *map(str, looks)], ([m, *(texts[m].get(step, "-") for step in looks)] for m in chosen))
+
+
 def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -> Iterator[list[str]]:
     ranking = SHOWN["ranking, cross-fitted best"]
     for goals, title in ((DOMAIN.sub_goals, ""), *(((goal,), f", {goal}") for goal in DOMAIN.sub_goals)):
@@ -237,7 +251,7 @@ def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -
 
 def _seeds(numbers: Numbers) -> str:
     seeds = sorted({seed for _, _, seed in numbers})
-    return f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]})" if seeds else "no seeds"
+    return f"seeds {seeds[0]} to {seeds[-1]}" if seeds else "no seeds"
 
 
 def main() -> None:
@@ -247,6 +261,7 @@ def main() -> None:
     parser.add_argument("--layouts", choices=LAYOUTS, default="test")
     parser.add_argument("--seeds", type=parse_integers, default=parse_integers("0-9"), help="0-9 or 0,2,5")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
+    parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
@@ -256,7 +271,8 @@ def main() -> None:
         return
     methods = arguments.methods.split(",")
     chosen = lengths(read(arguments.csv, "choice")) if arguments.chosen else {}
-    looks = {method: (chosen[method],) if chosen else LOOKS for method in methods}
+    until = tuple(step for step in LOOKS if step <= arguments.until)
+    looks = {method: (chosen[method],) if chosen else until for method in methods}
     run_cells(
         arguments.csv,
         COLUMNS,
