@@ -21,11 +21,11 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Pixels
+from hypogoal.hypotheses.thresholds import PAPER, thresholds
 from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 
 OnStep = Callable[[int, dict[str, float]], None]
 Look = Callable[[int, Ensemble], None]
-QUANTILE, QUANTILE_LEVEL = "unlabelled-q95", 0.95
 REPORT_EVERY = 10  # steps between reports, and between looks for NaN: a look makes a GPU wait
 
 
@@ -93,7 +93,7 @@ def fit(
     if len(unlabelled) == 0:
         if _diverse(config):
             raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
-        if config.threshold == QUANTILE:
+        if config.threshold != PAPER:
             raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
@@ -145,22 +145,12 @@ def fit(
                     look(step, ensemble)
                 checkpoints.offer(partial(state, number, part))
     ensemble.eval()
-    if config.threshold == QUANTILE:
-        probabilities = ensemble.predict(unlabelled, positions_of(unlabelled_origins))
-        ensemble.set_thresholds(quantile_thresholds(probabilities))
+    if config.threshold != PAPER:
+        own = ensemble.predict(observations, positions_of(origins))
+        elsewhere = ensemble.predict(unlabelled, positions_of(unlabelled_origins))
+        ensemble.set_thresholds(thresholds(config.threshold, own, labels, elsewhere))
     checkpoints.save(state(len(rounds), None))
     return ensemble
-
-
-def quantile_thresholds(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Thresholds float32 (K,) above which each member says yes to 5 % of states, from its probabilities (M, K) of them.
-
-    Members of a crop are sure of what is no base and unsure of what is one in a room they do not know; the quantile
-    needs no labels. It stays below 1: a member that is certain of more than 5 % goes on saying yes to those. The state
-    whose probability it is lies at its edge: see :meth:`Ensemble.verdicts`.
-    """
-    quantiles = np.quantile(probabilities, QUANTILE_LEVEL, axis=0, method="higher").astype(np.float32)
-    return np.minimum(quantiles, np.nextafter(np.float32(1), np.float32(0)))
 
 
 def _diverse(config: EnsembleConfig) -> bool:

@@ -27,7 +27,8 @@ from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network
 from hypogoal.hypotheses.scores import best_threshold, halves, member_scores, ranking
-from hypogoal.hypotheses.training import Report, fit, quantile_thresholds
+from hypogoal.hypotheses.thresholds import thresholds
+from hypogoal.hypotheses.training import Report, fit
 from hypogoal.hypotheses.views import positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
@@ -153,7 +154,8 @@ def score_rows(
         states (``at_q95``) and at the best threshold that there is (``at_best``).
     """
     probabilities = ensemble.predict(split.observations, positions_of(split.origins))
-    quantiles = quantile_thresholds(ensemble.predict(unlabelled, positions))
+    elsewhere = ensemble.predict(unlabelled, positions)
+    quantiles = thresholds("unlabelled-q95", elsewhere[:0], np.zeros(0, dtype=np.bool_), elsewhere)  # asks no label
     contexts = next((split.origins[name] for name in ("layout_seed", "room") if name in split.origins), None)
     first = None if contexts is None else halves(contexts)
     scopes = {"all": np.ones(len(split.labels), dtype=np.bool_)}

@@ -20,7 +20,8 @@ from hypogoal.hypotheses import batches, training
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.training import fit, quantile_thresholds
+from hypogoal.hypotheses.thresholds import RULES, thresholds
+from hypogoal.hypotheses.training import fit
 
 TOY = EnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, diversity_weight=0.03)
 
@@ -299,6 +300,8 @@ def test_thresholds_are_the_unlabelled_quantile() -> None:
     says_yes = ensemble.verdicts(unlabelled).mean(axis=0)
     assert (says_yes <= 0.05).all()
     assert (says_yes > 0).all()
+    rate = fit(observations, labels, unlabelled, dataclasses.replace(config, threshold="base-rate"), seed=0)
+    np.testing.assert_allclose(rate.verdicts(unlabelled).mean(axis=0), labels.mean(), atol=1.5 / len(unlabelled))
     half = fit(observations, labels, unlabelled, dataclasses.replace(config, threshold="0.5"), seed=0)
     np.testing.assert_array_equal(half.verdicts(unlabelled), half.predict(unlabelled) > 0.5)
     np.testing.assert_array_equal(half.predict(unlabelled), ensemble.predict(unlabelled))
@@ -309,9 +312,24 @@ def test_thresholds_are_the_unlabelled_quantile() -> None:
 def test_quantiles_by_hand() -> None:
     """The 96th of 100 probabilities, above which four are left; a member that is certain goes on saying yes."""
     probabilities = np.stack([np.arange(100) / 100, np.full(100, 0.25), np.ones(100)], axis=1).astype(np.float32)
-    thresholds = quantile_thresholds(np.random.default_rng(0).permutation(probabilities))
-    np.testing.assert_allclose(thresholds, [0.95, 0.25, 1.0])
-    assert (probabilities > thresholds).sum(axis=0).tolist() == [4, 0, 100]
+    elsewhere = np.random.default_rng(0).permutation(probabilities)
+    found = thresholds("unlabelled-q95", elsewhere[:2], np.array([True, False]), elsewhere)
+    np.testing.assert_allclose(found, [0.95, 0.25, 1.0])
+    assert (probabilities > found).sum(axis=0).tolist() == [4, 0, 100]
+
+
+def test_base_rate_by_hand() -> None:
+    """One of four labelled states is positive, so a quarter of the unlabelled ones gets a yes, but for the edge."""
+    elsewhere = np.random.default_rng(0).permutation((np.arange(100) / 100).astype(np.float32))[:, None]
+    found = thresholds("base-rate", np.zeros((4, 1), np.float32), np.array([False, True, False, False]), elsewhere)
+    np.testing.assert_allclose(found, [0.75])
+    assert (elsewhere > found).sum() == 24
+
+
+def test_every_rule_is_a_setting() -> None:
+    """What the settings offer is what there is."""
+    (setting,) = (field for field in dataclasses.fields(EnsembleConfig) if field.name == "threshold")
+    assert tuple(setting.metadata["choices"]) == tuple(RULES)
 
 
 def test_grey_maps_rise() -> None:
