@@ -49,12 +49,19 @@ METHODS: dict[str, dict[str, Any]] = {
     "say-no": {"diversity": "say-no"},
     "cnn": {"members": 1, "diversity": "none"},
 }
+WEIGHTS = (1e-5, 1e-4, 1e-3, 1e-2)
 LOOKS = (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1300, 1600, 2000, 2600)
 LAYOUTS = {"choice": 500, "test": 1000}  # the first of twenty held-out layouts
 KEYS = ("layouts", "method", "sub_goal", "seed", "step", "member")
 OF_ALL = ("ranking", "balanced_accuracy", "precision", "recall", "at_q95", "at_best")
 OF_HALVES = ("ranking", "balanced_accuracy", "at_q95")
 COLUMNS = (*KEYS, *OF_ALL, *(f"{name}_{half}" for half in ("first", "second") for name in OF_HALVES))
+
+
+def settings_of(method: str) -> dict[str, Any]:
+    """What a method changes: one of ``METHODS`` or an objective's name, with ``@`` and a weight behind it or not."""
+    name, _, weight = method.partition("@")
+    return METHODS.get(name, {"diversity": name}) | ({"diversity_weight": float(weight)} if weight else {})
 
 
 @lru_cache(maxsize=1)
@@ -116,7 +123,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
             half = "" if scores["scope"] == "all" else f"_{scores['scope']}"
             row |= {f"{name}{half}": scores[name] for name in (OF_HALVES if half else OF_ALL)}
 
-    config = dataclasses.replace(EnsembleConfig(steps=looks[-1]), **METHODS[method])
+    config = dataclasses.replace(EnsembleConfig(steps=looks[-1]), **settings_of(method))
     fit(
         data.labelled.observations,
         data.labelled.labels[:, column],
@@ -162,7 +169,10 @@ def curve(numbers: Numbers, method: str, of: Callable[[dict[str, NDArray[np.floa
 
 def lengths(choice: Numbers) -> dict[str, int]:
     """The rule: each method's length is the look with the highest cross-fitted ranking on the layouts for choosing."""
-    curves = {method: curve(choice, method, lambda members: crossed(members, "ranking")) for method in METHODS}
+    others = sorted({method for method, _, _ in choice} - set(METHODS))
+    curves = {
+        method: curve(choice, method, lambda members: crossed(members, "ranking")) for method in (*METHODS, *others)
+    }
     return {method: max(steps, key=lambda step: steps[step]) for method, steps in curves.items() if steps}
 
 
@@ -189,7 +199,8 @@ SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     choice, test = read(path, "choice"), read(path, "test")
-    chosen = lengths(choice)
+    everything = lengths(choice)
+    chosen = {method: steps for method, steps in everything.items() if method in METHODS}
     for name in ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best"):
         yield f"{name[0].upper()}{name[1:]} on the layouts for choosing by steps, {_seeds(choice)}; in bold the chosen."
         yield ""
@@ -200,6 +211,11 @@ def tables(path: Path) -> Iterator[str]:
         yield f"{name[0].upper()}{name[1:]} there, seed {first} alone."
         yield ""
         yield from _curves(alone, dict.fromkeys(chosen, 0), SHOWN[name])
+    if len(everything) > len(chosen):
+        yield f"Other weights and objectives there, seed {first} alone: the highest ranking by weight (at steps)."
+        yield ""
+        yield from table(["", *(f"{weight:g}" for weight in WEIGHTS)], _weights(alone))
+    chosen = everything
     tested = [method for method in chosen if any(name == method for name, _, _ in test)]
     if not tested:
         return
@@ -237,6 +253,20 @@ def _curves(
         for method, steps in curves.items()
     }
     yield from table(["", *map(str, looks)], ([m, *(texts[m].get(step, "-") for step in looks)] for m in chosen))
+
+
+def _weights(numbers: Numbers) -> Iterator[list[str]]:
+    methods = dict.fromkeys(method.partition("@")[0] for method, _, _ in numbers if method not in ("none", "cnn"))
+    for method in methods:
+        cells = []
+        for weight in WEIGHTS:
+            of = f"{method}@{weight:g}"
+            if weight == EnsembleConfig().diversity_weight and of not in {name for name, _, _ in numbers}:
+                of = method
+            steps = curve(numbers, of, SHOWN["ranking, cross-fitted best"])
+            best = max(steps, key=lambda step: steps[step]) if steps else 0
+            cells.append(f"{steps[best]:.3f} ({best})" if steps else "-")
+        yield [method, *cells]
 
 
 def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -> Iterator[list[str]]:

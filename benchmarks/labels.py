@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import Row, interval, run_cells, table
-from benchmarks.hypotheses import METHODS, Looked, states_of
+from benchmarks.hypotheses import Looked, settings_of, states_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
 from hypogoal.core.seeding import rng_for, seed_for
@@ -75,7 +75,7 @@ def run_cell(count: int, method: str, sub_goal: str, seed: int) -> list[Row]:
         data.labelled.observations[chosen],
         labels[chosen],
         data.unlabelled.observations,
-        dataclasses.replace(EnsembleConfig(steps=STEPS), **METHODS[method]),
+        dataclasses.replace(EnsembleConfig(steps=STEPS), **settings_of(method)),
         seed_for(seed, "ensemble", sub_goal),
         look=look,
         look_at=(STEPS,),
