@@ -1,16 +1,28 @@
 """Published tables are drawn from the committed cells (Spec F5)."""
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from benchmarks.hypotheses import LOOKS, METHODS, read, tables
+import pytest
+
+from benchmarks import hypotheses, labels, ladders, thresholds
+from benchmarks.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
+PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
+    "hypotheses-doorkey": hypotheses.tables,
+    "hypotheses-ladders": ladders.tables,
+    "labels-doorkey": labels.tables,
+    "thresholds-doorkey": thresholds.tables,
+}
 
 
-def test_tables_of_hypotheses_are_those_of_the_cells() -> None:
+@pytest.mark.parametrize("name", PAGES)
+def test_tables_are_those_of_the_cells(name: str) -> None:
     """Every line of every table stands on the page, and the page has no other."""
-    drawn = [line for line in tables(RESULTS / "hypotheses-doorkey.csv") if line.startswith("|")]
-    page = (RESULTS / "hypotheses-doorkey.md").read_text(encoding="utf-8")
+    cells = RESULTS / f"{name}.csv"
+    drawn = [line for line in PAGES[name](cells) if line.startswith("|")] if cells.exists() else []
+    page = (RESULTS / f"{name}.md").read_text(encoding="utf-8")
     assert drawn == [line for line in page.splitlines() if line.startswith("|")]
 
 
@@ -19,6 +31,28 @@ def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
     lines = (RESULTS / "hypotheses-doorkey.csv").read_text(encoding="utf-8").splitlines()
     few = [line for line in lines if not line.startswith("choice,none,go-to-goal,100")]
     (tmp_path / "few.csv").write_text("\n".join(few) + "\n")
-    numbers = read(tmp_path / "few.csv", "choice")
+    numbers = hypotheses.read(tmp_path / "few.csv", "choice")
     assert ("none", 100) not in {(method, seed) for method, _, seed in numbers}
-    assert all(tuple(steps) == LOOKS and cell[0] in METHODS for cell, steps in numbers.items())
+    assert ("dbat", 100) in {(method, seed) for method, _, seed in numbers}
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    """Cells that are there are not run again, nor are their rows written twice when more steps are wanted."""
+    ran: list[tuple[str, int]] = []
+
+    def job(cell: str, last: int) -> list[dict[str, object]]:
+        ran.append((cell, last))
+        return [{"cell": cell, "step": step, "score": step / 7} for step in range(1, last + 1)]
+
+    path = tmp_path / "cells.csv"
+
+    def run(cells: str, last: int) -> None:
+        jobs = {(cell,): lambda cell=cell: job(cell, last) for cell in cells}
+        run_cells(path, ("cell", "step", "score"), ("cell",), jobs, lambda _: range(1, last + 1), 1)
+
+    run("a", 2)
+    run("ab", 2)
+    run("a", 3)
+    assert ran == [("a", 2), ("b", 2), ("a", 3)]
+    rows = path.read_text(encoding="utf-8").splitlines()
+    assert rows == ["cell,step,score", "a,1,0.1429", "a,2,0.2857", "b,1,0.1429", "b,2,0.2857", "a,3,0.4286"]
