@@ -1,6 +1,6 @@
 """Where a member should say yes, without a label of another layout: rules for thresholds, compared on DoorKey.
 
-    python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-102
+    python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-101
     python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts test --seeds 0-4
 
 A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps; ``--tables`` draws
