@@ -146,6 +146,22 @@ def test_help_is_light() -> None:
     assert not HEAVY & loaded
 
 
+def test_commands_load_what_they_need() -> None:
+    """A sweep's plan and a stage's settings need no torch; SciPy's statistics are the evaluation's alone."""
+    assert "torch" not in loaded_by("import hypogoal.stages.sweep")
+    assert "scipy" not in loaded_by("import hypogoal.stages.train_ensemble, hypogoal.stages.train_meta")
+
+
+def test_optimisers_do_not_load_the_compiler() -> None:
+    """Torch's own, which loads it with the first of them, and ours, which is made, steps and goes on without."""
+    made = "import torch; w = torch.nn.Parameter(torch.zeros(3)); w.grad = w.data + 1; one = {}.Adam([w], fused=True)"
+    used = "\none.step(); one.zero_grad(); one.load_state_dict(one.state_dict())"
+    told = "\nif 'torch._dynamo' in sys.modules: sys.modules['compiler'] = sys"
+    assert "compiler" in loaded_by(made.format("torch.optim") + told)
+    ours = made.format("optimisers") + used + told
+    assert "compiler" not in loaded_by(f"from hypogoal.core import optimisers; {ours}")
+
+
 def unsafe(source: str) -> Iterator[str]:
     """Spec G2: what in this source could load or save a pickle."""
     modules = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}

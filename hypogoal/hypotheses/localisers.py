@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hypogoal.core.optimisers import Adam
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.hypotheses.batches import grey_maps
 from hypogoal.hypotheses.networks import folded
@@ -121,7 +122,7 @@ def fit_localiser(
         network = _heat_network(observations.shape[3])
         guesses = nn.Conv2d(FEATURES, 2 * n_actions, kernel_size=1)
     weights = [*network.parameters(), *guesses.parameters()]
-    optimiser = torch.optim.Adam(weights, LEARNING_RATE, weight_decay=L2_WEIGHT)
+    optimiser = Adam(weights, LEARNING_RATE, weight_decay=L2_WEIGHT)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, steps)
     rng = rng_for(seed, "states")
     for _ in range(steps):

@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from hypogoal.core.checkpoints import Checkpoints, State, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.optimisers import Adam
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.diversity import Context, load_objective
 from hypogoal.hypotheses.batches import TrainingStates
@@ -189,7 +190,7 @@ class _Round:
         self.frozen = states.unlabelled_logits(networks[: members[0]] if self.objective else [])
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
-        self.optimiser = torch.optim.Adam(
+        self.optimiser = Adam(
             [weight for network in self.networks for weight in network.parameters()],
             lr=config.learning_rate,
             weight_decay=config.l2_weight,

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from hypogoal.core.checkpoints import State
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
+from hypogoal.core.optimisers import Adam
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
@@ -50,7 +51,7 @@ class MetaPolicy(Chooser):
             self.head = HEADS[config.head](options).to(self.device)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head})
         self._flat = FlatParameters(self.policy)
-        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.meta_learning_rate, eps=1e-5, fused=True)
+        self.optimiser = Adam([self._flat.vector], lr=config.meta_learning_rate, eps=1e-5, fused=True)
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         self._open: Decisions = {}  # the last one of every environment

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
+from hypogoal.core.optimisers import Adam
 from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
@@ -93,7 +94,7 @@ class Initiation(Resumable):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "initiation-weights"))
             self.network = LightQNetwork(engine.observation_shape, options, actions=1).to(self.device)
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=LEARNING_RATE, fused=True)
+        self.optimiser = Adam(self.network.parameters(), lr=LEARNING_RATE, fused=True)
         self.states, self.option = np.zeros((2, KEPT), dtype=np.int64)
         self.reached = np.zeros(KEPT, dtype=np.bool_)
         self.executions = np.zeros(options, dtype=np.int64)

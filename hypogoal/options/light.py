@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.optimisers import Adam
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
 from hypogoal.domains.base import Engine
@@ -70,7 +71,7 @@ class LightLearner(Learner):
         pictures = isinstance(self.online.cells, PictureEmbedding)
         self.pixels = Pixels(engine, 2 * config.option_batch, self.device) if pictures else None
         self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
-        self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
+        self.optimiser = Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
         self.positive: dict[str, NDArray[Any]] = {
             name: np.zeros((self.options, POSITIVES_KEPT), kind) for name, kind in FIELDS.items()

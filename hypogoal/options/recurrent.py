@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.optimisers import Adam
 from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
@@ -46,7 +47,7 @@ class Member(Resumable):
             torch.manual_seed(seed_for(seed, "option-weights", option))
             self.online = PaperQNetwork(engine.observation_shape, actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
-        self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
+        self.optimiser = Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
         self.updates = self.due = self.executions = 0
 
