@@ -15,7 +15,6 @@ from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
-from hypogoal.meta.training import frames_kept
 from hypogoal.options.recording import STOPS_KEPT
 
 BASE = 450e6
@@ -65,6 +64,8 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
         about: the ensemble manifest's configuration.
         config: how options are learned.
     """
+    from hypogoal.meta.training import frames_kept  # with torch, which nobody else here needs
+
     oracle = config.termination == "oracle"
     options = len(about["sub_goals"]) * (1 if oracle else about["members"])
     picture = prod(domain.observation_shape)

@@ -146,6 +146,12 @@ def test_help_is_light() -> None:
     assert not HEAVY & loaded
 
 
+def test_commands_load_what_they_need() -> None:
+    """A sweep's plan and a stage's settings need no torch; SciPy's statistics are the evaluation's alone."""
+    assert "torch" not in loaded_by("import hypogoal.stages.sweep")
+    assert "scipy" not in loaded_by("import hypogoal.stages.train_ensemble, hypogoal.stages.train_meta")
+
+
 def unsafe(source: str) -> Iterator[str]:
     """Spec G2: what in this source could load or save a pickle."""
     modules = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 Scores = dict[str, NDArray[np.float64]]
 
@@ -58,8 +57,9 @@ def ranking(probabilities: NDArray[np.float32], labels: NDArray[np.bool_]) -> ND
     pairs = positives * (len(labels) - positives)
     if not pairs:
         return np.full(probabilities.shape[1], np.nan)
-    ranks: NDArray[np.float64] = rankdata(probabilities, axis=0)[labels].sum(axis=0)
-    return (ranks - positives * (positives + 1) / 2) / pairs
+    counted = zip(probabilities[labels].T, np.sort(probabilities[~labels], axis=0).T, strict=True)
+    wins = [sum(np.searchsorted(no, yes, side).sum() for side in ("left", "right")) for yes, no in counted]
+    return np.array(wins) / (2 * pairs)
 
 
 def best_threshold(

@@ -87,16 +87,22 @@ def test_results_are_a_row_for_each_number_of_each_cell(swept: Path) -> None:
     assert str(swept) not in "\n".join(lines)
 
 
-def test_finished_cells_are_never_run_again_and_new_ones_are_added(swept: Path, tmp_path: Path) -> None:
-    """Spec G4: started again nothing runs; with one more seed only that seed does; another sweep is refused."""
-    out = tmp_path / "out"
+@pytest.fixture(scope="module")
+def extended(swept: Path) -> tuple[list[str], dict[str, int]]:
+    """The same sweep begun with one seed, started again, then given the other: its command, each cell's attempts."""
+    out = swept / "extended"
     arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
-    assert main([*arguments, "--seeds", "0"]) == 0
-    assert main([*arguments, "--seeds", "0"]) == 0
-    assert main([*arguments, "--seeds", "0-1"]) == 0
-    attempts = {cell.name: read_record(out, cell).attempts for cell in read_plan(out)[0].cells}
-    assert attempts == {"data": 1, "ensemble-seed-0": 1, "ensemble-seed-1": 1}
-    assert (out / "results.csv").read_bytes() == (swept / "whole" / "results.csv").read_bytes()
+    for seeds in ("0", "0", "0-1"):
+        assert main([*arguments, "--seeds", seeds]) == 0
+    return arguments, {cell.name: read_record(out, cell).attempts for cell in read_plan(out)[0].cells}
+
+
+def test_finished_cells_are_never_run_again_and_new_ones_are_added(
+    swept: Path, extended: tuple[list[str], dict[str, int]]
+) -> None:
+    """Spec G4: started again nothing runs; with one more seed only that seed does; another sweep is refused."""
+    assert extended[1] == {"data": 1, "ensemble-seed-0": 1, "ensemble-seed-1": 1}
+    assert (swept / "extended/results.csv").read_bytes() == (swept / "whole/results.csv").read_bytes()
 
 
 def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -243,12 +249,11 @@ def test_a_failed_cell_stops_only_those_that_need_it(tmp_path: Path, capsys: pyt
 
 
 def test_what_was_changed_by_hand_is_not_replaced(
-    swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    swept: Path, extended: tuple[list[str], dict[str, int]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Spec G2, G4: manifests are verified; a damaged output is told, and stays until the user moves it."""
-    out = tmp_path / "out"
-    arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "--seeds", "0", "-q"]
-    assert main(arguments) == 0
+    out, arguments = swept / "extended", extended[0]
+    capsys.readouterr()
     before = (out / "results.csv").read_bytes()
     log = out / "ensemble/seed-0/metrics.jsonl"
     log.write_text(log.read_text() + "\n")

@@ -222,9 +222,12 @@ def test_the_light_learner_learns_both_options(experience: str) -> None:
 
 
 def test_the_paper_learner_learns_both_options() -> None:
-    """Spec D2, D3: independent conv-GRU networks, own experience, prioritised replay, full target copies."""
+    """Spec D2, D3: independent conv-GRU networks, own experience, prioritised replay, full target copies.
+
+    Of four seeds three learn it in 800 steps on one processor, another three on another; all four in 1,600.
+    """
     learner = run_corridor(
-        RecurrentLearner, 800, experience="own", network="paper", option_batch=16, option_gamma=0.9,
+        RecurrentLearner, 1600, experience="own", network="paper", option_batch=16, option_gamma=0.9,
         target_tau=1.0, target_interval=5, option_learning_rate=1e-3,
     )  # fmt: skip
     assert greedy(learner) == [[2, 1, 0], [2, 3, 4, 5]]
