@@ -239,8 +239,10 @@ def _curve(
     grid = np.linspace(0, end, POINTS).round().astype(np.int64)
     lines = []
     for index, (run, agent, called) in enumerate(drawn):
-        place = [other["name"] for other in runs[run]["agents"]].index(agent)
+        agents = runs[run]["agents"]
+        place = [other["name"] for other in agents].index(agent)
         values = on_grid(arrays[run][f"curves/{place}/{quantity}"], arrays[run]["curves/grid"], grid)
+        values = curves.values_of(agents[place], values)
         lines.append(curves.Line(called, values, PALETTE[index], dashed=index % 2 == 1))
     about, axis = QUANTITIES[quantity]
     bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
@@ -250,7 +252,7 @@ def _curve(
     )
     caption = (
         f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and seeds; "
-        f"bands: ± one standard error over them ({counts}).{more}"
+        f"{curves.BANDS} over them ({counts}).{more}"
     )
     title = f"{about}: {name}"
     return Drawn(identity, title, curves.learning_curves(grid, lines, axis, (), bounds), caption, heading=title)
@@ -286,7 +288,7 @@ def _pairs(about: Mapping[str, Any]) -> Block:
     digits = {"length": 0, "success": 2, "discounted_return": 2, "distance, best member": 1}
     rows = about["comparisons"]
     blocks = page.comparison_tables(
-        rows, "seed, and layout, sub-goal or ladder", "layouts, or seeds of ensembles,", digits
+        rows, "seed, and layout, sub-goal or ladder", "layouts, or seeds of ensembles or of one layout,", digits
     )
     text = (
         f"{first} against each other run, over what both have with the same seed."
@@ -303,8 +305,9 @@ PARTS: Mapping[str, Part] = {
         ("name",),
         [curves.AGENT],
         curves.HEADLINE,
-        "Over the last 100 training episodes of each run of an agent: mean ± standard error. 95 % at: median number of "
-        "environment steps at which 95 of the last 100 episodes succeeded, or how many runs got there.",
+        "Over the last 100 training episodes of each run of an agent: mean ± standard error over layouts, or over "
+        "runs of one layout. 95 % at: median number of environment steps at which 95 of the last 100 episodes "
+        "succeeded, or how many runs got there.",
         "name",
         itemgetter("agents"),
         curves.against,

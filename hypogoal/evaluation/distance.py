@@ -490,8 +490,8 @@ def distance_section(material: Material) -> Block:
             INTERVALS,
             _ordered(rows),
             tight=True,
-            folded="Interquartile means of the distance with intervals",
-            caption="Interquartile mean over seeds with its 95 % bootstrap interval; no interval with one seed.",
+            folded="Distance with intervals",
+            caption=page.INTERVALS.format(units="seeds"),
         ),
         *page.comparison_tables(
             material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}

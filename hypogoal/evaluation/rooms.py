@@ -446,9 +446,8 @@ def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
         INTERVALS,
         rows,
         tight=True,
-        folded="Interquartile means of balanced accuracy with intervals",
-        caption="Interquartile mean over ensemble seeds with its 95 % bootstrap interval (2,000 resamples of seeds); "
-        "no interval with one seed.",
+        folded="Balanced accuracy with intervals",
+        caption=page.INTERVALS.format(units="ensemble seeds"),
     )
     differences = page.table(
         DIFFERENCES,

@@ -133,7 +133,7 @@ def test_the_table_over_seeds():
     assert (found["mean"], found["n"], rows[0]["ensembles"]) == (pytest.approx(0.7), 2, 3)
     assert found["standard_deviation"] == pytest.approx(np.sqrt(2) * 0.1)
     assert found["standard_error"] == pytest.approx(0.1)
-    assert 0.6 - 1e-9 <= found["interval"][0] <= found["interval"][1] <= 0.8 + 1e-9
+    assert found["interval"] == pytest.approx([0.7 - 12.706 * 0.1, 0.7 + 12.706 * 0.1], abs=1e-3)
     assert rows[0]["scores"]["all"]["accuracy"]["validated"]["mean"] == pytest.approx(0.5)
     assert rows[0]["always_no"] == {"unseen": 0.75, "all": 0.75}
     assert rows[0]["tied"] == pytest.approx(4 / 3)
