@@ -287,11 +287,7 @@ def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def against(agents: Sequence[Entry]) -> Rows:
-    """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts.
-
-    Args:
-        agents: what :func:`agent_metrics` returns, in the report's order.
-    """
+    """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts."""
     runs = [(agent["name"], (run["layout_seed"], run["seed"]), run) for agent in agents for run in agent["runs"]]
     rows: Rows = []
     for quantity, higher in HIGHER.items():
@@ -412,12 +408,12 @@ def _answers(material: Material) -> list[str]:
 def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
     success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
     if success is None:
-        return f"No episode of {name} came to its end ({_runs(agent)}): it needs more steps."
+        return f"No episode of {name} came to its end ({runs_of(agent)}): it needs more steps."
     against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
     return (
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
         f"{_episodes(agent, window)}, which took {page.fixed(agent['length']['mean'], 0)} steps{against} "
-        f"({_runs(agent)})."
+        f"({runs_of(agent)})."
     )
 
 
@@ -438,7 +434,8 @@ def _episodes(agent: Mapping[str, Any], window: int) -> str:
     return f"{count} training episode{'s' if most > 1 else ''}"
 
 
-def _runs(agent: Mapping[str, Any]) -> str:
+def runs_of(agent: Entry) -> str:
+    """How many runs an agent has, and of which layouts and seeds."""
     runs = agent["runs"]
     layouts, seeds = (sorted({run[key] for run in runs}) for key in ("layout_seed", "seed"))
     return (
@@ -528,7 +525,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
     reference = f" Dotted: mean over layouts of {dotted}." if references else ""
     caption = (
         f"{which_figure}: {title.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
-        f"{BANDS} over runs. {agents[0]['name']}: {_runs(agents[0])}; "
+        f"{BANDS} over runs. {agents[0]['name']}: {runs_of(agents[0])}; "
         f"the other agents: {_others(agents)}.{reference}"
     )
     return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
@@ -554,11 +551,7 @@ class Line:
 
 
 def reward_bounds(lines: Sequence[Line]) -> Bounds:
-    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values.
-
-    Args:
-        lines: those that are drawn.
-    """
+    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values."""
     values = np.concatenate([np.zeros(0), *(line.values.ravel() for line in lines)])
     return (None, None) if ((values < 0) | (values > 1)).any() else SHARES
 

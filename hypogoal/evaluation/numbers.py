@@ -183,8 +183,8 @@ def rows_of(numbers: Mapping[str, Any], **place: Any) -> Iterable[Row]:
             yield Row(name, value, **place)
 
 
-def rows_of_options(members: Iterable[Mapping[str, Any]], **place: Any) -> Iterable[Row]:
-    """A row for each number of each member's option, all of one place."""
+def rows_of_members(members: Iterable[Mapping[str, Any]], **place: Any) -> Iterable[Row]:
+    """A row for each number of each member, or of its option, all of one place."""
     for member in members:
         numbers = {name: value for name, value in member.items() if name not in ("member", "option")}
         yield from rows_of(numbers, **place, member=member["member"])
@@ -356,26 +356,23 @@ def pairs(
 
 
 def pairs_by_groups(
-    entries: Iterable[Mapping[str, Any]],
+    entries: Sequence[Mapping[str, Any]],
     measured: Callable[[Any], Iterable[tuple[tuple[Hashable, ...], Mapping[str, float]]]],
     quantity: str,
     *,
-    ranked: bool,
     higher: bool = True,
 ) -> Rows:
-    """Methods against each other at each N, by their best, their validated and their mean member.
+    """The first method against each other at each N, by their best, their validated and their mean member.
 
     Args:
         entries: with ``method`` and ``groups``.
         measured: of an entry what is alike and the numbers by member, see :func:`pairs`.
         quantity, higher: what the numbers are, and whether the higher is the better one.
-        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
     """
-    ordered = sorted(entries, key=lambda entry: method_rank(entry["method"]) if ranked else 0)
     rows: Rows = []
-    for groups in by_groups(ordered):
+    for groups in by_groups(entries):
         here = [
-            (entry["method"], key, of) for entry in ordered if entry["groups"] == groups for key, of in measured(entry)
+            (entry["method"], key, of) for entry in entries if entry["groups"] == groups for key, of in measured(entry)
         ]
         for which in PICKED:
             values = [(method, key, of[which]) for method, key, of in here]
@@ -432,11 +429,8 @@ def compare_pairs(
 def name_apart(bases: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """A name for each of n things: its base name, and where settings differ within that, those settings.
 
-    What more than half of the things of one base name have in common goes unsaid.
-
-    Args:
-        bases: n names.
-        configs: n resolved settings; ``domain_config`` inside is looked into.
+    What more than half of the things of one base name have in common goes unsaid; ``domain_config`` inside the
+    settings is looked into.
     """
     flat = [{**(config.get("domain_config") or {}), **config, "domain_config": None} for config in configs]
     names = []
@@ -505,6 +499,11 @@ def method_rank(method: str) -> int:
     """The order of methods in tables and figures: the paper's method, its control, the single CNN, anything else."""
     starts = ("dbat", "divdis", "no diversity", "single CNN")
     return next((rank for rank, start in enumerate(starts) if method.startswith(start)), len(starts))
+
+
+def ranked(entries: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The entries in the order of their methods, so that others are compared with D-BAT where there is one."""
+    return sorted(entries, key=lambda entry: method_rank(entry.get("method") or entry["name"]))
 
 
 def by_groups(entries: Iterable[Mapping[str, Any]]) -> list[int | None]:

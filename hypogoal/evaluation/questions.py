@@ -55,12 +55,7 @@ def summary_table(metrics: Metrics) -> Table | Group:
 
 
 def render(material: Material, version: str) -> str:
-    """Spec F7: the page of a run, self-contained; ``material.figures`` is filled on the way.
-
-    Args:
-        material: the evaluation's numbers and arrays.
-        version: hypogoal's.
-    """
+    """Spec F7: the page of a run, self-contained; ``material.figures`` is filled on the way."""
     metrics = material.metrics
     count = len(metrics["provenance"]["artefacts"])
     evaluated = f"{count} artefact{'' if count == 1 else 's'} evaluated"
@@ -70,11 +65,7 @@ def render(material: Material, version: str) -> str:
 
 
 def paper_figures(material: Material) -> tuple[list[Drawn], list[str]]:
-    """Figures 2 to 9 and those beside them that the run has artefacts for; a line for each of 2 to 9 that it has not.
-
-    Args:
-        material: the evaluation's numbers and arrays.
-    """
+    """Figures 2 to 9 and those beside them that the run has artefacts for; a line for each of 2 to 9 that it lacks."""
     figures: Iterator[Drawn] = (figure for question in QUESTIONS for figure in question.figures(material))
     drawn = sorted((figure for figure in figures if figure.figure is not None), key=lambda figure: figure.stem)
     needed = {name: what for question in QUESTIONS for name, what in question.needed.items()}

@@ -27,7 +27,7 @@ from hypogoal.evaluation.curves import (
     variants,
     which,
 )
-from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of_options
+from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, drawing, grid_of_pictures, show_picture, style_of
@@ -252,7 +252,7 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
         for run in agent["runs"]:
             about = {"method": agent["name"], "layout": run["layout_seed"], "seed": run["seed"], "scope": SCOPE}
             for goal in run["sub_goals"]:
-                yield from rows_of_options(goal["members"], **about, sub_goal=goal["sub_goal"], artefact=run["path"])
+                yield from rows_of_members(goal["members"], **about, sub_goal=goal["sub_goal"], artefact=run["path"])
 
 
 def missing(work: Work) -> list[str]:

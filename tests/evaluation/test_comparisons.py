@@ -82,14 +82,13 @@ def ensemble(name, seed, **best):
 
 def test_ensembles_are_paired_by_seed_and_sub_goal():
     """Spec F1: D-BAT first, whatever comes first on disk; over all sub-goals and for each."""
-    rows = hypotheses.against(
-        [
-            ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
-            ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
-            ensemble("dbat, K=2", 0, red=0.8, door=0.8),
-            ensemble("dbat, K=2", 1, red=0.9, door=1.0),
-        ]
-    )
+    ensembles = [
+        ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
+        ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
+        ensemble("dbat, K=2", 0, red=0.8, door=0.8),
+        ensemble("dbat, K=2", 1, red=0.9, door=1.0),
+    ]
+    rows = hypotheses.QUESTION.pairs({"ensembles": ensembles})["hypotheses"]
     best = {row["where"]: row for row in rows if "best" in row["quantity"]}
     assert list(best) == [ALL, "door", "red"] or list(best) == [ALL, "red", "door"]
     assert best[ALL]["first"] == "dbat, K=2"
@@ -107,7 +106,8 @@ def judged(method, groups, seed, best):
 def test_methods_on_ladders_are_paired_at_each_number_of_groups():
     """Spec F1: N=1 with N=1; where nothing could be validated there is no pair."""
     bests = {"none": 0.5, "dbat": 0.6}
-    rows = rooms.against([judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)])
+    ensembles = [judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)]
+    rows = rooms.QUESTION.pairs({"ensembles": ensembles})["rooms"]
     found = {(row["where"], row["quantity"].split(", ")[1]): row for row in rows}
     assert found["N=2", "best member"]["difference"] == pytest.approx(0.1)
     assert found["N=1", "best member"]["n"] == 1
@@ -122,12 +122,13 @@ def stopped(method, ladder, seed, distance):
 
 def test_options_are_paired_by_ladder_and_seed():
     """Spec F3: the nearer is the better; oracle terminations are not a method."""
-    rows = distance.against(
+    options = (
         [
             stopped("none", "1L", 0, 40), stopped("none", "1R", 0, 10), stopped("dbat", "1L", 0, 10),
             stopped("dbat", "1R", 0, 20), stopped("oracle termination", "1L", 0, 0),
         ]
     )  # fmt: skip
+    rows = distance.QUESTION.pairs({"distance": {"options": options}})["distance"]
     row, _, mean = rows
     assert (row["first"], row["second"], row["wins"], row["n"], row["where"]) == ("dbat", "none", 1, 2, "N=2")
     assert (row["units"], row["difference"]) == (1, -10)
