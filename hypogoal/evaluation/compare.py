@@ -274,7 +274,7 @@ def _pairs(about: Mapping[str, Any]) -> Block:
     digits = {"length": 0, "success": 2, "discounted_return": 2, "distance, best member": 1}
     rows = about["comparisons"]
     blocks = page.comparison_tables(
-        rows, "seed, and layout, sub-goal or ladder", "layouts, or seeds of ensembles or of one layout,", digits
+        rows, "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)", digits
     )
     text = (
         f"{first} against each other run, over what both have with the same seed."

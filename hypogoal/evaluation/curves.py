@@ -56,7 +56,7 @@ UNITS = {
     "length_over_shortest": "ratio to the layout's shortest path",
     "discounted_return": "reward discounted by 0.99 per step",
 }
-LAYOUTS_OR_RUNS = "layouts, or runs of one layout,"  # what numbers and curves are over, see ``numbers.by_layout``
+LAYOUTS_OR_RUNS = "layouts (or runs of one layout)"  # what numbers and curves are over, see ``numbers.by_layout``
 BANDS = (
     "runs of one of several layouts count once, by their mean. Thin lines: each of fewer than 8; else bands: ± one "
     "standard error"

@@ -45,8 +45,8 @@ CAPTION = (
     "independent. Difference: mean of first − second, with its 95 % interval (Student's t)."
 )
 INTERVALS = (
-    "With its 95 % interval: of 2 to 7 {units} the mean with Student's t, of more the interquartile mean with a "
-    "bootstrap (2,000 resamples); of one there is no interval."
+    "95 % intervals: of 2 to 7 {units} the mean and Student's t; of more the interquartile mean and a bootstrap (2,000 "
+    "resamples); of one there is none."
 )
 
 

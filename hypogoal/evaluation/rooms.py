@@ -71,20 +71,20 @@ BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at
 
 
 def room_metrics(
+    probabilities: NDArray[np.float32],
     verdicts: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
     kinds: Sequence[str] = (),
-    probabilities: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
     """Spec F1: one ensemble's members by whether training saw the room.
 
     Args:
-        verdicts: bool (N, K) on held-out states.
-        labels: bool (N,), theirs.
+        probabilities: float (N, K), that held-out states are reached.
+        verdicts: bool (N, K), what was made of them.
+        labels: bool (N,), the truth.
         origins: int (N,) each: ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``.
         kinds: names of the values of ``kind``.
-        probabilities: float (N, K), what the verdicts were made of; without them there is no ``ranking``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
@@ -97,16 +97,13 @@ def room_metrics(
     for name, values in SCOPES.items():
         inside = np.isin(seen, values)
         scores = member_scores(verdicts[inside], labels[inside])
-        if probabilities is not None:
-            scores["ranking"] = ranking(probabilities[inside], labels[inside])
+        scores["ranking"] = ranking(probabilities[inside], labels[inside])
         scopes[name] = {
             "states": int(inside.sum()),
             "positives": int(labels[inside].sum()),
             "rooms": [] if rooms is None else np.unique(rooms[inside]).tolist(),
             "members": [{"member": member, **row} for member, row in enumerate(by_member(scores))],
-            "scores": {
-                score: with_validated(scores[score], validated["member"]) for score in SCORED if score in scores
-            },
+            "scores": {score: with_validated(scores[score], validated["member"]) for score in SCORED},
         }
     return {
         "scopes": scopes,
@@ -197,7 +194,6 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     for key, judged in sorted(grouped(of_rooms(ensembles), cell_of).items(), key=lambda item: by_method(item[0])):
         cell, goals = " ".join(map(str, key)), [goal for _, goal in judged]
         scopes = [goal["rooms"]["scopes"] for goal in goals]
-        scored = [score for score in SCORED if all(score in each["unseen"]["scores"] for each in scopes)]
         entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
         entry["ensembles"] = len(goals)
         counts = {scope: (scopes[0][scope]["positives"], scopes[0][scope]["states"]) for scope in TABLED}
@@ -208,7 +204,7 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
         entry["scores"] = {
             scope: {
                 score: _by_which([each[scope]["scores"][score] for each in scopes], score, cell, score, scope)
-                for score in scored
+                for score in SCORED
             }
             for scope in TABLED
         }
@@ -229,9 +225,8 @@ def look(work: Work, judgement: Judgement) -> None:
     """Members room by room, where held-out states say which rooms training saw."""
     split, judged = judgement.split, judgement.judged
     if "seen" in split.origins:
-        judgement.row["rooms"] = room_metrics(
-            judged.verdicts, split.labels, split.origins, judgement.kinds, judged.probabilities
-        )
+        states = (split.labels, split.origins, judgement.kinds)
+        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, *states)
 
 
 def missing(work: Work) -> list[str]:

@@ -49,7 +49,7 @@ def look(work: Work, judgement: Judgement) -> None:
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
     labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
-    examples = pick_examples(probabilities, labels, verdicts=verdicts)
+    examples = pick_examples(probabilities, verdicts, labels)
     explained = pick_to_explain(probabilities, verdicts, labels)
     for name, picked in (("examples", examples), ("saliency", explained)):
         picked = [(int(among[index]), kind) for index, kind in picked]
@@ -69,26 +69,20 @@ def look(work: Work, judgement: Judgement) -> None:
 
 
 def pick_examples(
-    probabilities: NDArray[np.float32],
-    labels: NDArray[np.bool_],
-    per_kind: int = 2,
-    threshold: float = 0.5,
-    verdicts: NDArray[np.bool_] | None = None,
+    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], per_kind: int = 2
 ) -> list[tuple[int, str]]:
     """States on which members disagree, all err, or all are right, so that a reader sees each.
 
     Args:
         probabilities: float (N, K), every member's P(sub-goal reached).
+        verdicts: bool (N, K), what members say.
         labels: bool (N,).
         per_kind: states of each kind at most.
-        threshold: above which a member says yes.
-        verdicts: bool (N, K), what members say, where not all have that threshold.
 
     Returns:
         (index, kind) with kind ``disagree`` (the widest spread of probabilities first, true and false states in
         turn), ``wrong`` (the most sure errors first), ``right yes`` and ``right no``; fewer where there are none.
     """
-    verdicts = probabilities > threshold if verdicts is None else verdicts
     correct = verdicts == labels[:, None]
     spread = probabilities.max(1) - probabilities.min(1)
     error = np.abs(probabilities - labels[:, None]).min(1)
