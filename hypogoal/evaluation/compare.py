@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -135,11 +134,7 @@ def _settings(metrics: Metrics) -> Iterator[tuple[tuple[str, str], str]]:
 def compare_runs(runs: Runs) -> Rows:
     """Spec F5: the first run against each other, agent by agent and method by method, over what they share.
 
-    Args:
-        runs: numbers by label, the first being the one that the others are compared with.
-
-    Returns:
-        Rows of ``numbers.pairs``, with the agent or the method in ``where``.
+    Rows are those of ``numbers.pairs``, with the agent or the method in ``where``.
     """
     rows: Rows = []
     for part in PARTS.values():
@@ -167,11 +162,8 @@ def on_grid(values: NDArray[np.float64], steps: NDArray[np.int64], grid: NDArray
 def compared_sections(runs: Runs, arrays: Curves, about: Mapping[str, Any], material: Material) -> list[Block]:
     """The page's sections; of results only those that every run has.
 
-    Args:
-        runs: in the order given; the first is the one that the others are compared with.
-        arrays: of their learning curves.
-        about: the comparison's own numbers: ``runs``, ``shared``, ``differences``, ``comparisons``.
-        material: figures are added to it.
+    ``about`` holds the comparison's own numbers: ``runs``, ``shared``, ``differences``, ``comparisons``; figures are
+    added to the material.
     """
     results = [_result(name, part, runs, arrays, material) for name, part in PARTS.items() if name in about["shared"]]
     return [_runs(about), _differences(about), *results, _pairs(about)]
@@ -239,28 +231,25 @@ def _curve(
     grid = np.linspace(0, end, POINTS).round().astype(np.int64)
     lines = []
     for index, (run, agent, called) in enumerate(drawn):
-        place = [other["name"] for other in runs[run]["agents"]].index(agent)
+        agents = runs[run]["agents"]
+        place = [other["name"] for other in agents].index(agent)
         values = on_grid(arrays[run][f"curves/{place}/{quantity}"], arrays[run]["curves/grid"], grid)
+        values = curves.values_of(agents[place], values)
         lines.append(curves.Line(called, values, PALETTE[index], dashed=index % 2 == 1))
     about, axis = QUANTITIES[quantity]
     bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
-    counts = "; ".join(f"{run}, {_count(runs[run], agent)}" for run, agent, _ in drawn)
+    counts = "; ".join(
+        f"{run}, {curves.runs_of(page.pick(runs[run]['agents'], 'name', agent))}" for run, agent, _ in drawn
+    )
     more = (
         f" Not drawn: {page.listed([called for _, _, called in wanted[MOST_LINES:]])}." if wanted[MOST_LINES:] else ""
     )
     caption = (
         f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and seeds; "
-        f"bands: ± one standard error over them ({counts}).{more}"
+        f"{curves.BANDS} over them ({counts}).{more}"
     )
     title = f"{about}: {name}"
     return Drawn(identity, title, curves.learning_curves(grid, lines, axis, (), bounds), caption, heading=title)
-
-
-def _count(metrics: Mapping[str, Any], agent: str) -> str:
-    agent_runs = page.pick(metrics["agents"], "name", agent)["runs"]
-    layouts, seeds = (sorted({run[key] for run in agent_runs}) for key in ("layout_seed", "seed"))
-    count = f"{len(agent_runs)} run{'s' if len(agent_runs) > 1 else ''}"
-    return f"{count}: layout seeds {page.listed(layouts)}, run seeds {page.listed(seeds)}"
 
 
 def _panels(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
@@ -270,14 +259,13 @@ def _panels(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
         if all(row["groups"] is None for row in rows) or len({row["sub_goal"] for row in rows}) > 1:
             continue
         panels = [
-            rooms.panel(rows, f"{which} member, unseen rooms", "unseen", "balanced_accuracy", which)
-            for which in ("best", "validated")
+            (f"{which} member, unseen rooms", "unseen", "balanced_accuracy", which) for which in ("best", "validated")
         ]
         caption = (
             f"{name}: balanced accuracy on rooms that training never saw, against labelled ladder groups. Lines: mean "
             f"over ensemble seeds; {rooms.bands(rows)}: ± one standard deviation over seeds. Dotted: chance."
         )
-        title, drawn = f"Scores on unseen rooms: {name}", rooms.scores_over_groups(panels, list(runs))
+        title, drawn = f"Scores on unseen rooms: {name}", rooms.scores_over_groups(rows, panels, list(runs))
         yield Drawn(f"rooms-{index}", title, drawn, caption, heading=title)
 
 
@@ -286,7 +274,7 @@ def _pairs(about: Mapping[str, Any]) -> Block:
     digits = {"length": 0, "success": 2, "discounted_return": 2, "distance, best member": 1}
     rows = about["comparisons"]
     blocks = page.comparison_tables(
-        rows, "seed, and layout, sub-goal or ladder", "layouts, or seeds of ensembles,", digits
+        rows, "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)", digits
     )
     text = (
         f"{first} against each other run, over what both have with the same seed."
@@ -303,8 +291,9 @@ PARTS: Mapping[str, Part] = {
         ("name",),
         [curves.AGENT],
         curves.HEADLINE,
-        "Over the last 100 training episodes of each run of an agent: mean ± standard error. 95 % at: median number of "
-        "environment steps at which 95 of the last 100 episodes succeeded, or how many runs got there.",
+        "Over the last 100 training episodes of each run of an agent: mean ± standard error over layouts, or over "
+        "runs of one layout. 95 % at: median number of environment steps at which 95 of the last 100 episodes "
+        "succeeded, or how many runs got there.",
         "name",
         itemgetter("agents"),
         curves.against,
@@ -320,7 +309,7 @@ PARTS: Mapping[str, Part] = {
         "which two members disagree; mean over ensemble seeds ± standard error.",
         "name",
         lambda metrics: [ensemble for ensemble in metrics["ensembles"] if not rooms.of_rooms([ensemble])],
-        partial(hypotheses.against, ranked=False),
+        hypotheses.against,
     ),
     "rooms": Part(
         "Hypotheses against labelled ladders",
@@ -332,7 +321,7 @@ PARTS: Mapping[str, Part] = {
         "best member on all rooms (the paper's Figure 3). Mean over ensemble seeds ± standard deviation.",
         "method",
         lambda metrics: [ensemble for ensemble in metrics["ensembles"] if rooms.of_rooms([ensemble])],
-        partial(rooms.against, ranked=False),
+        rooms.against,
         _panels,
         above=True,
     ),
@@ -352,6 +341,6 @@ PARTS: Mapping[str, Part] = {
         "executions that got to one. Mean over seeds ± standard deviation. Runs with other ladders are not alike.",
         "method",
         lambda metrics: metrics["distance"]["options"],
-        partial(distance.against, ranked=False),
+        distance.against,
     ),
 }

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import (
+    BOOTSTRAP_FROM,
     Metrics,
     Row,
     Rows,
+    by_layout,
     ensemble_name,
     grouped,
     mean_of,
@@ -54,6 +56,11 @@ UNITS = {
     "length_over_shortest": "ratio to the layout's shortest path",
     "discounted_return": "reward discounted by 0.99 per step",
 }
+LAYOUTS_OR_RUNS = "layouts (or runs of one layout)"  # what numbers and curves are over, see ``numbers.by_layout``
+BANDS = (
+    "runs of one of several layouts count once, by their mean. Thin lines: each of fewer than 8; else bands: ± one "
+    "standard error"
+)
 HIGHER = {"success": True, "length": False, "discounted_return": True}  # compared; the higher is better
 Bounds = tuple[float | None, float | None]
 SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
@@ -226,7 +233,7 @@ def agent_metrics(name: str, runs: Sequence[Run]) -> dict[str, Any]:
     layouts = [row["layout_seed"] for row in rows]
     metrics: dict[str, Any] = {"name": name, "kind": runs[0].kind, "runs": rows}
     for key, unit in UNITS.items():
-        metrics[key] = over([row[key] for row in rows], unit, name, key, strata=layouts)
+        metrics[key] = over([row[key] for row in rows], unit, name, key, layouts=layouts)
     reached = [np.inf if row["steps_to_95"] is None else float(row["steps_to_95"]) for row in rows]
     median = float(np.quantile(reached, 0.5, method="higher"))
     count, unit = int(np.isfinite(reached).sum()), "environment steps"
@@ -280,11 +287,7 @@ def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def against(agents: Sequence[Entry]) -> Rows:
-    """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts.
-
-    Args:
-        agents: what :func:`agent_metrics` returns, in the report's order.
-    """
+    """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts."""
     runs = [(agent["name"], (run["layout_seed"], run["seed"]), run) for agent in agents for run in agent["runs"]]
     rows: Rows = []
     for quantity, higher in HIGHER.items():
@@ -405,12 +408,12 @@ def _answers(material: Material) -> list[str]:
 def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
     success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
     if success is None:
-        return f"No episode of {name} came to its end ({_runs(agent)}): it needs more steps."
+        return f"No episode of {name} came to its end ({runs_of(agent)}): it needs more steps."
     against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
     return (
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
         f"{_episodes(agent, window)}, which took {page.fixed(agent['length']['mean'], 0)} steps{against} "
-        f"({_runs(agent)})."
+        f"({runs_of(agent)})."
     )
 
 
@@ -431,7 +434,8 @@ def _episodes(agent: Mapping[str, Any], window: int) -> str:
     return f"{count} training episode{'s' if most > 1 else ''}"
 
 
-def _runs(agent: Mapping[str, Any]) -> str:
+def runs_of(agent: Entry) -> str:
+    """How many runs an agent has, and of which layouts and seeds."""
     runs = agent["runs"]
     layouts, seeds = (sorted({run[key] for run in runs}) for key in ("layout_seed", "seed"))
     return (
@@ -445,10 +449,10 @@ def _headline(material: Material) -> Block:
         (AGENT, *HEADLINE),
         material.metrics["agents"],
         main=lambda agent: bool(agent["name"] == LEARNED),
-        caption="Over the last 100 training episodes of each run: mean over runs ± standard error. Steps: length of "
-        "an episode, failures counted at the cap; × shortest: against the layout's shortest path. Discounted return: "
-        "0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of the last 100 "
-        "episodes succeeded, or how many runs got there; steps of train-options count.",
+        caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
+        "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
+        "shortest path. Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, "
+        "at which 95 of the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
 
 
@@ -463,22 +467,16 @@ def curves_section(material: Material) -> Block:
         "beside it. Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive "
         "actions on the same observations and budget."
     )
-    drawn_over = sorted({agent["success"]["interval_over"] for agent in agents if agent["success"]["n"] > 1})
-    resamples = (
-        f"its 95 % bootstrap interval (2,000 resamples of {page.listed(drawn_over)})"
-        if drawn_over
-        else "no interval: one run each"
-    )
     digits = {"length": 0, "success": 2, "discounted_return": 2}
     blocks = [
         *drawn,
         page.table(
             INTERVALS,
             agents,
-            heading="Interquartile means",
-            caption=f"Interquartile mean over runs with {resamples}; over the last 100 episodes of each run.",
+            heading="Intervals",
+            caption=f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
         ),
-        *page.comparison_tables(material.comparisons("agents"), "layout and seed", "layouts", digits),
+        *page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits),
         page.table(
             EVERY_RUN,
             [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]],
@@ -508,7 +506,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
     others = cycle(look for look in OTHERS if look not in used)
     looks = [COLOURS.get(agent["name"]) or next(others) for agent in agents]
     lines = [
-        Line(agent["name"], arrays[f"curves/{index}/{quantity}"], *look)
+        Line(agent["name"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
         for index, (agent, look) in enumerate(zip(agents, looks, strict=True))
     ]
     bounds: Bounds
@@ -527,7 +525,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
     reference = f" Dotted: mean over layouts of {dotted}." if references else ""
     caption = (
         f"{which_figure}: {title.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
-        f"bands: ± one standard error over runs. {agents[0]['name']}: {_runs(agents[0])}; "
+        f"{BANDS} over runs. {agents[0]['name']}: {runs_of(agents[0])}; "
         f"the other agents: {_others(agents)}.{reference}"
     )
     return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
@@ -544,7 +542,7 @@ def _others(agents: Sequence[Mapping[str, Any]]) -> str:
 
 @dataclass(frozen=True)
 class Line:
-    """One agent's curve: values float (R, G), a row per run, NaN where it has no value."""
+    """One agent's curve: values float (R, G), a row per layout or run, NaN where it has no value."""
 
     name: str
     values: NDArray[np.float64]
@@ -553,11 +551,7 @@ class Line:
 
 
 def reward_bounds(lines: Sequence[Line]) -> Bounds:
-    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values.
-
-    Args:
-        lines: those that are drawn.
-    """
+    """The reward axis: the same for all tasks whose rewards are shares of episodes; else what fits the values."""
     values = np.concatenate([np.zeros(0), *(line.values.ravel() for line in lines)])
     return (None, None) if ((values < 0) | (values > 1)).any() else SHARES
 
@@ -569,7 +563,8 @@ def learning_curves(
     references: Sequence[tuple[str, float]] = (),
     bounds: Bounds = (0.0, None),
 ) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps; mean over runs, bands of one standard error.
+    """Figure 6: a quantity of episodes against environment steps; the mean, and of few layouts or runs each, of more a
+    band of one standard error.
 
     Args:
         grid: int (G,), environment steps.
@@ -590,18 +585,21 @@ def learning_curves(
     return figure
 
 
+def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """An agent's curves as they are averaged: of its runs (R, G) each layout's mean where there are several layouts."""
+    return by_layout(values, [run["layout_seed"] for run in agent["runs"]])[0]
+
+
 def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
-    runs = (~np.isnan(line.values)).sum(0)
-    total = np.nansum(line.values, axis=0)
-    shown = runs > 0
-    mean = np.where(shown, total / np.maximum(runs, 1), np.nan)
-    squares = np.nansum((line.values - mean) ** 2, axis=0)
-    error = np.sqrt(squares / np.maximum(runs - 1, 1) / np.maximum(runs, 1))
-    style = "--" if line.dashed else "-"
-    axes.plot(steps, mean, color=line.colour, linestyle=style, linewidth=1.6, label=line.name)
-    if len(line.values) > 1:
-        low, high = (mean - error)[shown], (mean + error)[shown]
-        axes.fill_between(steps[shown], low, high, color=line.colour, alpha=0.18, linewidth=0)
+    known = np.ma.masked_invalid(line.values)
+    mean = known.mean(0).filled(np.nan)
+    look: dict[str, Any] = {"color": line.colour, "linestyle": "--" if line.dashed else "-"}
+    axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
+    if len(known) >= BOOTSTRAP_FROM:
+        error = known.std(0, ddof=1) / np.sqrt(known.count(0))
+        axes.fill_between(steps, mean - error, mean + error, color=line.colour, alpha=0.18, linewidth=0)
+    elif len(known) > 1:
+        axes.plot(steps, line.values.T, linewidth=0.6, alpha=0.5, **look)
 
 
 def variants(entries: Iterable[Entry], name: str = LEARNED) -> list[Entry]:

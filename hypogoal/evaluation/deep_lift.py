@@ -54,33 +54,24 @@ def mean_state(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -> list[dict[str, Any]]:
-    """Spec F2: the check, state by state and member by member.
-
-    Args:
-        attributions: of n states.
-        picked: (index, kind) of each of them.
-    """
+    """Spec F2: the check, state by state and member by member, of n states ``picked`` as (index, kind)."""
     errors, sums = attributions.completeness_error(), attributions.values.sum(axis=(2, 3, 4))
     last = np.abs(attributions.values[..., -1]).sum(axis=(2, 3))
     everywhere = np.abs(attributions.values).sum(axis=(2, 3, 4))
     share = np.divide(last, everywhere, out=np.full_like(last, np.nan), where=everywhere > 0)
-    return [
-        {
-            "kind": kind,
-            "members": [
-                {
-                    "member": member,
-                    "log_odds": float(attributions.log_odds[state, member]),
-                    "baseline_log_odds": float(attributions.baseline_log_odds[member]),
-                    "attributed": float(sums[state, member]),
-                    "completeness_error": float(errors[state, member]),
-                    "last_frame": float(share[state, member]),
-                }
-                for member in range(attributions.values.shape[1])
-            ],
-        }
-        for state, (_, kind) in enumerate(picked)
+    every = range(attributions.values.shape[1])
+    columns = {
+        "log_odds": attributions.log_odds,
+        "baseline_log_odds": np.broadcast_to(attributions.baseline_log_odds, sums.shape),
+        "attributed": sums,
+        "completeness_error": errors,
+        "last_frame": share,
+    }
+    members = [
+        [{"member": member, **{name: float(of[state, member]) for name, of in columns.items()}} for member in every]
+        for state in range(len(picked))
     ]
+    return [{"kind": kind, "members": rows} for (_, kind), rows in zip(picked, members, strict=True)]
 
 
 def deep_lift(ensemble: Ensemble, observations: NDArray[np.uint8], baseline: NDArray[np.uint8]) -> Attributions:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -35,7 +33,8 @@ from hypogoal.evaluation.numbers import (
     name_apart,
     over,
     pairs_by_groups,
-    rows_of_options,
+    ranked,
+    rows_of_members,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
@@ -134,8 +133,8 @@ def ladder_numbers(
             for member, option in enumerate(range(index * members, (index + 1) * members))
         ]
         worst, best = most_and_least(np.array([option["distance"] for option in options]))
-        ranked = {"best": best, "worst": worst, "validated": validated.get(sub_goal)}
-        rows.append({"sub_goal": sub_goal, "options": options, **ranked})
+        picked = {"best": best, "worst": worst, "validated": validated.get(sub_goal)}
+        rows.append({"sub_goal": sub_goal, "options": options, **picked})
     return rows
 
 
@@ -200,13 +199,7 @@ def _over_seeds(rows: Sequence[Mapping[str, float]], *names: str) -> dict[str, A
 def ladder_names(
     methods: Sequence[str], groups: Sequence[int | None], configs: Sequence[Mapping[str, Any]]
 ) -> list[str]:
-    """Names of options by their ensemble's method; where their own settings differ at one N, those are added.
-
-    Args:
-        methods: n names.
-        groups: n numbers N.
-        configs: n resolved settings of ``train-options``.
-    """
+    """Names of n options artefacts by their ensemble's method; where their own settings differ at one N, with those."""
     names = list(methods)
     told = [{key: value for key, value in config.items() if key not in NOT_A_METHOD} for config in configs]
     for here in grouped(range(len(names)), lambda index: groups[index]).values():
@@ -291,10 +284,8 @@ def show_stops(
     """Figure 5's material: for each ladder and N the best members' stops of the first seed, and pictures of the rooms.
 
     Args:
-        rows: of ``distance.ladder_numbers``, with path, method, groups, ladder and seed.
-        ladders: in their order.
-        executions: by path.
-        domain: draws its rooms, where it can.
+        rows: of :func:`ladder_numbers`, with path (by which ``executions`` are), method, groups, ladder and seed.
+        ladders, executions, domain: what is drawn, and by whom.
         arrays: ``stops/<path>/<option>`` and ``pictures/<room>`` are written into it.
 
     Returns:
@@ -355,7 +346,7 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
     """Every member's option on every ladder."""
     for entry in metrics["distance"]["options"]:
         about = {"method": entry["method"], "N": entry["groups"], "ladder": entry["ladder"], "seed": entry["seed"]}
-        yield from rows_of_options(entry["options"], **about, sub_goal=entry["sub_goal"], artefact=entry["path"])
+        yield from rows_of_members(entry["options"], **about, sub_goal=entry["sub_goal"], artefact=entry["path"])
 
 
 def missing(work: Work) -> list[str]:
@@ -370,8 +361,8 @@ def missing(work: Work) -> list[str]:
     return lines if oracle else [*lines, "no options artefact with oracle terminations beside them"]
 
 
-def against(options: Sequence[Entry], *, ranked: bool = True) -> Rows:
-    """Spec F3: methods by how near their members' options stop, at each N, paired by ladder and seed; units are seeds.
+def against(options: Sequence[Entry]) -> Rows:
+    """Spec F3: the first method against each other by how near options stop, at each N, paired by ladder and seed.
 
     The best member is the best on the executions that are compared, of more members the better: beside it stand the
     one that validation on the labelled rooms chooses, and the mean over members.
@@ -379,14 +370,13 @@ def against(options: Sequence[Entry], *, ranked: bool = True) -> Rows:
     Args:
         options: rows of :func:`ladder_numbers` with path, method, groups, ladder and seed. Oracle terminations
             have no N and no members to choose among; they are left out.
-        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
     """
     learned = [row for row in options if not row["method"].startswith(ORACLE) and row["best"] is not None]
 
     def distances(row: Entry) -> list[tuple[tuple[str, str, int], dict[str, float]]]:
         return [((row["ladder"], row["sub_goal"], row["seed"]), _numbers(row))]
 
-    return pairs_by_groups(learned, distances, "distance", ranked=ranked, higher=False)
+    return pairs_by_groups(learned, distances, "distance", higher=False)
 
 
 def _group(entry: Entry) -> str:
@@ -490,8 +480,8 @@ def distance_section(material: Material) -> Block:
             INTERVALS,
             _ordered(rows),
             tight=True,
-            folded="Interquartile means of the distance with intervals",
-            caption="Interquartile mean over seeds with its 95 % bootstrap interval; no interval with one seed.",
+            folded="Distance with intervals",
+            caption=page.INTERVALS.format(units="seeds"),
         ),
         *page.comparison_tables(
             material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
@@ -539,8 +529,8 @@ def _bars(material: Material) -> Drawn:
     name_of, bars = page.method_of(found["options"]), []
     for entry in rows:
         mean, wide = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
-        bars.append(Bar(name_of(entry), _group(entry), mean, wide, _seed_means(found["options"], entry)))
-    names = list(dict.fromkeys(bar.name for bar in bars if not bar.name.startswith(ORACLE)))
+        bars.append((name_of(entry), _group(entry), mean, wide, _seed_means(found["options"], entry)))
+    names = list(dict.fromkeys(name for name, *_ in bars if not name.startswith(ORACLE)))
     drawn = distance_bars(bars, names, INSIDE) if bars else None
     seeds = sorted({row["seed"] for row in found["options"]})
     ladders = found["over_ladders"][0]["ladders"]
@@ -592,7 +582,7 @@ def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
     for column in figure["columns"]:
         place = f"stops/{column['path']}/{column['option']}"
         positions, ends = material.arrays[f"{place}/positions"], material.arrays[f"{place}/fates"]
-        columns.append(Stops(column["method"], positions[:, 0], material.arrays[f"{place}/pixels"], ends))
+        columns.append((column["method"], positions[:, 0], material.arrays[f"{place}/pixels"], ends))
         elsewhere = int((~np.isin(positions[:, 0], figure["rooms"])).sum())
         hits, inside = int((ends == HIT).sum()), int((ends == BEGAN_INSIDE).sum())
         more = f", {inside} began inside" if inside else ""
@@ -613,40 +603,32 @@ def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
     )
 
 
-@dataclass(frozen=True)
-class Bar:
-    """One bar of Figure 4: mean and standard deviation over seeds (NaN for one), and the seeds' own values."""
-
-    name: str
-    group: str
-    mean: float
-    deviation: float
-    seeds: Sequence[float]
-
-
-def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> Figure:
+def distance_bars(
+    bars: Sequence[tuple[str, str, float, float, Sequence[float]]], names: Sequence[str], inside: float
+) -> Figure:
     """Figure 4: the best member's distance; lower is better.
 
     Args:
-        bars: their groups are put side by side in the order in which they come.
+        bars: method, group, mean, standard deviation (NaN for one seed) and the seeds' own values; groups are put side
+            by side in the order in which they come.
         names: all methods, in the order of their colours; any other name is drawn grey.
         inside: what an execution counts that begins inside its own termination set, drawn as a line if it is near.
     """
     with drawing(3.1, 2, handlelength=2.6) as (figure, axes):
-        groups = grouped(bars, attrgetter("group"))
-        highest = max((bar.mean + np.nan_to_num(bar.deviation) for bar in bars), default=1.0)
+        groups = grouped(bars, itemgetter(1))
+        highest = max((mean + np.nan_to_num(deviation) for _, _, mean, deviation, _ in bars), default=1.0)
         for place, here in enumerate(groups.values()):
             width = min(0.26, 0.84 / len(here))
-            for index, bar in enumerate(here):
+            for index, (name, _, mean, deviation, seeds) in enumerate(here):
                 x = place + (index - (len(here) - 1) / 2) * width
-                turn, method = divmod(names.index(bar.name), len(METHOD_COLOURS)) if bar.name in names else (0, -1)
+                turn, method = divmod(names.index(name), len(METHOD_COLOURS)) if name in names else (0, -1)
                 colour = METHOD_COLOURS[method] if method >= 0 else GREY
                 hatch = HATCHES[turn % len(HATCHES)]
                 look: dict[str, Any] = {"color": colour, "edgecolor": INK, "linewidth": 0, "alpha": 0.8, "hatch": hatch}
-                axes.bar(x, bar.mean, width * 0.92, label=bar.name, **look)
-                if np.isfinite(bar.deviation):
-                    axes.errorbar(x, bar.mean, bar.deviation, color=INK, capsize=3, linewidth=1.2)
-                axes.plot(np.full(len(bar.seeds), x), bar.seeds, ".", color=INK, markersize=5, alpha=0.7)
+                axes.bar(x, mean, width * 0.92, label=name, **look)
+                if np.isfinite(deviation):
+                    axes.errorbar(x, mean, deviation, color=INK, capsize=3, linewidth=1.2)
+                axes.plot(np.full(len(seeds), x), seeds, ".", color=INK, markersize=5, alpha=0.7)
         if highest > inside / 2:
             axes.axhline(inside, color=GREY, linewidth=1.2, linestyle=":", label="began inside its own termination set")
         axes.set_xticks(range(len(groups)), list(groups))
@@ -657,44 +639,40 @@ def distance_bars(bars: Sequence[Bar], names: Sequence[str], inside: float) -> F
     return figure
 
 
-@dataclass(frozen=True)
-class Stops:
-    """Where one option stopped: rooms (n,), pixels (n, 2) in their pictures, fates (n,) (see ``distance.fates``)."""
-
-    title: str
-    rooms: NDArray[np.int64]
-    pixels: NDArray[np.int64]
-    fates: NDArray[np.int64]
-
-
-def stops_over_rooms(pictures: Sequence[tuple[int, NDArray[np.uint8]]], options: Sequence[Stops]) -> Figure:
+def stops_over_rooms(
+    pictures: Sequence[tuple[int, NDArray[np.uint8]]],
+    options: Sequence[tuple[str, NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]],
+) -> Figure:
     """Figure 5: a row per option, its rooms side by side; with one room two options in a row.
 
     What became of an execution is told by shape and by colour.
 
     Args:
         pictures: (room, uint8 (H, W, 3)).
-        options: whose stops.
+        options: title, and of the stops their rooms (n,), pixels (n, 2) in the pictures and :func:`fates` (n,).
     """
     with styled():
         columns = max(2, len(pictures))
-        panels = [(stops, room, picture) for stops in options for room, picture in pictures]
+        panels = list(product(options, pictures))
         rows = -(-len(panels) // columns)
         height, width = pictures[0][1].shape[:2]
         wide = (WIDTH - (columns - 1) * GAP) / columns  # inches
         high = wide * height / width
         size = (WIDTH, rows * (high + TITLE) + TITLE)
         figure = Figure(figsize=size)
-        for index, (stops, room, picture) in enumerate(panels):
+        for index, ((title, rooms, pixels, ends), (room, picture)) in enumerate(panels):
             row, column = divmod(index, columns)
             left, bottom = column * (wide + GAP), size[1] - (row + 1) * (high + TITLE)
             place = figure.add_axes((left / size[0], bottom / size[1], wide / size[0], high / size[1]))
             place.set_axis_off()
             place.imshow(picture, interpolation="none", aspect="auto")
-            _draw_stops(place, stops, room)
+            for fate, (_, marker, colour) in STOPS.items():
+                x, y = pixels[(rooms == room) & (ends == fate)].T
+                place.plot(x, y, marker, color=colour, alpha=0.75, **_mark(marker))
             first = room == pictures[0][0]
-            title = f"{stops.title}, room {room}" if first else f"room {room}"
-            place.set_title(title, pad=3, fontsize=9.5 if columns == 2 else 8)
+            place.set_title(
+                f"{title}, room {room}" if first else f"room {room}", pad=3, fontsize=9.5 if columns == 2 else 8
+            )
         handles = [Line2D([], [], marker=marker, color=colour, **_mark(marker)) for _, marker, colour in STOPS.values()]
         labels = [name for name, _, _ in STOPS.values()]
         figure.legend(handles, labels, loc="lower left", ncols=3, handletextpad=0.2, columnspacing=1.2, borderpad=0)
@@ -709,18 +687,11 @@ def _mark(marker: str) -> dict[str, Any]:
     return {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5, **more.get(marker, {})}
 
 
-def _draw_stops(axes: Axes, stops: Stops, room: int) -> None:
-    for fate, (_, marker, colour) in STOPS.items():
-        here = (stops.rooms == room) & (stops.fates == fate)
-        x, y = stops.pixels[here].T
-        axes.plot(x, y, marker, color=colour, alpha=0.75, **_mark(marker))
-
-
 QUESTION = Question(
     numbers=numbers,
     missing=missing,
     rows=rows,
-    pairs=lambda metrics: {"distance": against(metrics["distance"]["options"])},
+    pairs=lambda metrics: {"distance": against(ranked(metrics["distance"]["options"]))},
     summary=summary,
     sections=sections,
     figures=figures,

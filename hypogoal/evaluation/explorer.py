@@ -7,7 +7,7 @@ holds the states as data; ``templates/explorer.js`` shows those that its filters
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import settings_of, variants
-from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _natural(place: str) -> tuple[int, str]:
     return int(digits or 0), place
 
 
-def _goal(material: Material, source: Mapping[str, Any], sub_goal: str) -> dict[str, Any]:
+def _goal(material: Material, source: Entry, sub_goal: str) -> dict[str, Any]:
     members = [
         {
             "facts": [
@@ -193,9 +193,7 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
     return options
 
 
-def _chosen(
-    material: Material, run: Mapping[str, Any], goal: Mapping[str, Any], member: int, settings: str
-) -> dict[str, Any]:
+def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: str) -> dict[str, Any]:
     option = goal["members"][member]
     chosen, expected = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
     notes = [word for word in ("most", "least") if goal[word] == member]
@@ -219,7 +217,7 @@ def _over(chosen: Any, expected: Any) -> list[float | None]:
     return [round(float(c / e), 3) if e > 0 else None for c, e in zip(chosen, expected, strict=True)]
 
 
-def _stopped(material: Material, row: Mapping[str, Any], member: int) -> dict[str, Any]:
+def _stopped(material: Material, row: Entry, member: int) -> dict[str, Any]:
     option = row["options"][member]
     notes = [word for word in ("best", "validated") if row[word] == member]
     return {

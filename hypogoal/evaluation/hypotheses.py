@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import page
-from hypogoal.evaluation.numbers import Metrics, Row, Rows, grouped, method_rank, over, pairs, rows_of
+from hypogoal.evaluation.numbers import Metrics, Row, Rows, grouped, over, pairs, ranked, rows_of, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, drawing, style_of
 from hypogoal.hypotheses.scores import (
@@ -127,25 +127,21 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
             about["sub_goal"] = goal["sub_goal"]
             scopes = {name: scope["members"] for name, scope in goal.get("rooms", {}).get("scopes", {}).items()}
             for scope, members in {"heldout": goal["members"], **scopes}.items():
-                for scores in members:
-                    numbers = {name: value for name, value in scores.items() if name != "member"}
-                    yield from rows_of(numbers, **about, member=scores["member"], scope=scope)
-            for states in ("heldout", "unlabelled"):
+                yield from rows_of_members(members, **about, scope=scope)
+            for states in reversed(STATES):
                 yield from rows_of({"disagreement": goal["disagreement"][states]}, **about, scope=states)
 
 
-def against(ensembles: Sequence[Entry], *, ranked: bool = True) -> Rows:
-    """Spec F1: kinds of ensembles by their members' balanced accuracy on held-out layouts, paired by seed.
+def against(ensembles: Sequence[Entry]) -> Rows:
+    """Spec F1: the first kind of ensembles against each other by balanced accuracy on held-out layouts, paired by seed.
 
     Args:
         ensembles: what was computed of each; those judged by room are left out.
-        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
 
     Returns:
         Rows over all sub-goals that both have, and for each sub-goal by itself; units are seeds.
     """
     found: Rows = []
-    ensembles = sorted(ensembles, key=lambda ensemble: method_rank(ensemble["name"]) if ranked else 0)
     for which in COMPARED:
         measured = [
             (ensemble["name"], (goal["sub_goal"], ensemble["seed"]), goal["balanced_accuracy"][which])
@@ -256,14 +252,7 @@ def _members(ensemble: Entry) -> Block:
 def figures(material: Material) -> list[Drawn]:
     """Figure 3's quantity for one labelled context."""
     entries = material.metrics["hypotheses"]
-    sub_goals = list(dict.fromkeys(entry["sub_goal"] for entry in entries))
-    kinds = []
-    for name, alike in grouped(entries, itemgetter("name")).items():
-        values = np.full((len(sub_goals), len(WHICH)), math.nan)
-        for entry in alike:
-            values[sub_goals.index(entry["sub_goal"])] = np.array([entry[which]["mean"] for which in WHICH], float)
-        kinds.append((name, values))
-    drawn = best_mean_worst_members(sub_goals, kinds) if np.isfinite([values for _, values in kinds]).any() else None
+    drawn = best_mean_worst_members(entries)
     seeds = sorted({ensemble["seed"] for ensemble in material.metrics["ensembles"]})
     where = "layouts, pooled over them" if _has_layouts(material.metrics) else "states"
     caption = (
@@ -275,28 +264,34 @@ def figures(material: Material) -> list[Drawn]:
     return [Drawn("members", title, drawn, caption, nothing)]
 
 
-def best_mean_worst_members(sub_goals: Sequence[str], kinds: Sequence[tuple[str, NDArray[np.float64]]]) -> Figure:
+def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
     """Figure 3's quantity for one labelled layout: balanced accuracy on held-out layouts, by kind of ensemble.
 
     Args:
-        sub_goals: G names.
-        kinds: (name, float (G, 3)) with each sub-goal's best, mean and worst member, mean over seeds.
+        entries: of :func:`hypotheses_table`; where no mean in them is a number there is no figure.
     """
-    step = 0.8 / max(1, len(kinds))
+    means = [entry[which]["mean"] for entry in entries for which in WHICH]
+    lowest = min((mean for mean in means if mean is not None), default=None)
+    if lowest is None:
+        return None
+    kinds, sub_goals = grouped(entries, itemgetter("name")), list(dict.fromkeys(map(itemgetter("sub_goal"), entries)))
+    step = 0.8 / len(kinds)
     with drawing(1.2 + len(sub_goals) * max(0.42, 0.2 * len(kinds)), 3) as (figure, axes):
-        places = np.arange(len(sub_goals), dtype=np.float64)
-        for index, (name, values) in enumerate(kinds):
-            y = places + (index - (len(kinds) - 1) / 2) * step
+        for index, (name, alike) in enumerate(kinds.items()):
+            values = np.full((len(sub_goals), len(WHICH)), math.nan)
+            for entry in alike:
+                values[sub_goals.index(entry["sub_goal"])] = np.array([entry[which]["mean"] for which in WHICH], float)
+            y = np.arange(len(sub_goals), dtype=np.float64) + (index - (len(kinds) - 1) / 2) * step
             colour, marker = style_of(index)
             axes.hlines(y, values[:, 2], values[:, 0], color=colour, linewidth=1.6, alpha=0.6)
             axes.plot(values[:, 0], y, marker, color=colour, markersize=7, label=name)
             axes.plot(values[:, 1], y, "|", color=colour, markersize=10, markeredgewidth=1.8)
             axes.plot(values[:, 2], y, marker, color=colour, markersize=5, fillstyle="none")
         axes.axvline(0.5, color=GREY, linewidth=1.2, linestyle=":")
-        axes.set_yticks(places, sub_goals)
+        axes.set_yticks(range(len(sub_goals)), sub_goals)
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        axes.set_xlim(min(0.45, float(np.nanmin([values for _, values in kinds])) - 0.03), 1.02)
+        axes.set_xlim(min(0.45, lowest - 0.03), 1.02)
         axes.set_xlabel("balanced accuracy on held-out states (0.5: chance)")
     return figure
 
@@ -305,7 +300,7 @@ QUESTION = Question(
     look=look,
     numbers=lambda work: {"hypotheses": hypotheses_table(work.ensembles)},
     rows=rows,
-    pairs=lambda metrics: {"hypotheses": against(metrics["ensembles"])},
+    pairs=lambda metrics: {"hypotheses": against(ranked(metrics["ensembles"]))},
     summary=summary,
     sections=sections,
     figures=figures,

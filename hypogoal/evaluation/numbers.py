@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import stdtrit
 from scipy.stats import binomtest, bootstrap, trim_mean
 
 from hypogoal.core.seeding import rng_for
@@ -23,6 +24,9 @@ Item = TypeVar("Item")
 Key = TypeVar("Key", bound=Hashable)
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
+# Values from which on there is a bootstrap: of 2 values it would hold in 49 % of cases, of 5 in 85 %.
+BOOTSTRAP_FROM = 8
+STUDENT = "Student's t of the mean"
 PICKED = ("best", "validated", "mean")  # members that methods are compared by
 # Settings that may differ between two runs that are averaged, or that follow from others.
 NOT_A_VARIANT = frozenset(
@@ -119,19 +123,27 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     ),
     "probability": (
         "fraction",
-        "share of pairs of runs, alike in layout and seed, in which the first is better; a tie counts half",
+        "share of pairs of runs, alike in layout and seed, in which the first is better; a tie counts half; each unit "
+        "counts once, by its mean",
     ),
-    "units": ("layouts or seeds", "that pairs are of: those of one are not independent"),
+    "units": (
+        "layouts or seeds",
+        "that pairs are of: those of one are not independent; seeds where there is one layout",
+    ),
     "wins": ("pairs", "in which the first is better"),
     "ties": ("pairs", "in which both are the same"),
-    "difference": ("as said beside it", "mean over pairs of first - second"),
-    "difference_interval": ("as said beside it", "95 % bootstrap interval of the difference"),
+    "difference": ("as said beside it", "mean over units of the mean over pairs of first - second"),
+    "difference_interval": ("as said beside it", "95 % interval of the difference, Student's t"),
     "sign_test": ("probability", "of units won and lost as unevenly as these if neither were better"),
-    "mean": ("as said beside it", "over runs"),
-    "standard_error": ("as said beside it", "of the mean over runs"),
-    "iqm": ("as said beside it", "interquartile mean over runs"),
-    "interval": ("as said beside it", "95 % bootstrap interval, of the interquartile mean or probability"),
-    "standard_deviation": ("as said beside it", "over runs (n - 1)"),
+    "mean": ("as said beside it", "over layouts, each by the mean of its runs; over runs where there is one layout"),
+    "standard_error": ("as said beside it", "of that mean"),
+    "iqm": ("as said beside it", "interquartile mean over the same"),
+    "interval": (
+        "as said beside it",
+        "95 %: Student's t, of the mean or the probability; of 8 or more layouts or runs a bootstrap's, of the "
+        "interquartile mean; interval_over says which",
+    ),
+    "standard_deviation": ("as said beside it", "over the same (n - 1)"),
     "n": ("runs", "runs that have this number"),
 }
 
@@ -171,8 +183,8 @@ def rows_of(numbers: Mapping[str, Any], **place: Any) -> Iterable[Row]:
             yield Row(name, value, **place)
 
 
-def rows_of_options(members: Iterable[Mapping[str, Any]], **place: Any) -> Iterable[Row]:
-    """A row for each number of each member's option, all of one place."""
+def rows_of_members(members: Iterable[Mapping[str, Any]], **place: Any) -> Iterable[Row]:
+    """A row for each number of each member, or of its option, all of one place."""
     for member in members:
         numbers = {name: value for name, value in member.items() if name not in ("member", "option")}
         yield from rows_of(numbers, **place, member=member["member"])
@@ -216,75 +228,85 @@ def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> Any:
     return trim_mean(values, 0.25, axis=axis)
 
 
-def bootstrap_interval(
-    values: NDArray[np.float64],
-    strata: Sequence[Hashable],
-    rng: np.random.Generator,
-    statistic: Callable[..., Any] = interquartile_mean,
-) -> tuple[float, float, str]:
-    """Spec F5: 95 % percentile bootstrap interval of the interquartile mean, or of another statistic.
+def by_unit(values: ArrayLike, units: Sequence[Hashable]) -> NDArray[np.float64]:
+    """The mean of each unit's values, (n, ...) to (U, ...), in the order in which units come; a NaN is left out."""
+    found, names = np.asarray(values, np.float64), list(dict.fromkeys(units))
+    of = np.array([[mark == unit for mark in units] for unit in names], np.float64).reshape(len(names), len(found))
+    counts, sums = np.tensordot(of, ~np.isnan(found), 1), np.tensordot(of, np.nan_to_num(found), 1)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
-    Runs are drawn again within their stratum (a layout), so the interval speaks of these layouts with other seeds.
-    Where a layout has a single run there is nothing to draw within it: then runs are drawn from all of them, and the
-    interval speaks of other layouts too.
+
+def by_layout(values: ArrayLike, layouts: Sequence[Hashable]) -> tuple[NDArray[np.float64], str]:
+    """Spec F5: what is independent: each layout's mean over its runs; where there is one layout, the runs themselves.
 
     Args:
-        values: float (n,), one per run.
-        strata: n hashable marks.
-        rng: draws the resamples.
-        statistic: takes values and ``axis``.
+        values: (n, ...), one per run.
+        layouts: n hashable marks; none for runs that have no layouts.
 
     Returns:
-        Lower and upper bound, NaN for fewer than two runs, and over what was resampled.
+        float64 (U, ...), and "layouts" or "runs".
     """
-    if len(values) < 2:
-        return math.nan, math.nan, "one run: no interval"
-    groups = [values[[mark == stratum for mark in strata]] for stratum in sorted(set(strata), key=str)]
-    over = "runs within layouts" if len(groups) > 1 else "runs"
-    if min(map(len, groups)) < 2:
-        groups, over = [values], "runs"
-    if np.ptp(values) == 0:
-        return float(values[0]), float(values[0]), over
+    several = len(set(layouts)) > 1
+    return by_unit(values, layouts if several else range(len(np.asarray(values)))), "layouts" if several else "runs"
 
-    def together(*resampled: NDArray[np.float64], axis: int = -1) -> Any:
-        return statistic(np.concatenate(resampled, axis=axis), axis=axis)
 
+def student_interval(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Spec F5: Student's 95 % interval of the mean of (n,) independent values; NaN for fewer than two."""
+    mean, error = mean_and_error(values)
+    wide = float(stdtrit(max(1, len(values) - 1), (1 + CONFIDENCE) / 2)) * error
+    return mean - wide, mean + wide
+
+
+def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, str]:
+    """Spec F5: a 95 % interval: of few values Student's, of the mean; of 8 or more a bootstrap, of the middle half's.
+
+    A percentile bootstrap of few values is too narrow: of two it would hold in every second case.
+
+    Args:
+        values: float (n,), independent of each other.
+        rng: draws the resamples.
+
+    Returns:
+        Lower and upper bound, NaN for fewer than two values, and its kind.
+    """
+    if len(values) < BOOTSTRAP_FROM:
+        return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
     how: dict[str, Any] = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "method": "percentile"}
-    found = bootstrap(groups, together, **how, vectorized=True, rng=rng).confidence_interval
-    return float(found.low), float(found.high), over
+    found = bootstrap([values], interquartile_mean, **how, vectorized=True, rng=rng).confidence_interval
+    return float(found.low), float(found.high), "bootstrap of the interquartile mean"
 
 
 def over(
     values: Sequence[float],
     unit: str,
     *cell: str,
-    strata: Sequence[Hashable] | None = None,
+    layouts: Sequence[Hashable] = (),
     deviation: bool = False,
 ) -> dict[str, Any]:
-    """Spec F5: everything said of a number over runs. Runs whose number is NaN are left out and ``n`` says so.
+    """Spec F5: everything said of a number over runs, of which those of one layout count once, by their mean.
 
     Args:
-        values: one per run.
+        values: one per run. Runs whose number is NaN are left out and ``n`` says so.
         unit: theirs.
         cell: names of this number among all; they seed the resamples.
-        strata: a mark per run, see :func:`bootstrap_interval`.
-        deviation: with the standard deviation over runs (n - 1), the bands of Figures 3 and 4.
+        layouts: a mark per run, see :func:`by_layout`.
+        deviation: with the standard deviation (n - 1), the bands of Figures 3 and 4.
 
     Returns:
-        mean, standard_error, iqm, interval (95 %, of the iqm), interval_over, n, unit.
+        mean, standard_error, iqm, interval (95 %, see :func:`interval`), interval_over (of what, and its kind), n
+        (runs), unit.
     """
-    defined = [not np.isnan(value) for value in values]
-    numbers = np.array([value for value, there in zip(values, defined, strict=True) if there], dtype=np.float64)
-    marks = [mark for mark, there in zip(strata or [0] * len(values), defined, strict=True) if there]
+    defined = [index for index, value in enumerate(values) if not np.isnan(value)]
+    numbers, of = by_layout([values[index] for index in defined], [layouts[index] for index in defined if layouts])
     mean, error = mean_and_error(numbers)
-    low, high, drawn = bootstrap_interval(numbers, marks, rng_for(0, "bootstrap", *cell))
+    low, high, kind = interval(numbers, rng_for(0, "bootstrap", *cell))
     found = {
         "mean": mean,
         "standard_error": error,
         "iqm": float(interquartile_mean(numbers)) if len(numbers) else math.nan,
         "interval": [low, high],
-        "interval_over": drawn,
-        "n": len(numbers),
+        "interval_over": f"{of}: {kind}",
+        "n": len(defined),
         "unit": unit,
     }
     if deviation:
@@ -311,7 +333,7 @@ def pairs(
         quantity: what the rows say that is compared.
         where: and of what.
         higher: the better value is the higher one.
-        layouts: the first mark's values are the units, not the seeds.
+        layouts: the first mark is the layout; where there are several, they are the units, not the seeds.
 
     Returns:
         A row for each method after the first that shares a pair with it, see :func:`compare_pairs`.
@@ -326,34 +348,31 @@ def pairs(
         shared = [key for key in values[first] if key in values[second]]
         if shared:
             here, there = (np.array([values[name][key] for key in shared], np.float64) for name in (first, second))
-            units = [key[:1] if layouts else key[-2:] for key in shared]
-            rng = rng_for(0, "bootstrap", "pairs", first, second, quantity, where)
+            several = layouts and len({key[0] for key in shared}) > 1
+            units = [key[:1] if several else key[-2:] for key in shared]
             about = {"first": first, "second": second, "quantity": quantity, "where": where, "higher": higher}
-            rows.append({**about, **compare_pairs(here, there, units, rng, within=layouts, higher=higher)})
+            rows.append({**about, **compare_pairs(here, there, units, higher=higher)})
     return rows
 
 
 def pairs_by_groups(
-    entries: Iterable[Mapping[str, Any]],
+    entries: Sequence[Mapping[str, Any]],
     measured: Callable[[Any], Iterable[tuple[tuple[Hashable, ...], Mapping[str, float]]]],
     quantity: str,
     *,
-    ranked: bool,
     higher: bool = True,
 ) -> Rows:
-    """Methods against each other at each N, by their best, their validated and their mean member.
+    """The first method against each other at each N, by their best, their validated and their mean member.
 
     Args:
         entries: with ``method`` and ``groups``.
         measured: of an entry what is alike and the numbers by member, see :func:`pairs`.
         quantity, higher: what the numbers are, and whether the higher is the better one.
-        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
     """
-    ordered = sorted(entries, key=lambda entry: method_rank(entry["method"]) if ranked else 0)
     rows: Rows = []
-    for groups in by_groups(ordered):
+    for groups in by_groups(entries):
         here = [
-            (entry["method"], key, of) for entry in ordered if entry["groups"] == groups for key, of in measured(entry)
+            (entry["method"], key, of) for entry in entries if entry["groups"] == groups for key, of in measured(entry)
         ]
         for which in PICKED:
             values = [(method, key, of[which]) for method, key, of in here]
@@ -366,69 +385,52 @@ def compare_pairs(
     first: NDArray[np.float64],
     second: NDArray[np.float64],
     units: Sequence[Hashable],
-    rng: np.random.Generator,
     *,
-    within: bool = False,
     higher: bool = True,
 ) -> dict[str, Any]:
     """Spec F5: the first of two methods against the second over n pairs of runs that share layout and seed.
 
     The probability of improvement is the share of pairs in which the first is better, a tie counting half. Pairs of one
-    unit (one seed's ensemble on several ladders, one layout with several seeds) are not independent: interval and sign
-    test are over units, each of which counts once, by its mean. Where one wins every pair there is nothing to resample
-    and the interval has no width, so the sign test stands beside it, which few units cannot make small.
+    unit (one seed's ensemble on several ladders, one layout with several seeds) are not independent: everything but
+    the counts is over units, each of which counts once, by its mean. Where one wins every pair the interval has no
+    width, so the sign test stands beside it, which few units cannot make small.
 
     Args:
         first: float (n,), pair by pair; pairs with a NaN are left out.
         second: float (n,), of the other method.
         units: n hashable marks.
-        rng: draws the resamples.
-        within: the intervals, not the sign test, are drawn within units where each has several pairs: they speak of
-            these layouts with other seeds (see :func:`bootstrap_interval`).
         higher: the better value is the higher one.
 
     Returns:
-        n, units (how many), wins, ties, probability, interval (95 %) and interval_over, difference (mean of
-        first - second) and difference_interval (95 %), sign_test (two-sided p, ties left out). NaN without pairs.
+        n, units (how many), wins, ties, probability and its interval (Student's 95 %, cut at 0 and 1), interval_over,
+        difference (mean of first - second) and difference_interval, sign_test (two-sided p, ties left out). NaN without
+        pairs, intervals also of one unit.
     """
     there = ~(np.isnan(first) | np.isnan(second))
     marks = [mark for mark, both in zip(units, there, strict=True) if both]
     difference = first[there] - second[there]
     better = np.sign(difference if higher else -difference)
-    scores = (1 + better) / 2
-    of_units, differences = (_by_unit(values, marks) for values in (scores, difference))
-    drawn = (scores, difference, marks) if within else (of_units, differences, [0] * len(of_units))
-    low, high, over = bootstrap_interval(drawn[0], drawn[2], rng, np.mean)
-    *around, _ = bootstrap_interval(drawn[1], drawn[2], rng, np.mean)
-    won, lost = int((of_units > 0.5).sum()), int((of_units < 0.5).sum())
+    scores, differences = (by_unit(values, marks) for values in ((1 + better) / 2, difference))
+    won, lost = int((scores > 0.5).sum()), int((scores < 0.5).sum())
     return {
-        "n": len(scores),
-        "units": len(of_units),
+        "n": len(difference),
+        "units": len(scores),
         "wins": int((better > 0).sum()),
         "ties": int((better == 0).sum()),
         "probability": mean_of(scores),
-        "interval": [low, high],
-        "interval_over": over,
-        "difference": mean_of(difference),
-        "difference_interval": around,
+        "interval": np.clip(student_interval(scores), 0, 1).tolist(),
+        "interval_over": f"units: {STUDENT}",
+        "difference": mean_of(differences),
+        "difference_interval": list(student_interval(differences)),
         "sign_test": float(binomtest(won, won + lost).pvalue) if won + lost else math.nan,
     }
-
-
-def _by_unit(values: NDArray[np.float64], marks: Sequence[Hashable]) -> NDArray[np.float64]:
-    """The mean of each unit's values, in the order in which units come."""
-    means = [values[[mark == unit for mark in marks]].mean() for unit in dict.fromkeys(marks)]
-    return np.array(means, dtype=np.float64)
 
 
 def name_apart(bases: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """A name for each of n things: its base name, and where settings differ within that, those settings.
 
-    What more than half of the things of one base name have in common goes unsaid.
-
-    Args:
-        bases: n names.
-        configs: n resolved settings; ``domain_config`` inside is looked into.
+    What more than half of the things of one base name have in common goes unsaid; ``domain_config`` inside the
+    settings is looked into.
     """
     flat = [{**(config.get("domain_config") or {}), **config, "domain_config": None} for config in configs]
     names = []
@@ -497,6 +499,11 @@ def method_rank(method: str) -> int:
     """The order of methods in tables and figures: the paper's method, its control, the single CNN, anything else."""
     starts = ("dbat", "divdis", "no diversity", "single CNN")
     return next((rank for rank, start in enumerate(starts) if method.startswith(start)), len(starts))
+
+
+def ranked(entries: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The entries in the order of their methods, so that others are compared with D-BAT where there is one."""
+    return sorted(entries, key=lambda entry: method_rank(entry.get("method") or entry["name"]))
 
 
 def by_groups(entries: Iterable[Mapping[str, Any]]) -> list[int | None]:

@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 
@@ -38,10 +39,14 @@ POLICY = (
 )
 CAPTION = (
     "Pairs of runs that share {shared}. P: the probability of improvement, the share of pairs in which the first is "
-    "better, a tie counting half, with its 95 % bootstrap interval (2,000 resamples {drawn}); 0.5: neither is. An "
-    "interval without width means that every pair came out alike, not that it is certain: see the sign test "
-    "(two-sided, ties left out) and over how many {units} it is, each of which counts once, by its mean: pairs of one "
-    "are not independent. Difference: mean of first − second, with its 95 % interval."
+    "better, a tie counting half, with its 95 % interval (Student's t, cut at 0 and 1); 0.5: neither is. An interval "
+    "without width means that every pair came out alike, not that it is certain: see the sign test (two-sided, ties "
+    "left out). n: how many {units} everything is over, each of which counts once, by its mean: pairs of one are not "
+    "independent. Difference: mean of first − second, with its 95 % interval (Student's t)."
+)
+INTERVALS = (
+    "95 % intervals: of 2 to 7 {units} the mean and Student's t; of more the interquartile mean and a bootstrap (2,000 "
+    "resamples); of one there is none."
 )
 
 
@@ -312,12 +317,13 @@ def deviation(aggregated: Entry | None, digits: int) -> dict[str, str]:
 
 
 def interval(aggregated: Entry, digits: int, scale: float = 1.0) -> str:
-    """Interquartile mean and its 95 % interval."""
+    """The mean or the interquartile mean, whichever the 95 % interval beside it is of."""
     if aggregated["iqm"] is None:
         return "–"
+    value = aggregated["mean" if STUDENT in aggregated["interval_over"] else "iqm"]
     low, high = aggregated["interval"]
     around = "" if low is None else f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
-    return f"{scale * aggregated['iqm']:.{digits}f}{around}"
+    return f"{scale * value:.{digits}f}{around}"
 
 
 def verdict(probability: float, says: bool, truth: bool) -> dict[str, str]:
@@ -362,8 +368,7 @@ def comparison_tables(
         number("sign test p", lambda e: cell(fixed(e["sign_test"], 3), f"n = {e['units']}"), dict),
         number("difference", difference, dict),
     ]
-    drawn = "within layouts where each has several" if units == "layouts" else "of seeds"
-    caption = CAPTION.format(shared=shared, units=units, drawn=drawn)
+    caption = CAPTION.format(shared=shared, units=units)
     title = f"Seed by seed: {firsts.pop()} against the others" if len(firsts) == 1 else "Seed by seed"
     return [table(columns, found, tight=True, heading=title, caption=caption)]
 

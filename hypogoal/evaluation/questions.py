@@ -25,6 +25,7 @@ QUESTIONS: list[Question] = [
     saliency.QUESTION,
     selection.QUESTION,
 ]
+OLDER = "; evaluated by an older hypogoal: its intervals are bootstraps, too narrow with few runs. Evaluate again"
 
 
 def agents_last() -> list[Question]:
@@ -55,26 +56,19 @@ def summary_table(metrics: Metrics) -> Table | Group:
 
 
 def render(material: Material, version: str) -> str:
-    """Spec F7: the page of a run, self-contained; ``material.figures`` is filled on the way.
-
-    Args:
-        material: the evaluation's numbers and arrays.
-        version: hypogoal's.
-    """
+    """Spec F7: the page of a run, self-contained; ``material.figures`` is filled on the way."""
     metrics = material.metrics
     count = len(metrics["provenance"]["artefacts"])
     evaluated = f"{count} artefact{'' if count == 1 else 's'} evaluated"
     subtitle = f"{listed(domains_of(metrics))}; {evaluated}; hypogoal {version}"
+    if metrics["quantities"].get("interval") != meanings()["interval"]:
+        subtitle += OLDER
     sections = [section for question in QUESTIONS for section in question.sections(material)]
     return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version)
 
 
 def paper_figures(material: Material) -> tuple[list[Drawn], list[str]]:
-    """Figures 2 to 9 and those beside them that the run has artefacts for; a line for each of 2 to 9 that it has not.
-
-    Args:
-        material: the evaluation's numbers and arrays.
-    """
+    """Figures 2 to 9 and those beside them that the run has artefacts for; a line for each of 2 to 9 that it lacks."""
     figures: Iterator[Drawn] = (figure for question in QUESTIONS for figure in question.figures(material))
     drawn = sorted((figure for figure in figures if figure.figure is not None), key=lambda figure: figure.stem)
     needed = {name: what for question in QUESTIONS for name, what in question.needed.items()}

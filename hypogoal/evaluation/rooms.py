@@ -8,10 +8,10 @@ rooms of the labelled groups, the only ones whose labels were to be had, would h
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
-from operator import itemgetter, methodcaller
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,8 +32,9 @@ from hypogoal.evaluation.numbers import (
     methods_lacking,
     over,
     pairs_by_groups,
+    ranked,
 )
-from hypogoal.evaluation.page import Block, Column, Drawn, Entry, Material, Question
+from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, legend_below, styled
 from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
 
@@ -56,6 +57,7 @@ WHICH = {
     "worst": "worst member",
 }
 SHARE = "share of states"
+SPREAD = ("mean", "standard_deviation")  # of the figures
 CELL = ("method", "groups", "sub_goal")  # what rows are over seeds of
 IN_ROOMS = {"balanced_accuracy": "bal. acc.", "accuracy": "accuracy"}
 SEEN = {0: "no", 1: "unlabelled", 2: "labelled"}
@@ -69,20 +71,20 @@ BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at
 
 
 def room_metrics(
+    probabilities: NDArray[np.float32],
     verdicts: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
     kinds: Sequence[str] = (),
-    probabilities: NDArray[np.float32] | None = None,
 ) -> dict[str, Any]:
     """Spec F1: one ensemble's members by whether training saw the room.
 
     Args:
-        verdicts: bool (N, K) on held-out states.
-        labels: bool (N,), theirs.
+        probabilities: float (N, K), that held-out states are reached.
+        verdicts: bool (N, K), what was made of them.
+        labels: bool (N,), the truth.
         origins: int (N,) each: ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``.
         kinds: names of the values of ``kind``.
-        probabilities: float (N, K), what the verdicts were made of; without them there is no ``ranking``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
@@ -95,16 +97,13 @@ def room_metrics(
     for name, values in SCOPES.items():
         inside = np.isin(seen, values)
         scores = member_scores(verdicts[inside], labels[inside])
-        if probabilities is not None:
-            scores["ranking"] = ranking(probabilities[inside], labels[inside])
+        scores["ranking"] = ranking(probabilities[inside], labels[inside])
         scopes[name] = {
             "states": int(inside.sum()),
             "positives": int(labels[inside].sum()),
             "rooms": [] if rooms is None else np.unique(rooms[inside]).tolist(),
             "members": [{"member": member, **row} for member, row in enumerate(by_member(scores))],
-            "scores": {
-                score: with_validated(scores[score], validated["member"]) for score in SCORED if score in scores
-            },
+            "scores": {score: with_validated(scores[score], validated["member"]) for score in SCORED},
         }
     return {
         "scopes": scopes,
@@ -195,7 +194,6 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     for key, judged in sorted(grouped(of_rooms(ensembles), cell_of).items(), key=lambda item: by_method(item[0])):
         cell, goals = " ".join(map(str, key)), [goal for _, goal in judged]
         scopes = [goal["rooms"]["scopes"] for goal in goals]
-        scored = [score for score in SCORED if all(score in each["unseen"]["scores"] for each in scopes)]
         entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
         entry["ensembles"] = len(goals)
         counts = {scope: (scopes[0][scope]["positives"], scopes[0][scope]["states"]) for scope in TABLED}
@@ -206,7 +204,7 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
         entry["scores"] = {
             scope: {
                 score: _by_which([each[scope]["scores"][score] for each in scopes], score, cell, score, scope)
-                for score in scored
+                for score in SCORED
             }
             for scope in TABLED
         }
@@ -227,9 +225,8 @@ def look(work: Work, judgement: Judgement) -> None:
     """Members room by room, where held-out states say which rooms training saw."""
     split, judged = judgement.split, judgement.judged
     if "seen" in split.origins:
-        judgement.row["rooms"] = room_metrics(
-            judged.verdicts, split.labels, split.origins, judgement.kinds, judged.probabilities
-        )
+        states = (split.labels, split.origins, judgement.kinds)
+        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, *states)
 
 
 def missing(work: Work) -> list[str]:
@@ -238,12 +235,10 @@ def missing(work: Work) -> list[str]:
     return methods_lacking(rooms, "ensemble", "Figure 3") if rooms or work.contents.ladders else []
 
 
-def against(ensembles: Sequence[Entry], *, ranked: bool = True) -> Rows:
-    """Spec F1: methods by their members' balanced accuracy on unseen rooms, at each N, paired by seed, which are units.
+def against(ensembles: Sequence[Entry]) -> Rows:
+    """Spec F1: the first method against each other by balanced accuracy on unseen rooms, at each N, paired by seed.
 
-    Args:
-        ensembles: what was computed of each; those not judged by room are left out.
-        ranked: the method that stands first is D-BAT where there is one; else the first that comes.
+    Ensembles not judged by room are left out.
     """
 
     def scores(ensemble: Entry) -> Iterator[tuple[tuple[str, int], Entry]]:
@@ -251,7 +246,7 @@ def against(ensembles: Sequence[Entry], *, ranked: bool = True) -> Rows:
             yield (goal["sub_goal"], ensemble["seed"]), goal["rooms"]["scopes"]["unseen"]["scores"]["balanced_accuracy"]
 
     judged = [ensemble for ensemble in ensembles if of_rooms([ensemble])]
-    return pairs_by_groups(judged, scores, "balanced accuracy on unseen rooms", ranked=ranked)
+    return pairs_by_groups(judged, scores, "balanced accuracy on unseen rooms")
 
 
 METHOD = page.label("method", "method", once=True)
@@ -446,9 +441,8 @@ def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
         INTERVALS,
         rows,
         tight=True,
-        folded="Interquartile means of balanced accuracy with intervals",
-        caption="Interquartile mean over ensemble seeds with its 95 % bootstrap interval (2,000 resamples of seeds); "
-        "no interval with one seed.",
+        folded="Balanced accuracy with intervals",
+        caption=page.INTERVALS.format(units="ensemble seeds"),
     )
     differences = page.table(
         DIFFERENCES,
@@ -498,7 +492,7 @@ def figures(material: Material) -> Iterator[Drawn]:
 
 def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
     panels = [
-        panel(rows, f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
+        (f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
         for score in ("accuracy", "balanced_accuracy")
         for scope in ("all", "unseen")
     ]
@@ -509,47 +503,25 @@ def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
         f"{_seeds(material, rows)} {_why_dashes(rows)}{PAPER}"
     )
     nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
-    return Drawn(name, "Figure 3: the best member against labelled ladder groups", _drawn(panels), caption, nothing)
+    title, drawn = "Figure 3: the best member against labelled ladder groups", scores_over_groups(rows, panels)
+    return Drawn(name, title, drawn, caption, nothing)
 
 
 def _four(material: Material, rows: Sequence[Entry]) -> Drawn:
-    panels = [panel(rows, name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
+    panels = [(name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
     name = f"unseen{_suffix(material, rows)}"
     caption = (
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
         f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
         "Only the second can be had without labels from the rooms it is for."
     )
-    title = "Balanced accuracy on unseen rooms"
-    return Drawn(name, title, _drawn(panels), caption, "As above.", file=f"figure3-{name}")
-
-
-def _drawn(panels: Sequence[Panel]) -> Figure | None:
-    """The figure; None where no data say N."""
-    labelled = any(len(series.groups) for panel in panels for series in panel.series)
-    return scores_over_groups(panels, [series.name for series in panels[0].series]) if labelled else None
+    title, drawn = "Balanced accuracy on unseen rooms", scores_over_groups(rows, panels)
+    return Drawn(name, title, drawn, caption, "As above.", file=f"figure3-{name}")
 
 
 def _suffix(material: Material, rows: Sequence[Entry]) -> str:
     """What a figure's name ends with where there are several sub-goals."""
     return f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
-
-
-def panel(rows: Sequence[Mapping[str, Any]], title: str, scope: str, score: str, which: str) -> Panel:
-    """One plot of Figure 3: a score of one kind of member over N, a line per method of the rows."""
-    labelled = [entry for entry in rows if entry["groups"] is not None]
-    series = []
-    for name, entries in grouped(rows, itemgetter("method")).items():
-        there = [entry for entry in entries if entry["groups"] is not None]
-        scores = [entry["scores"][scope][score][which] for entry in there]
-        mean, deviation = (np.array([of[key] for of in scores], float) for key in ("mean", "standard_deviation"))
-        series.append(Series(name, np.array([entry["groups"] for entry in there], np.int64), mean, deviation))
-    blind = {}
-    for entry in sorted(labelled, key=itemgetter("groups")):
-        never = entry["always_no"][scope] if score == "accuracy" else 0.5 if entry["positives"][scope] else None
-        if never is not None:
-            blind[entry["groups"]] = never
-    return Panel(title, blind, series)
 
 
 def bands(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -561,52 +533,48 @@ def bands(rows: Sequence[Mapping[str, Any]]) -> str:
     return "bands, and bars where a method has one N (those methods side by side)" if any(alone) else "bands"
 
 
-@dataclass(frozen=True)
-class Series:
-    """One method over N: arrays (n,), the mean and the standard deviation over seeds; NaN where there is none."""
-
-    name: str
-    groups: NDArray[np.int64]
-    mean: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One small plot: its title, by N what it takes no seeing to score (dotted), and a series per method."""
-
-    title: str
-    blind: Mapping[int, float]
-    series: Sequence[Series]
-
-
-def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
+def scores_over_groups(
+    rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]], names: Sequence[str] = ()
+) -> Figure | None:
     """Figure 3: scores against the number of labelled ladder groups; bands of one standard deviation.
 
-    A method with one N has an error bar instead of a band, a little beside the other methods'.
+    A method with one N has an error bar instead of a band, a little beside the other methods'. Dotted is what it takes
+    no seeing to score.
 
     Args:
-        panels: two in a row.
-        names: all methods, in the order of their colours.
+        rows: of :func:`rooms_table`; those without N are left out, and where all are there is no figure.
+        panels: two in a row: title, and of which scope, score and member.
+        names: all methods, in the order of their colours; those of the rows where none are given.
     """
+    names, rows = names or list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
+    if not rows:
+        return None
     with styled():
-        rows = -(-len(panels) // 2)
-        figure = Figure(figsize=(WIDTH, 2.25 * rows + 0.05), layout="constrained")
-        axes = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
-        values = [series.mean - np.nan_to_num(series.deviation) for panel in panels for series in panel.series]
-        lowest = np.nanmin(np.concatenate([*values, [0.5]]))
-        ticks = sorted({int(group) for panel in panels for series in panel.series for group in series.groups})
-        for place, panel in zip(axes.flat, panels, strict=False):
-            for series in panel.series:
-                _draw_series(place, series, names.index(series.name), len(names))
-            if len(panel.blind) == 1:  # of one N a line is a point, which a method's marker may hide
-                place.axhline(*panel.blind.values(), color=GREY, linewidth=1.2, linestyle=":", zorder=0)
+        high = -(-len(panels) // 2)
+        figure = Figure(figsize=(WIDTH, 2.25 * high + 0.05), layout="constrained")
+        axes = figure.subplots(high, 2, sharex=True, sharey=True, squeeze=False)
+        ticks, lowest = sorted({row["groups"] for row in rows}), 0.5
+        for place, (title, scope, score, which) in zip(axes.flat, panels, strict=False):
+            for name, entries in grouped(rows, itemgetter("method")).items():
+                scores = [entry["scores"][scope][score][which] for entry in entries]
+                mean, deviation = (np.array([of[key] for of in scores], float) for key in SPREAD)
+                groups = np.array([entry["groups"] for entry in entries], float)
+                _draw_method(place, name, groups, mean, deviation, names)
+                lowest = float(np.nanmin([lowest, *(mean - np.nan_to_num(deviation))]))
+            blind = {}
+            for row in sorted(rows, key=itemgetter("groups")):
+                never = row["always_no"][scope] if score == "accuracy" else 0.5 if row["positives"][scope] else None
+                if never is not None:
+                    blind[row["groups"]] = never
+            if len(blind) == 1:  # of one N a line is a point, which a method's marker may hide
+                place.axhline(*blind.values(), color=GREY, linewidth=1.2, linestyle=":", zorder=0)
             else:
-                place.plot(list(panel.blind), list(panel.blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
-            place.set_title(panel.title, fontsize=9.5)
-            place.set_ylim(max(0.0, float(lowest) - 0.03), 1.03)
+                place.plot(list(blind), list(blind.values()), ".:", color=GREY, linewidth=1.2, markersize=3)
+            place.set_title(title, fontsize=9.5)
+        for place in axes.flat:
+            place.set_ylim(max(0.0, lowest - 0.03), 1.03)
             place.set_xticks(ticks)
-            place.set_xlim(min(ticks, default=0) - 0.4, max(ticks, default=1) + 0.4)
+            place.set_xlim(ticks[0] - 0.4, ticks[-1] + 0.4)
         for place in axes[-1]:
             place.set_xlabel("labelled ladder groups, N")
         for place in axes[:, 0]:
@@ -617,20 +585,26 @@ def scores_over_groups(panels: Sequence[Panel], names: Sequence[str]) -> Figure:
         return figure
 
 
-def _draw_series(axes: Axes, series: Series, index: int, count: int) -> None:
-    """The series of method ``index`` of ``count``."""
+def _draw_method(
+    axes: Axes,
+    name: str,
+    groups: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    deviation: NDArray[np.float64],
+    names: Sequence[str],
+) -> None:
+    index, count = names.index(name), len(names)
     colour, line = METHOD_COLOURS[index % len(METHOD_COLOURS)], STYLES[index % len(STYLES)]
     marker = MARKERS[index % len(MARKERS)]
-    groups = series.groups.astype(np.float64)
     if len(groups) == 1:  # the others with one N lie at the same place
-        groups += (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
-    axes.plot(groups, series.mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=series.name)
-    shown = ~(np.isnan(series.mean) | np.isnan(series.deviation))
-    mean, deviation = series.mean[shown], series.deviation[shown]
+        groups = groups + (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
+    axes.plot(groups, mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=name)
+    shown = ~(np.isnan(mean) | np.isnan(deviation))
+    groups, mean, deviation = groups[shown], mean[shown], deviation[shown]
     if len(mean) == 1:  # a band would have no width
-        axes.errorbar(groups[shown], mean, deviation, color=colour, capsize=3, linewidth=1.2)
+        axes.errorbar(groups, mean, deviation, color=colour, capsize=3, linewidth=1.2)
     else:
-        axes.fill_between(groups[shown], mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
+        axes.fill_between(groups, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
 
 
 def _at_each_n(material: Material, rows: Sequence[Entry]) -> Iterator[tuple[str, list[tuple[str, list[Entry]]]]]:
@@ -647,20 +621,16 @@ def kinds_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
     """A table for each N: what share of each kind of negatives members call reached."""
     blocks: list[Block] = []
     for place, (groups, methods) in enumerate(_at_each_n(material, rows)):
-        lines: dict[tuple[str, str], dict[str, Any]] = {}
-        for method, judged in methods:
-            false = [(of, rooms["validated"]["member"]) for rooms in judged for of in rooms["false_positives"]]
-            for (scope, kind), alike in grouped(false, lambda pair: (pair[0]["scope"], pair[0]["kind"])).items():
-                line = lines.setdefault((scope, kind), {"scope": scope, "kind": kind})
-                line["states"] = f"{alike[-1][0]['negatives']:,}"
-                line[f"{method}: mean"] = _percent([float(np.mean(of["share"])) for of, _ in alike])
-                picked = [of["share"][member] for of, member in alike if member is not None]
-                line[f"{method}: validated"] = _percent(picked)
+        found = [of for _, judged in methods for rooms in judged for of in rooms["false_positives"]]
+        lines = {(of["scope"], of["kind"]): of for of in found}
         columns = [
-            page.label("held-out states of", lambda line: TABLED[line["scope"]], once=True),
+            page.label("held-out states of", lambda of: TABLED[of["scope"]], once=True),
             page.label("negatives", "kind"),
-            page.number("states", "states"),
-            *_by_method(methods, ("mean", "validated")),
+            page.number("states", "negatives", "{:,}".format),
+            *(
+                page.number(f"{method}: {name}", partial(_called_reached, judged, name))
+                for (method, judged), name in product(methods, ("mean", "validated"))
+            ),
         ]
         name = f"False positives by kind, N={groups}"
         caption = (
@@ -674,31 +644,35 @@ def kinds_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
     return blocks
 
 
-def _by_method(methods: Iterable[tuple[str, Any]], names: Iterable[str]) -> list[Column]:
-    """Columns of lines whose keys are like ``dbat, K=2: mean``."""
-    keys = [f"{method}: {name}" for (method, _), name in product(methods, names)]
-    return [page.number(key, methodcaller("get", key, "–")) for key in keys]
-
-
-def _percent(values: Sequence[float]) -> str:
-    return f"{100 * float(np.mean(values)):.1f}" if values else "–"
+def _called_reached(judged: Sequence[Entry], which: str, negatives: Entry) -> str:
+    """Of these negatives in every seed's rooms, in percent."""
+    alike = [
+        (of["share"], rooms["validated"]["member"])
+        for rooms in judged
+        for of in rooms["false_positives"]
+        if (of["scope"], of["kind"]) == (negatives["scope"], negatives["kind"])
+    ]
+    if which == "mean":
+        shares = [float(np.mean(share)) for share, _ in alike]
+    else:
+        shares = [share[member] for share, member in alike if member is not None]
+    return page.fixed(100 * float(np.mean(shares)) if shares else None, 1)
 
 
 def room_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
     """A folded table for each N: accuracies in every room."""
     blocks: list[Block] = []
     for groups, methods in _at_each_n(material, rows):
-        lines = [dict(room) for rooms in methods[0][1][:1] for room in rooms["by_room"]]
-        for method, judged in methods:
-            for (index, line), (score, name) in product(enumerate(lines), IN_ROOMS.items()):
-                values = [value for rooms in judged for value in rooms["by_room"][index][score] if value is not None]
-                line[f"{method}: {name}"] = page.fixed(float(np.mean(values)) if values else None, 2)
+        lines = [room for rooms in methods[0][1][:1] for room in rooms["by_room"]]
         columns = [
             page.label("room", lambda line: str(line["room"])),
             page.label("in training", lambda line: SEEN.get(line["seen"], str(line["seen"]))),
             page.number("states", "states", "{:,}".format),
             page.number("positives", "positives", "{:,}".format),
-            *_by_method(methods, IN_ROOMS.values()),
+            *(
+                page.number(f"{method}: {name}", partial(_in_room, judged, score), page.fixed, 2)
+                for (method, judged), (score, name) in product(methods, IN_ROOMS.items())
+            ),
         ]
         caption = (
             "Mean over members and ensemble seeds, on the room's held-out states. Rooms without a "
@@ -707,6 +681,13 @@ def room_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
         folded = f"Every room, N={groups}"
         blocks += [page.table(columns, lines, tight=True, folded=folded, caption=caption)] if lines else []
     return blocks
+
+
+def _in_room(judged: Sequence[Entry], score: str, room: Entry) -> float | None:
+    """Every seed's and member's score in a room, on average."""
+    alike = [of for rooms in judged for of in rooms["by_room"] if of["room"] == room["room"]]
+    values = [value for of in alike for value in of[score] if value is not None]
+    return float(np.mean(values)) if values else None
 
 
 def members_table(material: Material) -> Block:
@@ -732,7 +713,7 @@ QUESTION = Question(
     look=look,
     numbers=lambda work: {"rooms": rooms_table(work.ensembles)},
     missing=missing,
-    pairs=lambda metrics: {"rooms": against(metrics["ensembles"])},
+    pairs=lambda metrics: {"rooms": against(ranked(metrics["ensembles"]))},
     summary=summary,
     sections=sections,
     figures=figures,

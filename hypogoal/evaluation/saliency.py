@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +33,7 @@ EXAMPLES = {
 }
 NEEDED = "an ensemble artefact with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
+EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
 KEY = 0.75  # inches below all pictures
 
 
@@ -49,7 +49,7 @@ def look(work: Work, judgement: Judgement) -> None:
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
     labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
-    examples = pick_examples(probabilities, labels, verdicts=verdicts)
+    examples = pick_examples(probabilities, verdicts, labels)
     explained = pick_to_explain(probabilities, verdicts, labels)
     for name, picked in (("examples", examples), ("saliency", explained)):
         picked = [(int(among[index]), kind) for index, kind in picked]
@@ -69,26 +69,20 @@ def look(work: Work, judgement: Judgement) -> None:
 
 
 def pick_examples(
-    probabilities: NDArray[np.float32],
-    labels: NDArray[np.bool_],
-    per_kind: int = 2,
-    threshold: float = 0.5,
-    verdicts: NDArray[np.bool_] | None = None,
+    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], per_kind: int = 2
 ) -> list[tuple[int, str]]:
     """States on which members disagree, all err, or all are right, so that a reader sees each.
 
     Args:
         probabilities: float (N, K), every member's P(sub-goal reached).
+        verdicts: bool (N, K), what members say.
         labels: bool (N,).
         per_kind: states of each kind at most.
-        threshold: above which a member says yes.
-        verdicts: bool (N, K), what members say, where not all have that threshold.
 
     Returns:
         (index, kind) with kind ``disagree`` (the widest spread of probabilities first, true and false states in
         turn), ``wrong`` (the most sure errors first), ``right yes`` and ``right no``; fewer where there are none.
     """
-    verdicts = probabilities > threshold if verdicts is None else verdicts
     correct = verdicts == labels[:, None]
     spread = probabilities.max(1) - probabilities.min(1)
     error = np.abs(probabilities - labels[:, None]).min(1)
@@ -236,8 +230,7 @@ def figures(material: Material) -> Iterator[Drawn]:
     goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
     for goal in goals:
         arrays = material.within(f"saliency/{goal['sub_goal']}")
-        names = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")
-        state = Explained(*(arrays[name][0] for name in names))
+        state = {name: arrays[name][0] for name in EXPLAINED}
         suffix = f"-{goal['sub_goal']}" if len(goals) > 1 else ""
         place = page.texts(arrays["places"])[0]
         error = max(member["completeness_error"] for member in goal["states"][0]["members"])
@@ -247,7 +240,7 @@ def figures(material: Material) -> Iterator[Drawn]:
             f"{found['baseline']}. Orange speaks for 'reached', blue against it; each picture has a scale of its own. "
             f"They add up to the difference in log-odds within {error:.0e}."
         )
-        colours = state.seen.shape[-1] == 3
+        colours = state["seen"].shape[-1] == 3
         every = "Colour by colour." if colours else "Every frame that members see."
         last = "" if colours else " Of the stack of frames the last."
         members, frames = attributions_of_members(state), attributions_of_every_frame(state)
@@ -255,62 +248,40 @@ def figures(material: Material) -> Iterator[Drawn]:
         yield Drawn(f"figure9{suffix}", "Figure 9", frames, f"Figure 9 of the paper. {about} {every}")
 
 
-@dataclass(frozen=True)
-class Explained:
-    """A state and each member's attributions.
-
-    Attributes:
-        observation: uint8 (H, W, C).
-        seen: uint8 (h, w, C), what members see of it.
-        values: float (K, h, w, C), log-odds.
-        probabilities: float (K,).
-        verdicts: bool (K,).
-        truth: the sub-goal is reached.
-    """
-
-    observation: NDArray[np.uint8]
-    seen: NDArray[np.uint8]
-    values: NDArray[np.floating]
-    probabilities: NDArray[np.floating]
-    verdicts: NDArray[np.bool_]
-    truth: bool | np.bool_
-
-    def said(self, member: int) -> str:
-        """A member's verdict and probability."""
-        verdict = "yes" if self.verdicts[member] else "no"
-        return f"member {member}: {verdict} {self.probabilities[member]:.2f}"
+def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
+    says = page.verdict(state["probabilities"][member], bool(state["verdicts"][member]), bool(state["labels"]))
+    return f"member {member}: {says['text']}"
 
 
-def attributions_of_members(state: Explained, columns: int = 4) -> Figure:
+def attributions_of_members(state: Mapping[str, NDArray[Any]], columns: int = 4) -> Figure:
     """Figure 2: what each member goes by in one state; of a stack of frames the last.
 
     Args:
-        state: of K members.
+        state: of one state and K members what is in ``EXPLAINED``, as ``arrays.h5`` has it.
         columns: pictures in a row, the state itself being the first.
     """
-    members = len(state.values)
+    members = len(state["attributions"])
     columns = min(columns, members + 1)
     figure, places = grid_of_pictures(-(-(members + 1) // columns), columns, KEY)
-    show_picture(places[0], state.observation, f"truth: {'yes' if state.truth else 'no'}")
-    grey = brightness(state.seen) / 255
-    for member in range(members):
-        image = attribution_image(flat(state.values[member]), grey)
-        show_picture(places[member + 1], image, state.said(member))
+    show_picture(places[0], state["observations"], f"truth: {'yes' if state['labels'] else 'no'}")
+    grey = brightness(state["seen"]) / 255
+    for member, values in enumerate(state["attributions"]):
+        show_picture(places[member + 1], attribution_image(flat(values), grey), _said(state, member))
     _key(figure, places)
     return figure
 
 
-def attributions_of_every_frame(state: Explained) -> Figure:
+def attributions_of_every_frame(state: Mapping[str, NDArray[Any]]) -> Figure:
     """Figure 9: a row per member, a column per frame, oldest first, above them the frames; of colours one of each."""
-    channels, members = state.seen.shape[-1], len(state.values)
+    channels, members = state["seen"].shape[-1], len(state["attributions"])
     figure, places = grid_of_pictures(members + 1, channels, KEY)
     ages = [f"{age} step{'s' if age > 1 else ''} before" for age in range(channels - 1, 0, -1)]
     for channel, name in enumerate(["red", "green", "blue"] if channels == 3 else [*ages, "newest frame"]):
-        frame = state.seen[..., channel]
+        frame = state["seen"][..., channel]
         show_picture(places[channel], frame, name)
-        for member in range(members):
-            image = attribution_image(state.values[member, ..., channel], frame / 255)
-            show_picture(places[(member + 1) * channels + channel], image, state.said(member) if channel == 0 else "")
+        for member, values in enumerate(state["attributions"]):
+            image, said = attribution_image(values[..., channel], frame / 255), _said(state, member)
+            show_picture(places[(member + 1) * channels + channel], image, "" if channel else said)
     _key(figure, places)
     return figure
 

@@ -17,8 +17,17 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain, step_of
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, base_name, control_of, variants, which
-from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of_options
+from hypogoal.evaluation.curves import (
+    LAYOUTS_OR_RUNS,
+    LEARNED,
+    PRETRAINING,
+    RANDOM,
+    base_name,
+    control_of,
+    variants,
+    which,
+)
+from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, drawing, grid_of_pictures, show_picture, style_of
@@ -232,7 +241,7 @@ def _over_runs(name: str, rows: Sequence[Entry]) -> dict[str, Any]:
 
     def of(quantity: str, scope: str) -> dict[str, Any]:
         values = [row["rank_correlation"][quantity][scope] for row in rows]
-        return over(values, "Spearman's rho", name, quantity, scope, strata=layouts)
+        return over(values, "Spearman's rho", name, quantity, scope, layouts=layouts)
 
     return {quantity: {scope: of(quantity, scope) for scope in ("all", "within")} for quantity in QUANTITIES}
 
@@ -243,7 +252,7 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
         for run in agent["runs"]:
             about = {"method": agent["name"], "layout": run["layout_seed"], "seed": run["seed"], "scope": SCOPE}
             for goal in run["sub_goals"]:
-                yield from rows_of_options(goal["members"], **about, sub_goal=goal["sub_goal"], artefact=run["path"])
+                yield from rows_of_members(goal["members"], **about, sub_goal=goal["sub_goal"], artefact=run["path"])
 
 
 def missing(work: Work) -> list[str]:
@@ -357,9 +366,9 @@ def choices_section(material: Material) -> Block:
         ],
         heading="Rank correlation with the match",
         caption="Spearman's rank correlation between how a member is ranked and its match with the true sub-goal on "
-        "the run's layout; interquartile mean over runs, 95 % bootstrap interval. Within: mean over sub-goals of the "
-        "correlation among a sub-goal's members. 1 would mean that reward picks out the hypotheses that transfer, 0 "
-        "that it does not.",
+        "the run's layout. Within: mean over sub-goals of the correlation among a sub-goal's members. 1 would mean "
+        "that reward picks out the hypotheses that transfer, 0 that it does not. "
+        f"{page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
     )
     members = [_members(run, folded=index > 0) for index, run in enumerate(agent["runs"])]
     control, variant = control_of(material, agent, selection), which(agent, selection)

@@ -28,27 +28,20 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
         UserError: fewer than two runs, one twice, one that was not evaluated, runs that cannot be compared, or ``out``
             exists.
     """
-    from hypogoal.evaluation.compare import (
-        compare_runs,
-        compared_sections,
-        differences,
-        domains_of,
-        labels_of,
-        shared,
-        why_not,
-    )
+    from hypogoal.evaluation import compare as beside
     from hypogoal.evaluation.page import Material, draw_page
+    from hypogoal.evaluation.provenance import domains_of
     from hypogoal.evaluation.questions import meanings
 
     claim(out, kind="comparison", inputs=runs, force=force)
     if len({run.resolve() for run in runs}) < max(2, len(runs)):
         where = " ".join(map(str, runs))
         raise UserError("a comparison takes two different runs or more", where, "Name each run once.")
-    labels = labels_of([run.resolve().as_posix() for run in runs])
+    labels = beside.labels_of([run.resolve().as_posix() for run in runs])
     found = {label: read_evaluation(run, "curves/") for label, run in zip(labels, runs, strict=True)}
     metrics = {label: one.metrics for label, one in found.items()}
     with fitting(" ".join(map(str, runs))):
-        reason = why_not(metrics)
+        reason = beside.why_not(metrics)
         if reason is not None:
             raise UserError("these runs cannot be compared", reason, "Choose runs of one experiment, evaluated alike.")
         about = {
@@ -57,9 +50,9 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
                 for label, run in zip(labels, runs, strict=True)
             ],
             "domains": domains_of(metrics[labels[0]]),
-            "shared": shared(metrics),
-            "differences": differences(metrics),
-            "comparisons": plain(compare_runs(metrics)),
+            "shared": beside.shared(metrics),
+            "differences": beside.differences(metrics),
+            "comparisons": plain(beside.compare_runs(metrics)),
             **{
                 table: {label: own[table] for label, own in metrics.items()}
                 for table in ("agents", "hypotheses", "rooms", "distance")
@@ -67,7 +60,9 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
             "quantities": meanings(),
         }
         material = Material(about, {})
-        sections = compared_sections(metrics, {label: one.arrays for label, one in found.items()}, about, material)
+        sections = beside.compared_sections(
+            metrics, {label: one.arrays for label, one in found.items()}, about, material
+        )
         version = versions().get("hypogoal", "unknown")
         page = draw_page(
             f"hypogoal: {len(runs)} runs compared", f"{', '.join(labels)}; hypogoal {version}", sections, version

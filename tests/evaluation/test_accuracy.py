@@ -128,7 +128,7 @@ def test_examples_show_every_kind():
     """Spec F7: disagreement, error and agreement, each with the state that shows it best."""
     probabilities = np.array([[0.9, 0.1], [0.6, 0.4], [0.8, 0.9], [0.99, 0.97], [0.1, 0.2], [0.45, 0.7]], np.float32)
     labels = np.array([YES, YES, NO, YES, NO, NO])
-    assert pick_examples(probabilities, labels) == [
+    assert pick_examples(probabilities, probabilities > 0.5, labels) == [
         (0, "disagree"), (5, "disagree"), (2, "wrong"), (3, "right yes"), (4, "right no"),
     ]  # fmt: skip
 

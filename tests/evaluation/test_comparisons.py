@@ -11,7 +11,7 @@ from hypogoal.evaluation.page import comparison_tables
 
 def pairs(first, second, units=None, **more):
     first, second = np.array(first, dtype=float), np.array(second, dtype=float)
-    return compare_pairs(first, second, units or range(len(first)), np.random.default_rng(0), **more)
+    return compare_pairs(first, second, units or range(len(first)), **more)
 
 
 def test_probability_of_improvement_by_hand():
@@ -24,22 +24,11 @@ def test_probability_of_improvement_by_hand():
 
 
 def test_a_win_in_every_pair_is_not_certainty():
-    """Spec F5: five of five: nothing to resample, so the interval has no width; the sign test is 2 / 2**5."""
+    """Spec F5: five of five: they do not vary, so the interval has no width; the sign test is 2 / 2**5."""
     found = pairs([2, 3, 4, 5, 6], [1, 2, 2, 3, 5])
     assert found["interval"] == [1, 1]
     assert found["sign_test"] == pytest.approx(2 / 2**5)
     assert found["difference"] == pytest.approx(7 / 5)
-
-
-def test_the_interval_is_drawn_within_strata():
-    """Spec F5: one layout always won, the other always lost: other seeds of these layouts would give 1/2 again.
-
-    Drawn from all four pairs, 1 in 16 resamples would be all wins, so the 95 % interval would be 0 to 1.
-    """
-    first, second = [1, 1, 0, 0], [0, 0, 1, 1]
-    within = pairs(first, second, [5, 5, 6, 6], within=True)
-    assert (within["interval"], within["interval_over"]) == ([0.5, 0.5], "runs within layouts")
-    assert pairs(first, second, [5, 6, 7, 8], within=True)["interval"] == [0, 1]
 
 
 def test_pairs_of_one_unit_are_one_piece_of_evidence():
@@ -50,7 +39,8 @@ def test_pairs_of_one_unit_are_one_piece_of_evidence():
     found = pairs([1, 1, 0, 1, 1, 1, 0, 0, 0], [0] * 2 + [1] + [0] * 3 + [1] * 3, [5, 5, 5, 6, 6, 6, 7, 7, 7])
     assert (found["units"], found["wins"], found["n"]) == (3, 5, 9)
     assert found["sign_test"] == 1.0  # two of three
-    assert found["difference_interval"] == pytest.approx([-1, 1])
+    assert found["difference_interval"] == pytest.approx([1 / 9 - 2.5297, 1 / 9 + 2.5297], abs=1e-3)
+    assert found["interval"] == [0, 1]  # a probability's is cut there
     assert pairs([3, 3], [1, 3], [0, 1])["sign_test"] == 1.0  # a unit that ties is left out
 
 
@@ -80,7 +70,8 @@ def test_agents_are_paired_by_layout_and_seed():
     success, length, _ = rows
     assert (success["ties"], success["probability"]) == (3, 0.5)
     assert (length["n"], length["wins"]) == (3, 2)
-    assert length["difference"] == pytest.approx((-12 + 1 - 10) / 3)
+    assert length["units"] == 2
+    assert length["difference"] == pytest.approx(((-12 + 1) / 2 - 10) / 2)  # each layout once
     assert curves.against([]) == curves.against([own]) == []
 
 
@@ -91,14 +82,13 @@ def ensemble(name, seed, **best):
 
 def test_ensembles_are_paired_by_seed_and_sub_goal():
     """Spec F1: D-BAT first, whatever comes first on disk; over all sub-goals and for each."""
-    rows = hypotheses.against(
-        [
-            ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
-            ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
-            ensemble("dbat, K=2", 0, red=0.8, door=0.8),
-            ensemble("dbat, K=2", 1, red=0.9, door=1.0),
-        ]
-    )
+    ensembles = [
+        ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
+        ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
+        ensemble("dbat, K=2", 0, red=0.8, door=0.8),
+        ensemble("dbat, K=2", 1, red=0.9, door=1.0),
+    ]
+    rows = hypotheses.QUESTION.pairs({"ensembles": ensembles})["hypotheses"]
     best = {row["where"]: row for row in rows if "best" in row["quantity"]}
     assert list(best) == [ALL, "door", "red"] or list(best) == [ALL, "red", "door"]
     assert best[ALL]["first"] == "dbat, K=2"
@@ -116,7 +106,8 @@ def judged(method, groups, seed, best):
 def test_methods_on_ladders_are_paired_at_each_number_of_groups():
     """Spec F1: N=1 with N=1; where nothing could be validated there is no pair."""
     bests = {"none": 0.5, "dbat": 0.6}
-    rows = rooms.against([judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)])
+    ensembles = [judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)]
+    rows = rooms.QUESTION.pairs({"ensembles": ensembles})["rooms"]
     found = {(row["where"], row["quantity"].split(", ")[1]): row for row in rows}
     assert found["N=2", "best member"]["difference"] == pytest.approx(0.1)
     assert found["N=1", "best member"]["n"] == 1
@@ -131,12 +122,13 @@ def stopped(method, ladder, seed, distance):
 
 def test_options_are_paired_by_ladder_and_seed():
     """Spec F3: the nearer is the better; oracle terminations are not a method."""
-    rows = distance.against(
+    options = (
         [
             stopped("none", "1L", 0, 40), stopped("none", "1R", 0, 10), stopped("dbat", "1L", 0, 10),
             stopped("dbat", "1R", 0, 20), stopped("oracle termination", "1L", 0, 0),
         ]
     )  # fmt: skip
+    rows = distance.QUESTION.pairs({"distance": {"options": options}})["distance"]
     row, _, mean = rows
     assert (row["first"], row["second"], row["wins"], row["n"], row["where"]) == ("dbat", "none", 1, 2, "N=2")
     assert (row["units"], row["difference"]) == (1, -10)
@@ -168,7 +160,7 @@ def test_what_is_alike_in_all_counts_each_for_itself():
     others = [run(5, 0, length) for length in (11, 22, 33)]
     rows = curves.against([{"name": "a", "runs": runs}, {"name": "b", "runs": others}])
     length = next(row for row in rows if row["quantity"] == "length")
-    assert (length["n"], length["wins"], length["units"]) == (3, 3, 1)
+    assert (length["n"], length["wins"], length["units"]) == (3, 3, 3)
     assert length["difference"] == pytest.approx(-2)
 
 

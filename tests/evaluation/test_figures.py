@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hypogoal.evaluation.curves import Line, learning_curves
-from hypogoal.evaluation.distance import Bar, distance_bars
+from hypogoal.evaluation.distance import distance_bars
 from hypogoal.evaluation.hypotheses import best_mean_worst_members
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.evaluation.plots import BLUE, VERMILLION, to_png, to_svg
@@ -21,9 +21,19 @@ def curves():
     return learning_curves(GRID, lines, "reward per episode", [("random play", 0.1)], (0, 1))
 
 
+def of_members(name, sub_goal, best, mean, worst):
+    """As metrics.json has it: null where there is no number."""
+    scores = {"best": best, "mean": mean, "worst": worst}
+    return {"name": name, "sub_goal": sub_goal, **{which: {"mean": score} for which, score in scores.items()}}
+
+
 def members():
-    values = np.array([[0.9, 0.8, 0.7], [1.0, np.nan, 0.5]])
-    return best_mean_worst_members(["red", "blue"], [("dbat, K=3", values), ("single CNN", values - 0.1)])
+    found = [
+        ("dbat, K=3", "red", 0.9, 0.8, 0.7),
+        ("dbat, K=3", "blue", 1.0, None, 0.5),
+        ("single CNN", "red", 0.8, 0.7, 0.6),
+    ]
+    return best_mean_worst_members([of_members(*values) for values in found])
 
 
 def preferences():
@@ -74,7 +84,7 @@ def long_curves():
 
 
 def long_members():
-    return best_mean_worst_members(["red"], [(name, np.full((1, 3), 0.8)) for name in LONG])
+    return best_mean_worst_members([of_members(name, "red", 0.8, 0.8, 0.8) for name in LONG])
 
 
 def long_preferences():
@@ -112,9 +122,9 @@ def test_a_name_that_begins_with_an_underscore_is_in_the_legend():
     values = np.linspace(0, 1, 11)[None]
     for figure in (
         preference_against_match(["_x", "red"], match, match),
-        best_mean_worst_members(["red"], [("_x", np.full((1, 3), 0.8)), ("red", np.full((1, 3), 0.7))]),
+        best_mean_worst_members([of_members(name, "red", 0.8, 0.8, 0.8) for name in ("_x", "red")]),
         learning_curves(GRID, [Line("_x", values, BLUE), Line("red", values, VERMILLION)], "reward"),
-        distance_bars([Bar(name, "N=1", 4.0, 1.0, (3.0, 5.0)) for name in ("_x", "red")], ["_x", "red"], 300),
+        distance_bars([(name, "N=1", 4.0, 1.0, (3.0, 5.0)) for name in ("_x", "red")], ["_x", "red"], 300),
     ):
         (legend,) = figure.legends
         assert [text.get_text().strip() for text in legend.get_texts()] == ["_x", "red"]

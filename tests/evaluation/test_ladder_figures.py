@@ -3,28 +3,32 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.distance import Bar, Stops, distance_bars, stops_over_rooms
+from hypogoal.evaluation.distance import distance_bars, stops_over_rooms
 from hypogoal.evaluation.plots import to_png, to_svg
-from hypogoal.evaluation.rooms import Panel, Series, bands, scores_over_groups
+from hypogoal.evaluation.rooms import bands, scores_over_groups
 
-GROUPS = np.array([1, 2, 7])
+ACCURACY = ("accuracy, all rooms", "all", "accuracy", "best")
+BALANCED = ("balanced, unseen", "unseen", "balanced_accuracy", "best")
+
+
+def row(method, groups, mean, deviation=None, never=None):
+    """As metrics.json has it: null where there is no number."""
+    best = {"best": {"mean": mean, "standard_deviation": deviation}}
+    scores = {scope: {"accuracy": best, "balanced_accuracy": best} for scope in ("all", "unseen")}
+    about = {"method": method, "groups": groups, "scores": scores}
+    return {**about, "always_no": {"all": never}, "positives": {"all": 3, "unseen": int(groups == 1)}}
 
 
 def scores():
-    several = Series("dbat, K=6", GROUPS, np.array([0.6, 0.9, np.nan]), np.array([0.1, 0.05, np.nan]))
-    single = Series("single CNN", GROUPS[:1], np.array([0.5]), np.array([np.nan]))
-    panels = [
-        Panel("accuracy, all rooms", {1: 0.9, 7: 0.8}, [several, single]),
-        Panel("balanced, unseen", {1: 0.5}, [several]),
-    ]
-    return scores_over_groups(panels, ["dbat, K=6", "single CNN"])
+    several = [row("dbat, K=6", 1, 0.6, 0.1, 0.9), row("dbat, K=6", 2, 0.9, 0.05), row("dbat, K=6", 7, None, None, 0.8)]
+    return scores_over_groups([*several, row("single CNN", 1, 0.5, None, 0.9)], [ACCURACY, BALANCED])
 
 
 def bars():
     found = [
-        Bar("dbat, K=6", "N=1", 40.0, 5.0, (35.0, 45.0)),
-        Bar("single CNN", "N=1", 280.0, np.nan, (280.0,)),
-        Bar("oracle termination", "true sub-goal", 2.0, 0.0, (2.0, 2.0)),
+        ("dbat, K=6", "N=1", 40.0, 5.0, (35.0, 45.0)),
+        ("single CNN", "N=1", 280.0, np.nan, (280.0,)),
+        ("oracle termination", "true sub-goal", 2.0, 0.0, (2.0, 2.0)),
     ]
     return distance_bars(found, ["dbat, K=6", "single CNN"], 300)
 
@@ -33,7 +37,7 @@ def stops(rooms=(1, 4)):
     pictures = [(room, np.full((210, 160, 3), 40, np.uint8)) for room in rooms]
     where = np.array([1, 1, 4, 9])
     pixels = np.array([[20.5, 30], [40, 50], [60, 70], [0, 0]])
-    return stops_over_rooms(pictures, [Stops("dbat", where, pixels, np.array([0, 1, 2, 0])) for _ in range(3)])
+    return stops_over_rooms(pictures, [("dbat", where, pixels, np.array([0, 1, 2, 0]))] * 3)
 
 
 @pytest.mark.parametrize(
@@ -68,9 +72,9 @@ NAMES = [f"dbat, K=3, some_setting=value-{index}" for index in range(20)]
 
 def test_many_methods_are_told_apart():
     """Figures 3 and 4: all of them in the legend, which the figure has room for, and no two drawn alike."""
-    lines = [Series(name, GROUPS, np.full(3, 0.6), np.full(3, 0.1)) for name in NAMES]
-    bars = [Bar(name, "N=1", 40.0, np.nan, (40.0,)) for name in NAMES]
-    curves, columns = scores_over_groups([Panel("all rooms", {}, lines)], NAMES), distance_bars(bars, NAMES, 300)
+    lines = [row(name, groups, 0.6, 0.1) for name in NAMES for groups in (1, 2, 7)]
+    bars = [(name, "N=1", 40.0, np.nan, (40.0,)) for name in NAMES]
+    curves, columns = scores_over_groups(lines, [ACCURACY]), distance_bars(bars, NAMES, 300)
     for figure in (curves, columns):
         to_png(figure)  # lays it out
         (legend,) = figure.legends
@@ -87,8 +91,7 @@ def test_many_methods_are_told_apart():
 def test_with_one_n_methods_stand_side_by_side_with_error_bars():
     """Figure 3: a band would have no width, and methods would hide each other."""
     names = NAMES[:3]
-    one = [Series(name, GROUPS[:1], np.array([0.8]), np.array([0.1])) for name in names]
-    axes = scores_over_groups([Panel("all rooms", {1: 0.5}, one)], names).axes[0]
+    axes = scores_over_groups([row(name, 1, 0.8, 0.1) for name in names], [BALANCED]).axes[0]
     assert len(axes.containers) == 3
     places = [bars.lines[2][0].get_segments()[0] for bars in axes.containers]
     np.testing.assert_allclose([place[:, 1] for place in places], [[0.7, 0.9]] * 3)

@@ -17,6 +17,9 @@ from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation import explorer, judging
+from hypogoal.evaluation.page import Material
+from hypogoal.evaluation.questions import OLDER, render
+from hypogoal.evaluation.run import read_evaluation
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
 from hypogoal.stages.evaluate import evaluate, summary_table
@@ -87,6 +90,14 @@ def test_members_are_judged_room_by_room(run, metrics):
         len(ROOMS) * STATES_PER_ROOM - sum(ROOMS.values())
     )
     assert {row["kind"] for row in rooms["false_positives"]} == {"near-base", "on-ladder", "elsewhere"}
+
+
+def test_intervals_of_before_are_told(run, page):
+    """Spec F5: captions say what intervals are; those of an evaluation of before are not."""
+    found = read_evaluation(run)
+    before = {**found.metrics, "quantities": {"interval": {"unit": "", "meaning": "95 % bootstrap interval"}}}
+    assert OLDER not in page
+    assert OLDER in render(Material(before, found.arrays), "0")
 
 
 def test_any_number_of_processes_gives_the_same_evaluation(small, tmp_path, monkeypatch):

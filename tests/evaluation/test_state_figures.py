@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hypogoal.evaluation.plots import to_file, to_svg
-from hypogoal.evaluation.saliency import Explained, attributions_of_every_frame, attributions_of_members
+from hypogoal.evaluation.saliency import EXPLAINED, attributions_of_every_frame, attributions_of_members
 from hypogoal.evaluation.selection import termination_states
 
 
@@ -12,7 +12,8 @@ def explained(members, channels):
     rng = np.random.default_rng(0)
     state = rng.integers(0, 256, (12, 12, channels), dtype=np.uint8)
     values = rng.normal(size=(members, 12, 12, channels))
-    return Explained(state, state, values, np.linspace(0.1, 0.9, members), np.arange(members) > 0, True)
+    said = (np.linspace(0.1, 0.9, members), np.arange(members) > 0, True)
+    return dict(zip(EXPLAINED, (state, state, values, *said), strict=True))
 
 
 def pictures(figure):
