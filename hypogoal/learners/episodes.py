@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.checkpoints import State
+from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.files import write_table
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Step
 
 EPISODE_COLUMNS = ("step", "length", "reward", "terminated")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.resumable import Resumable
+from hypogoal.core.checkpoints import Resumable
 
 FAN = 64  # children of a node: 1e5 leaves are three levels, and NumPy's cost is by the call
 

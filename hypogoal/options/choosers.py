@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.resumable import Resumable
+from hypogoal.core.checkpoints import Resumable
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
 

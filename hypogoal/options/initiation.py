@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
-from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.domains.base import Engine

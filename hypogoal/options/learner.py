@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import State
+from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine, Step, step_of
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.learners.episodes import Episodes
 from hypogoal.options.choosers import Outcome

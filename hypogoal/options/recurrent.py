@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
 from hypogoal.domains.base import Engine

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.resumable import Resumable
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.domains.base import Domain, Engine
