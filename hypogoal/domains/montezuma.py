@@ -1,8 +1,8 @@
 """Montezuma's Revenge, climbing down ladders (Spec B4, B5): the domain as the stages see it, how states are collected.
 
 The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezuma_ladders`` (where the ladders are),
-``montezuma_rollouts`` and ``montezuma_states`` (what is collected), ``montezuma_env`` and ``montezuma_engine`` (one
-game and many, from the top of a ladder on).
+``montezuma_states`` (what is collected), ``montezuma_env`` and ``montezuma_engine`` (one game and many, from the top
+of a ladder on).
 """
 
 from __future__ import annotations
@@ -27,8 +27,15 @@ from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observ
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS
 from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
-from hypogoal.domains.montezuma_rollouts import PLAYS
-from hypogoal.domains.montezuma_states import KINDS, RoomStates, emulator_of_process, gather, labels_of, origins_of
+from hypogoal.domains.montezuma_states import (
+    KINDS,
+    PLAYS,
+    RoomStates,
+    emulator_of_process,
+    gather,
+    labels_of,
+    origins_of,
+)
 
 # The unlabelled rooms where none are given: the first of these ladder rooms that has no labels, and a room without a
 # ladder; where all have labels, two without.
