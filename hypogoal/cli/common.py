@@ -47,9 +47,6 @@ Set = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Change a setting; see 'hypogoal config'."),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=MOST_INTEGER, help="Seed of everything that is random.")]
-LayoutSeed = Annotated[
-    int | None, typer.Option("--layout-seed", min=0, max=MOST_INTEGER, help="The layout to learn on.")
-]
 Force = Annotated[bool, typer.Option("--force", help="Replace what stands at --out.")]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with what was begun; keep a complete --out as it is; else begin.")
@@ -67,17 +64,6 @@ def values_of(assignments: Iterable[str] | None) -> list[str]:
     return [value.strip() for text in texts for value in text.split(",")]
 
 
-def domain_of(artefact: Path, kind: str) -> str:
-    """The domain of a data file (kind ``data``) or of an artefact."""
-    if kind == "data":
-        from hypogoal.dataset import open_dataset
-
-        return open_dataset(artefact).domain
-    from hypogoal.core.artefacts import open_artefact
-
-    return str(open_artefact(artefact, kind).config["domain"])
-
-
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
     """The numbers of states of a data file."""
     if quiet:
@@ -88,14 +74,12 @@ def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
     say(f"unlabelled                     {counts['unlabelled']:7d} states")
 
 
-def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
+def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
     """What training came to; what NaN says, that no episode has ended, the number of episodes says too."""
     if not quiet:
         known = {key: value for key, value in numbers.items() if not (isinstance(value, float) and math.isnan(value))}
-        text = ", ".join(
-            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in known.items()
-        )
-        say(text)
+        texts = (f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in known.items())
+        say(", ".join(texts))
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:

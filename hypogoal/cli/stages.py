@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from hypogoal.cli.common import (
     Device,
     Force,
-    LayoutSeed,
     Out,
     Preset,
     Quiet,
@@ -18,12 +21,17 @@ from hypogoal.cli.common import (
     Seed,
     Set,
     app,
-    domain_of,
     print_counts,
     print_outcome,
     values_of,
 )
+from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import draw, give, say
+
+EnsembleFolder = Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")]
+LayoutSeed = Annotated[
+    int | None, typer.Option("--layout-seed", min=0, max=MOST_INTEGER, help="The layout to learn on.")
+]
 
 
 @app.command()
@@ -49,10 +57,66 @@ def collect(
     give(out)
 
 
-@app.command("train-ensemble")
+def _common(
+    out: Out,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """The options of every training command."""
+
+
+def training(told: Callable[..., None]) -> None:
+    """Make the command of a training stage, which is called as ``told`` is: that one's signature says what it reads and
+    which options it alone has, those of its settings and those of the stage itself.
+    """
+    stage = told.__name__.replace("_", "-")
+    source, *own = inspect.signature(told, eval_str=True).parameters.values()
+    out, *others = inspect.signature(_common, eval_str=True).parameters.values()
+
+    def command(preset: str | None, set_: list[str] | None, **given: Any) -> None:
+        from hypogoal.core import own_code
+        from hypogoal.domains.base import defaults_of
+        from hypogoal.settings import CONFIGS, configuration
+
+        read, path, named = given.pop(source.name), given.pop("out"), source.name == "domain"
+        domain = read if named else _domain_of(read, source.name)
+        settings = {field.name for field in fields(CONFIGS[stage])}
+        options = {option.name: given.pop(option.name) for option in own if option.name in settings}
+        config = configuration(stage, domain, preset, set_, options, given=named)
+        words, vouched = [], []
+        if "diversity" in options:  # the user's own words and the domain's may name code, what a preset says may not
+            words = [options["diversity"] or "", *values_of(set_)]
+            vouched = [value for value in defaults_of(domain, stage).values() if isinstance(value, str)]
+        run = getattr(import_module(f"hypogoal.stages.{told.__name__}"), told.__name__)
+        given = {name: value for name, value in given.items() if value is not None}
+        with own_code.given(*words), own_code.vouched(*vouched):
+            numbers = run(read, config, path, **given)
+        if numbers:
+            print_outcome(numbers, given["quiet"])
+        give(path)
+
+    parameters = [source, out, *own, *others]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    app.command(stage, help=told.__doc__)(command)
+
+
+def _domain_of(read: Path, kind: str) -> str:
+    """The domain of a data file (kind ``data``) or of an artefact."""
+    from hypogoal.core.artefacts import open_artefact
+    from hypogoal.dataset import open_dataset
+
+    return open_dataset(read).domain if kind == "data" else str(open_artefact(read, kind).config["domain"])
+
+
+@training
 def train_ensemble(
     data: Annotated[Path, typer.Argument(help="The HDF5 file that 'collect' wrote.")],
-    out: Out,
     diversity: Annotated[
         str | None, typer.Option(help="dbat, none, another (docs/concepts.md), or module:function.")
     ] = None,
@@ -64,110 +128,34 @@ def train_ensemble(
             "meta-policy, instead of DATA's; repeatable."
         ),
     ] = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
 ) -> None:
     """Train an ensemble of diverse classifiers for each sub-goal."""
-    from hypogoal.core import own_code
-    from hypogoal.domains.base import defaults_of
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_ensemble import train_ensemble as stage
-
-    given = {"diversity": diversity, "members": members}
-    domain = domain_of(data, "data")
-    config = configuration("train-ensemble", domain, preset, set_, given)
-    own = [value for value in defaults_of(domain, "train-ensemble").values() if isinstance(value, str)]
-    others = tuple(unlabelled or ())
-    with own_code.given(diversity or "", *values_of(set_)), own_code.vouched(*own):  # and not what a preset says
-        stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
-    give(out)
 
 
-@app.command("train-options")
-def train_options(
-    ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
-    out: Out,
-    layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-) -> None:
+@training
+def train_options(ensemble: EnsembleFolder, layout_seed: LayoutSeed = None) -> None:
     """Learn an option policy for every member, options chosen at random."""
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_options import train_options as stage
-
-    given = {"layout_seed": layout_seed}
-    config = configuration("train-options", domain_of(ensemble, "ensemble"), preset, set_, given)
-    print_outcome(
-        stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
-    )
-    give(out)
 
 
-@app.command("train-meta")
+@training
 def train_meta(
-    ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
-    out: Out,
+    ensemble: EnsembleFolder,
     options: Annotated[Path | None, typer.Option(help="Continue the options of 'train-options'.")] = None,
     layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
 ) -> None:
     """Learn which options to choose, by the environment's reward."""
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_meta import train_meta as stage
-
-    given = {"layout_seed": layout_seed}
-    config = configuration("train-meta", domain_of(ensemble, "ensemble"), preset, set_, given)
-    print_outcome(
-        stage(
-            ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
-        ),
-        quiet,
-    )
-    give(out)
 
 
-@app.command("train-baseline")
+@training
 def train_baseline(
     domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
-    out: Out,
     agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
     data: Annotated[
         Path | None, typer.Option(help="States of the domain: play in the world that they were collected in.")
     ] = None,
     layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
 ) -> None:
     """Train PPO or DQN on the primitive actions, for comparison."""
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_baseline import train_baseline as stage
-
-    given = {"agent": agent, "layout_seed": layout_seed}
-    config = configuration("train-baseline", domain, preset, set_, given, given=True)
-    numbers = stage(domain, config, out, data=data, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
-    print_outcome(numbers, quiet)
-    give(out)
 
 
 @app.command()
