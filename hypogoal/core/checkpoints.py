@@ -96,11 +96,8 @@ class Checkpoints:
         return self.path is not None and self.path.is_file()
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Called where the state is whole: saves it if it is time to, or if the stage is to stop.
-
-        Raises:
-            KeyboardInterrupt: a signal came; the state is saved.
-            UserError: as of :meth:`save`.
+        """Called where the state is whole: saves it if it is time to, or if a signal came, which then is a
+        ``KeyboardInterrupt``.
         """
         if self._signal is None and time.monotonic() < self._next:
             return
@@ -114,10 +111,9 @@ class Checkpoints:
             raise KeyboardInterrupt(self._signal)
 
     def save(self, state: State) -> None:
-        """Write ``state``. One with a tensor that holds NaN or Inf is not: the last good one stays (Spec G3).
+        """Write ``state``, or raise a ``UserError``; the one before is still there then.
 
-        Raises:
-            UserError: it cannot be written; the one before is still there.
+        One with a tensor that holds NaN or Inf is not written: the last good one stays (Spec G3).
         """
         from safetensors import SafetensorError
         from safetensors.numpy import save_file
@@ -142,11 +138,7 @@ class Checkpoints:
             ) from None
 
     def load(self) -> State | None:
-        """The state last saved; None where none was.
-
-        Raises:
-            UserError: the file is damaged.
-        """
+        """The state last saved; None where none was. A damaged file is a ``UserError``."""
         from safetensors import SafetensorError
         from safetensors.numpy import load_file
 

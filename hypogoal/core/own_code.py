@@ -68,14 +68,9 @@ def environment_of_children() -> dict[str, str]:
 
 
 def require_trust(name: str, what: str) -> None:
-    """Refuse to load ``module:object`` that the user neither gave nor allowed; other names pass.
+    """Refuse (``UserError``) to load ``module:object`` that the user neither gave nor allowed; other names pass.
 
-    Args:
-        name: what a file, or the user, calls it.
-        what: what it is to be, for the message ("domain").
-
-    Raises:
-        UserError: see above.
+    ``what`` it is to be ("domain") stands in the message.
     """
     if ":" in name and name not in allowed():
         raise UserError(f"a file names code of its own as its {what}", name, f"Do you trust it? Set {TRUST}={name}")
@@ -187,11 +182,7 @@ class UsersCode:
         return UserError(f"{self.what} {self.failed} {text}", place or self._place() or None, do)
 
     def refuse(self, gave: str, do: str) -> NoReturn:
-        """What it gave is not what it promised to.
-
-        Raises:
-            UserError: with the place where the code begins.
-        """
+        """Tell (``UserError``) that what it gave is not what it promised to, with the place where the code begins."""
         raise UserError(f"{self.what} {gave}", self._place() or None, do)
 
     def _place(self) -> str:
