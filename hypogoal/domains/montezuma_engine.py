@@ -91,16 +91,13 @@ class MontezumaEngine(TurnEngine):
 
     @property
     def n_states(self) -> int:
-        """Ids known so far are 0 .. n_states - 1."""
         return len(self._alive)
 
     @property
     def oldest(self) -> int:
-        """Ids below this one, but for the S start states', are forgotten: there are no images of them."""
         return self.n_states - len(self._seen)
 
     def _begin(self, number: int) -> int:
-        """An episode of one environment; returns the start state."""
         begin = draw_start(self.starts, self.along, self._rng)
         self._emulators[number].restore(self.starts[begin].snapshot)
         return begin
@@ -129,11 +126,7 @@ class MontezumaEngine(TurnEngine):
         return ids
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, 84, 84, 4) of states (n,), into ``out`` where given.
-
-        Raises:
-            ValueError: there is no such state, it is forgotten, or ``out`` is of the wrong kind.
-        """
+        """Observations uint8 (n, 84, 84, 4) of states (n,); a ``ValueError`` where one is not there, or forgotten."""
         fixed, oldest = len(self.starts), self.oldest
         out = self.room_for(len(ids), out)
         for image, state in zip(out, self._known(ids).tolist(), strict=True):
@@ -152,7 +145,6 @@ class MontezumaEngine(TurnEngine):
         return np.frombuffer(self._alive, np.bool_)[self._known(ids)]
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Spec B4: the true predicates, bool (n, 1); of forgotten states too."""
         return labels_of(self.positions(ids), self.alive(ids))
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
@@ -179,11 +171,7 @@ class MontezumaEngine(TurnEngine):
         }
 
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments.
-
-        Raises:
-            ValueError: it was made with others.
-        """
+        """Continue from a ``snapshot`` of an engine made with the same arguments; with others, a ``ValueError``."""
         from ale_py import ALEState
 
         if snapshot["arguments"].tobytes() != self._arguments:

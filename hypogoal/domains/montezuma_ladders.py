@@ -66,11 +66,7 @@ FAR = 10**9  # more than any way is long
 
 
 def ladder_named(name: str) -> Ladder:
-    """A ladder by its name.
-
-    Raises:
-        UserError: there is none of that name.
-    """
+    """A ladder by its name; a ``UserError`` where there is none."""
     if name not in BY_NAME:
         raise UserError("unknown ladder", name, f"Choose one of {', '.join(BY_NAME)}.")
     return BY_NAME[name]

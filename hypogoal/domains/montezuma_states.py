@@ -241,10 +241,8 @@ def gather(
 def choose(
     kinds: NDArray[np.int64], positions: NDArray[np.int64], wanted: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Which ``wanted`` of states (n,) to keep: of each kind its share, spread over positions (n, 3); others at random.
-
-    Returns:
-        Their indices, in order.
+    """The indices, in order, of ``wanted`` of states (n,): of each kind its share, spread over positions (n, 3), others
+    at random.
     """
     order = rng.permutation(len(kinds))
     latest: dict[tuple[int, ...], int] = {}  # kind and position -> turn of the last state so far
