@@ -84,7 +84,6 @@ class RandomChooser(Chooser):
     def choose(
         self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """One of the offered options for each environment, int64 (n,)."""
         return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
 
     def record(self, outcome: Outcome) -> None:

@@ -18,11 +18,7 @@ LONGEST = 10_000  # steps that a random action is kept at most: Dabney et al. 20
 
 
 def action_set(engine: Engine, name: str) -> NDArray[np.int64]:
-    """The engine's actions that a policy chooses among, int64 (A,): all, or those of ``engine.action_sets[name]``.
-
-    Raises:
-        UserError: the engine has no set of that name.
-    """
+    """The actions to choose among, int64 (A,): all, or ``engine.action_sets[name]``; else a ``UserError``."""
     if name == ALL:
         return np.arange(engine.n_actions)
     if name not in engine.action_sets:
@@ -37,11 +33,7 @@ def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:
 
 
 def check_actions(state: Mapping[str, Tensor], actions: NDArray[np.int64], name: str) -> None:
-    """Refuse to continue policies that chose among other actions.
-
-    Raises:
-        UserError: they did.
-    """
+    """Refuse (``UserError``) to continue policies that chose among other actions."""
     if not np.array_equal(actions_of(state, len(actions)), actions):
         raise UserError("these options were trained with other actions", f"actions={name}", "Give the same --set.")
 
@@ -71,12 +63,8 @@ class Exploration(Resumable):
         self._left = np.zeros(environments, dtype=np.int64)
 
     def mix(self, policy: NDArray[np.int64], epsilon: NDArray[np.float64], age: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Actions int64 (E,): the policy's (E,), or random ones.
-
-        Args:
-            policy: what the policies would play.
-            epsilon: of each environment's policy, (E,).
-            age: steps since each environment's execution began, (E,).
+        """Actions int64 (E,): the policy's (E,), or random ones, by ``epsilon`` (E,), ``age`` (E,) steps after
+        executions began.
         """
         count = len(policy)
         begins = self.rng.random(count) < epsilon

@@ -151,10 +151,8 @@ class Learner(Resumable, ABC):
         return state | {name: torch.from_numpy(getattr(self, name).copy()) for name in COUNTERS}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from the weights and counters of an artefact; replays start empty.
-
-        Raises:
-            UserError: they are not of as many options with the same actions.
+        """Continue from the weights and counters of an artefact; replays start empty. What does not fit is a
+        ``UserError``.
         """
         check_actions(state, self.actions, self.config.actions)
         self.load_weights(state)

@@ -164,10 +164,8 @@ class OptionLoop(Resumable):
         self.option[done] = NONE
 
     def snapshot(self) -> State:
-        """As of :class:`Resumable`; the engine's in it."""
         return {"engine": self.engine.snapshot(), **super().snapshot()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """As of :class:`Resumable`."""
         self.engine.restore(snapshot["engine"])
         super().restore(snapshot)

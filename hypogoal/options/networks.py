@@ -85,11 +85,7 @@ class PictureEmbedding(nn.Module):
 
 
 def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | PictureEmbedding:
-    """Cells where whole ones fill the image, else convolutions over the picture.
-
-    Raises:
-        UserError: it is too small for these.
-    """
+    """Cells where whole ones fill the image, else convolutions over it; a ``UserError`` where it is too small."""
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:

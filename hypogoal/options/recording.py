@@ -122,7 +122,6 @@ class Recorder(Resumable):
         self._window[:] = 0
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """As of :class:`Resumable`."""
         super().restore(snapshot)
         self.executions = [deque((Execution(*row) for row in rows), EXECUTIONS_KEPT) for rows in self.executions]
 
@@ -141,9 +140,7 @@ class Recorder(Resumable):
     def write_executions(self, folder: Path, distance: Callable[[NDArray[np.int64]], NDArray[np.int64]]) -> None:
         """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
 
-        Args:
-            folder: where.
-            distance: of positions (n, 3) from where the sub-goal truly holds, int (n,).
+        ``distance`` is of positions (n, 3) from where the sub-goal truly holds, int (n,).
         """
         rows = [row for option in self.executions for row in option]
         at = self.engine.positions(np.array([row.state for row in rows], dtype=np.int64).reshape(-1))

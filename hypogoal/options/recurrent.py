@@ -200,12 +200,10 @@ class RecurrentLearner(Learner):
         return float(loss.detach())
 
     def weights(self) -> dict[str, Tensor]:
-        """As of :class:`Learner`."""
         states = [member.online.state_dict() for member in self.members]
         return {f"{option}.{name}": value for option, state in enumerate(states) for name, value in state.items()}
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """As of :class:`Learner`."""
         for option, member in enumerate(self.members):
             of_option = below(f"{option}.", weights)
             check_fit(member.online.state_dict(), of_option, f"option {option} of options.safetensors", AGAIN)
