@@ -135,11 +135,7 @@ class Experiment:
 
 
 def read_experiment(path: Path) -> Experiment:
-    """An experiment in a TOML file.
-
-    Raises:
-        UserError: not such a file.
-    """
+    """An experiment in a TOML file; a ``UserError`` where it is none."""
     text = read_text(path, "the experiment is", "Give a .toml file.", MAX_PRESET_BYTES)
     table = parse_toml(text, path, "the experiment is", MEND)
     _check_keys(table, KEYS, path)

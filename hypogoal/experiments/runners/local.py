@@ -28,13 +28,9 @@ class Outcome:
 
 
 def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool = False) -> Outcome:
-    """Run what is not finished; a cell that fails stops only those that need it.
+    """Run what is not finished; a cell that fails stops only those that need it. ``say`` is told what happens.
 
-    Args:
-        plan: the cells, which of them are to be made again though finished, and how many cores they may use.
-        run: the run's folder.
-        say: told what happens, a line at a time.
-        check: all are there: have the stage of each say whether its command makes what is there.
+    ``check``: all are there, have the stage of each say whether its command makes what is there.
     """
     outcome = Outcome(waiting=list(plan.cells))
     places = {cell.name: place for place, cell in enumerate(plan.cells)}

@@ -101,19 +101,11 @@ def arrays(plan: Plan, todo: Sequence[Cell], most: int = MOST_ELEMENTS) -> list[
 
 
 def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> list[dict[str, Any]]:
-    """Write a script for each array into ``run/slurm`` and submit it; one more job gathers the numbers at the end.
+    """Write a script for each array of ``todo`` into ``run/slurm`` and submit it; one more job gathers the numbers at
+    the end.
 
-    Args:
-        plan: all cells.
-        run: the run's folder, which every node must see under the same path.
-        todo: those that are not finished.
-        options: what to ask of Slurm.
-
-    Returns:
-        Of each job its number (``id``), name and cells.
-
-    Raises:
-        UserError: there is no Slurm, it refuses, or jobs of this sweep are still in its queue.
+    Every node must see the run's folder under the same path. Returns of each job its number (``id``), name and cells.
+    No Slurm, one that refuses, or jobs of this sweep still in its queue are a ``UserError``.
     """
     check(run, options)
     if alive := queued(run):
@@ -150,11 +142,7 @@ def most_elements() -> int:
 
 
 def check(run: Path, options: Options) -> None:
-    """Check, before anything is written, that jobs can be asked for.
-
-    Raises:
-        UserError: there is no Slurm, or an option or the run's path is not one that a batch script can have.
-    """
+    """Refuse (``UserError``), before anything is written, where there is no Slurm, or what no batch script can have."""
     if shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     for text in (options.partition, options.time, options.memory, *options.extra):
@@ -260,10 +248,8 @@ def queued(run: Path) -> list[str]:
 
 
 def cancel(run: Path) -> int:
-    """Have Slurm end every job of a run; cells that run save where they are. Returns how many jobs there were.
-
-    Raises:
-        UserError: there are none, or Slurm does not end them.
+    """Have Slurm end every job of a run (else a ``UserError``); cells that run save where they are. Returns how many
+    there were.
     """
     alive = queued(run)
     if not alive:
@@ -303,8 +289,7 @@ class _Signals:
 def run_job(run: Path, name: str) -> None:
     """Run the cell called ``name`` of the sweep in ``run``; the job's processors are what it may use.
 
-    Raises:
-        UserError: there is no such cell, something it needs is not there, or it failed.
+    Where there is no such cell, what it needs is not there, or it fails, it is a ``UserError``.
     """
     signals = _Signals()
     plan, _ = read_plan(run)
