@@ -59,10 +59,8 @@ class Episodes(list[tuple[int, int, float, int]], Resumable):
         write_table(folder / "episodes.csv", EPISODE_COLUMNS, self)
 
     def snapshot(self) -> State:
-        """As of :class:`Resumable`."""
         return {**super().snapshot(), "rows": np.array(self, np.float64).reshape(-1, len(EPISODE_COLUMNS))}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """As of :class:`Resumable`."""
         super().restore(snapshot)
         self[:] = [(int(row[0]), int(row[1]), row[2], int(row[3])) for row in snapshot["rows"].tolist()]

@@ -109,7 +109,6 @@ class PrioritisedReplay(Resumable):
         self.tree.set(indices, priorities**self.alpha)
 
     def snapshot(self) -> dict[str, Any]:
-        """What a resumed run needs to go on exactly."""
         return {
             "data": {name: values[: self.size].copy() for name, values in self.data.items()},
             "priorities": self.tree.get(np.arange(self.size)),

@@ -69,11 +69,7 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 
 
 def hyperparameters(agent: str, name: str) -> PPOSettings | DQNSettings:
-    """The hyperparameters of ``agent`` (ppo, dqn) in setting ``name`` (paper, tuned).
-
-    Raises:
-        UserError: there is no such agent or setting.
-    """
+    """Those of ``agent`` (ppo, dqn) in setting ``name`` (paper, tuned); a ``UserError`` where there are none."""
     try:
         return HYPERPARAMETERS[agent, name]
     except KeyError:
