@@ -59,7 +59,6 @@ class MetaPolicy(Chooser):
     def choose(
         self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """Draw an option for each of n environments in states ``ids`` among those offered, bool (n, O)."""
         with torch.no_grad():
             scores = self._outputs(ids)[:, :-1].cpu()
             mask = torch.from_numpy(offered)
@@ -73,7 +72,6 @@ class MetaPolicy(Chooser):
         return options.numpy()
 
     def record(self, outcome: Outcome) -> None:
-        """The chosen options ended as ``outcome`` says."""
         came_of_it = {
             "environment": outcome.environments,
             "returned": outcome.returns,
@@ -85,7 +83,6 @@ class MetaPolicy(Chooser):
         self._finished.append({name: values[outcome.environments] for name, values in self._open.items()} | came_of_it)
 
     def learn(self) -> dict[str, float]:
-        """Update when enough decisions are finished; returns numbers to log, empty when none was due."""
         if sum(len(part["state"]) for part in self._finished) < self.config.decisions:
             return {}
         decisions, self._finished = _joined(self._finished), []
@@ -144,15 +141,10 @@ class MetaPolicy(Chooser):
         self.optimiser.step()
 
     def state(self) -> dict[str, Tensor]:
-        """Weights, for an artefact."""
         return {name: value.contiguous() for name, value in self.policy.state_dict().items()}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Weights of an artefact.
-
-        Raises:
-            UserError: they are not of such a policy.
-        """
+        """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
         check_fit(self.state(), state, "meta.safetensors", AGAIN)
         self.policy.load_state_dict(state)
 
