@@ -66,10 +66,8 @@ class Marks:
         return file.parent.name if file else None
 
     def mark(self, state: NDArray[np.uint8], kind: str) -> None:
-        """Mark a state, uint8 (H, W, C); another mark of it is taken back.
-
-        Raises:
-            UserError: states marked before are of another shape.
+        """Mark a state, uint8 (H, W, C), of the shape of those before (else a ``UserError``); another mark of it is
+        taken back.
         """
         name, before = _name(state), self.of(state)
         if before is not None:
@@ -136,16 +134,10 @@ def _encoded(state: NDArray[np.uint8]) -> tuple[str, bytes]:
 
 
 def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) -> None:
-    """Show the states of ``source`` and mark them by keyboard, until the window is closed.
+    """Show the states of ``source`` and mark them by keyboard, each at once, until the window is closed.
 
-    Args:
-        source: the states.
-        marks: where the marks go, each at once.
-        sub_goal: its name.
-        fps: steps a second that are played whether a key is held or not; 0: one step for each key.
-
-    Raises:
-        UserError: there is no screen, or no pygame.
+    ``fps``: steps a second that are played whether a key is held or not; 0: one step for each key. Without a screen, or
+    pygame, it is a ``UserError``.
     """
     keys = {kind[0]: kind for kind in marks.kinds}  # p, n, u
     modes: list[str | None] = [None, *(kind for kind in ("negative", "unlabelled", "positive") if kind in marks.kinds)]
@@ -439,11 +431,7 @@ def action_help(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]] | NDArray[np.uint8]:
-    """The unlabelled states of a data file or of a ``.npz`` file, or the images of a folder.
-
-    Raises:
-        UserError: none of these, or there are no states.
-    """
+    """The unlabelled states of a data file or of a ``.npz`` file, or the images of a folder; else a ``UserError``."""
     if path.is_dir():
         return [read_image(file) for file in image_files(path)]
     if path.suffix == ".npz":
