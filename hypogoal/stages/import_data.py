@@ -86,11 +86,7 @@ def _too_small(domain: str, shape: tuple[int, ...]) -> list[str]:
 
 
 def export_data(data: Path, out: Path, *, force: bool = False) -> None:
-    """Write the states of a data file as ``.npz``, which ``import_data`` takes again.
-
-    Raises:
-        UserError: ``out`` exists or is no ``.npz``, or the sub-goals do not share their states.
-    """
+    """Write the states of a data file as ``.npz``, which ``import_data`` takes again; see :func:`write_arrays`."""
     if out.suffix != ".npz":
         raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
     out = claim(out, kind=ARRAYS, inputs=[data], force=force)

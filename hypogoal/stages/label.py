@@ -66,14 +66,8 @@ def _source(source: str, layout_seed: int, arguments: Mapping[str, Any]) -> Sour
 
 
 def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
-    """An environment by its id, of a domain, or by the function that makes it.
-
-    Args:
-        source: an id (``ALE/Freeway-v5``), a domain's name, or ``module:object``.
-        arguments: of the environment.
-
-    Raises:
-        UserError: there is no such thing.
+    """An environment by its id (``ALE/Freeway-v5``), of a domain, or by the function that makes it; else a
+    ``UserError``.
     """
     import ale_py
     import minigrid  # noqa: F401 - registers its environments when it is loaded

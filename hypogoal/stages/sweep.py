@@ -55,10 +55,8 @@ AGAIN = "give the same command again to go on"
 
 
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
-    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment.
-
-    Raises:
-        UserError: no such stage or domain, or no experiment is on that domain.
+    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment. Else a
+    ``UserError``.
     """
     if stage == "collect":
         return load_domain(domain, given=True).config_class
@@ -133,11 +131,7 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
 
 
 def _begun(out: Path, planned: Plan) -> bool:
-    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with.
-
-    Raises:
-        LostPlan: that is not known any more.
-    """
+    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with."""
     try:
         before, _ = read_plan(out)
         check_same(out, planned.cells)
@@ -204,11 +198,7 @@ def submit(
     quiet: bool = False,
     confirm: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Have Slurm run what is not finished; arguments as of :func:`sweep`, returns the jobs.
-
-    Raises:
-        UserError: as of :func:`sweep` and ``slurm.submit``.
-    """
+    """Have Slurm run what is not finished; arguments and errors as of :func:`sweep`, returns the jobs."""
     at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
     planned = replace(planned, workers=at_once)
     slurm.check(out, options)
@@ -277,11 +267,7 @@ def _begin(
 
 
 def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str], None]) -> None:
-    """Have each cell's stage say whether what is there is what its command makes.
-
-    Raises:
-        UserError: one is not.
-    """
+    """Refuse (``UserError``) what is there and not, as each cell's stage says, what its command makes."""
     alone = [replace(cell, needs=()) for cell in cells]
     outcome = run_cells(replace(planned, cells=alone, anew=frozenset(), workers=cores()), out, say=say, check=True)
     for name, why in outcome.failed.items():
@@ -290,10 +276,8 @@ def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str],
 
 
 def gather(out: Path) -> Path:
-    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former.
-
-    Raises:
-        UserError: there is no sweep, or an artefact is damaged.
+    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former. No sweep, a
+    damaged artefact: a ``UserError``.
     """
     planned, _ = read_plan(out)
     results = write_results(planned, out)

@@ -35,17 +35,10 @@ def train_meta(
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Train the meta-policy over the options of an ensemble artefact and write the artefact ``out``.
+    """Train the meta-policy over an ensemble's options, or over these ``options`` of it, and write the artefact
+    ``out``.
 
-    Args:
-        ensemble: the ensemble artefact.
-        config: see :class:`TrainMetaConfig`.
-        out: the artefact to write.
-        options: an options artefact, made from the same ensemble, to continue from.
-        seed, force, resume, quiet, device: as for every stage.
-
-    Returns:
-        Steps, episodes, and success and length over the last 100 episodes.
+    Returns steps, episodes, and success and length over the last 100 episodes.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()

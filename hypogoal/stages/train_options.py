@@ -29,9 +29,8 @@ def train_options(
 ) -> dict[str, Any]:
     """Train the options of an ensemble artefact and write the artefact ``out``.
 
-    Returns:
-        Steps, episodes, and success and length over the last 100 episodes of random choice; where each option begins
-        an episode, instead of these two the shares of ``recorder.recent``.
+    Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
+    begins an episode, instead of these two the shares of ``recorder.recent``.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
