@@ -58,13 +58,7 @@ def ensemble_disk(sub_goals: int, members: int) -> float:
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
-    """``train-options`` and ``train-meta``.
-
-    Args:
-        domain: where they play.
-        about: the ensemble manifest's configuration.
-        config: how options are learned.
-    """
+    """``train-options`` and ``train-meta`` in a domain; ``about`` is the ensemble manifest's configuration."""
     oracle = config.termination == "oracle"
     options = len(about["sub_goals"]) * (1 if oracle else about["members"])
     picture = prod(domain.observation_shape)
