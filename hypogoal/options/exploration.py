@@ -39,17 +39,11 @@ def check_actions(state: Mapping[str, Tensor], actions: NDArray[np.int64], name:
 
 
 class Exploration(Resumable):
-    """Random actions in place of a policy's own, for every environment.
+    """Random actions, of A, in place of a policy's own, for each of E environments.
 
     ``independent``: at each step with chance epsilon, one action for one step. ``persistent``: epsilon-z-greedy
-    exploration; with chance epsilon a random action is begun and kept for n steps, P(n) proportional to
-    n ** -persistence, but not beyond its execution's end.
-
-    Args:
-        config: see :class:`OptionConfig`.
-        environments: E.
-        actions: A, how many actions there are.
-        rng: where chance comes from.
+    exploration; with chance epsilon a random action is begun and kept for n steps, P(n) proportional to n **
+    -persistence, but not beyond its execution's end.
 
     Source: Dabney, Ostrovski and Barreto 2020, Temporally-Extended epsilon-Greedy Exploration.
     """

@@ -68,12 +68,7 @@ class Narrowed:
 class Initiation(Resumable):
     """The probability that an option reaches its sub-goal before its time is up, and which options it lets start.
 
-    Args:
-        engine: gives observations of state ids.
-        options: O.
-        config: ``initiation_threshold`` and ``initiation_ignored``.
-        seed: of weights and draws.
-        device: where the network is.
+    Of ``config`` it asks ``initiation_threshold`` and ``initiation_ignored``; ``seed`` is of weights and draws.
     """
 
     CHANGING = ("network", "optimiser", "rng", "states", "option", "reached", "executions", "count", "_due")

@@ -38,19 +38,10 @@ def offered_options(verdicts: NDArray[np.bool_]) -> NDArray[np.bool_]:
 class OptionLoop(Resumable):
     """Steps every environment once per call of :meth:`step`.
 
-    Args:
-        engine: the environments.
-        terminations: the options' termination classifiers.
-        learner: the intra-option policies.
-        chooser: the policy over options.
-        recorder: episodes and choices are told to it.
-        config: timeouts, masks, whether options begin at start states.
-        gamma: the meta-level's discount per environment step (E1).
-        initiation: holds options back where they do not reach their sub-goals (D7); None, it holds none back.
-        visited: is shown every state (B7).
-
-    Raises:
-        UserError: options are to begin at start states, and the engine cannot begin an episode when asked.
+    Episodes and choices are told to ``recorder``; ``config`` has timeouts, masks and whether options begin at start
+    states, a ``UserError`` where the engine cannot begin an episode when asked. ``gamma`` is the meta-level's discount
+    per environment step (E1). ``initiation`` holds options back where they do not reach their sub-goals (D7);
+    ``visited`` is shown every state (B7).
     """
 
     CHANGING = (
