@@ -259,18 +259,11 @@ def make_plan(
     device: str = "auto",
     short: bool = False,
 ) -> Plan:
-    """The cells of an experiment.
+    """The cells of an experiment in the folder ``out``; what cannot be, or is not there, is a ``UserError``.
 
-    Args:
-        experiment: which.
-        out: the run's folder.
-        assignments: ``SETTING=VALUES``, with commas between, in place of the file's; ``workers=N``, ``evaluate=false``;
-            where it has a domain also ``STAGE.KEY=VALUE``.
-        preset, device: where it has a domain.
-        short: for one that is to have one agent and no more, names without their axes.
-
-    Raises:
-        UserError: it is asked for what cannot be, or its commands for what is not there.
+    ``assignments`` are ``SETTING=VALUES``, with commas between, in place of the file's; ``workers=N``,
+    ``evaluate=false``; where it has a domain also ``STAGE.KEY=VALUE``, and ``preset`` and ``device``. ``short``: for
+    one that is to have one agent and no more, names without their axes.
     """
     return _Planner(experiment, out, [*assignments], preset, device).plan(short=short)
 

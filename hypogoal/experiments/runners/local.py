@@ -22,7 +22,6 @@ REPORT_SECONDS = 15.0
 class Outcome:
     """What became of the cells: of each that failed why, and those that wait for such a one."""
 
-    done: list[Cell] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
     waiting: list[Cell] = field(default_factory=list)
 
@@ -46,7 +45,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                     outcome.waiting.remove(cell)
                     try:
                         if cell.name not in plan.anew and is_finished(cell) and not check:
-                            _add(outcome, made, cell)
+                            made.add(cell.out)
                         else:
                             startable.append(cell)
                     except UserError as error:
@@ -69,7 +68,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                 else:
                     if started.cell.name in plan.anew:
                         made_anew(run, started.cell)
-                    _add(outcome, made, started.cell)
+                    made.add(started.cell.out)
                     say(f"[{len(made)}/{total}] {started.cell.name} done in {started.seconds:.0f} s")
             if running and time.monotonic() - told > REPORT_SECONDS:
                 told = time.monotonic()
@@ -97,11 +96,6 @@ def _allotted(startable: list[Cell], running: list[Running], workers: int, budge
         return cores
     left = budget - sum(started.cell.cost.memory * started.cores for started in running)
     return min(cores, max(0, int(left // cell.cost.memory))) if cell.cost.memory else cores
-
-
-def _add(outcome: Outcome, made: set[Path], cell: Cell) -> None:
-    outcome.done.append(cell)
-    made.add(cell.out)
 
 
 def _fail(outcome: Outcome, cell: Cell, why: str, say: Callable[[str], None]) -> None:

@@ -123,7 +123,8 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
             jobs.append({"id": numbers[array.name], "name": array.name, "cells": [cell.name for cell in array.cells]})
             replace_text(folder / JOBS, json.dumps(jobs, indent=1) + "\n")
         script = folder / f"{GATHER}.sh"
-        replace_text(script, _gather(run, options))
+        memory = f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M"
+        replace_text(script, "\n".join([*_head(run, GATHER, options), memory, *_sweep(run, "--gather"), ""]))
         jobs.append({"id": _sbatch(script, list(numbers.values())), "name": GATHER, "cells": []})
     except UserError:
         for job in jobs:
@@ -197,14 +198,6 @@ def _sweep(run: Path, what: str) -> list[str]:
         f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
         f"exec {python} -m hypogoal sweep --out {shlex.quote(str(run))} {what}",
     ]
-
-
-def _gather(run: Path, options: Options) -> str:
-    lines = _head(run, GATHER, options)
-    lines += [
-        f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M",
-    ]
-    return "\n".join([*lines, *_sweep(run, "--gather")]) + "\n"
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
