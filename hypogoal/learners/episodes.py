@@ -17,13 +17,9 @@ LAST = 100  # episodes, of which success and length are told
 
 
 class Episodes(list[tuple[int, int, float, int]], Resumable):
-    """A row of ``EPISODE_COLUMNS`` for every finished episode of some environments, in the order in which they ended.
+    """A row of ``EPISODE_COLUMNS`` for every finished episode of E environments, in the order in which they ended.
 
-    Args:
-        environments: E.
-
-    Attributes:
-        steps: environment steps so far, summed over the environments.
+    ``steps`` are environment steps so far, summed over the environments.
     """
 
     CHANGING = ("steps", "_length", "_reward")
