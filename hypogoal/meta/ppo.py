@@ -28,14 +28,9 @@ Decisions = dict[str, NDArray[Any]]  # columns (n, ...)
 
 
 class MetaPolicy(Chooser):
-    """Chooses options for every environment and learns from what they return.
+    """Chooses among O options for every environment and learns from what they return.
 
-    Args:
-        engine: gives observations of state ids.
-        options: the number of options, O.
-        config: see :class:`MetaConfig`.
-        seed: of weights, draws and minibatches.
-        device: where the networks are; options are drawn on the CPU.
+    ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
     """
 
     CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "_finished", "updates")
