@@ -39,14 +39,8 @@ class Marks:
     """One file a state, ``folder/KIND/DIGEST.png`` (``.npy`` where a state is no grey or colour image).
 
     Each mark is on the disk before the next key is read: a crash loses none. A state is marked once, the last word
-    counts.
-
-    Args:
-        folder: where, made with the first mark; what is in it already is gone on with.
-        kinds: the marks that there are.
-
-    Raises:
-        UserError: a link in the folder leads out of it.
+    counts. The folder is made with the first mark; what is in it already is gone on with. A link that leads out of it
+    is a ``UserError``.
     """
 
     def __init__(self, folder: Path, kinds: Sequence[str] = KINDS):
@@ -74,7 +68,9 @@ class Marks:
             self._move(name, kind)
             self._before.append((name, before))
             return
-        self._require_like(state)
+        if self._files and (shape := read_image(next(iter(self._files.values()))).shape) != state.shape:
+            what = f"the states are {size_text(state.shape)}, those marked before {size_text(shape)}"
+            raise UserError(what, self.folder, "Give another --out.")
         for each in self.kinds:
             (self.folder / each).mkdir(parents=True, exist_ok=True)
         suffix, content = _encoded(state)
@@ -108,13 +104,6 @@ class Marks:
         before = self._files[name]
         self._files[name] = before.replace(self.folder / kind / before.name)
         sync(self.folder / kind)
-
-    def _require_like(self, state: NDArray[np.uint8]) -> None:
-        for file in self._files.values():
-            if (shape := read_image(file).shape) != state.shape:
-                what = f"the states are {size_text(state.shape)}, those marked before {size_text(shape)}"
-                raise UserError(what, self.folder, "Give another --out.")
-            return
 
 
 def _name(state: NDArray[np.uint8]) -> str:
@@ -344,12 +333,8 @@ class Recorded(Source):
 class Played(Source):
     """An environment that is played by keyboard; its states are those that an agent would see.
 
-    Args:
-        make: makes it: observations uint8 (H, W, C) or (H, W), actions ``Discrete``.
-        layout_seed: what ``reset`` is given; the next layout is one more.
-
-    Raises:
-        UserError: observations or actions are others.
+    ``make`` makes it: observations uint8 (H, W, C) or (H, W), actions ``Discrete``, else a ``UserError``. ``reset`` is
+    given ``layout_seed``; the next layout is one more.
     """
 
     def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
