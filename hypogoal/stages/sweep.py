@@ -80,20 +80,12 @@ def plan(
     device: str = "auto",
     short: bool = False,
 ) -> Plan:
-    """The cells of an experiment.
+    """The cells of an experiment in the folder ``out``: a name, one of the paper's figures, or an own TOML file.
 
-    Args:
-        experiment: a name, one of the paper's figures, or an own TOML file (see ``experiments.format``).
-        out: the run's folder.
-        preset: of a named experiment; a figure has its own.
-        assignments: ``KEY=VALUE`` or ``STAGE.KEY=VALUE``; of an own experiment ``AXIS=VALUES``.
-        seeds: the run seeds, ``0-9``.
-        device: of the training stages.
-        short: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
-            was begun with other names keeps those.
-
-    Raises:
-        UserError: unknown experiment or preset, a setting that no stage has, or no such device.
+    ``assignments`` are ``KEY=VALUE`` or ``STAGE.KEY=VALUE``, of an own experiment ``AXIS=VALUES``; ``preset`` is of a
+    named one, a figure has its own; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages.
+    ``short``: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
+    was begun with other names keeps those. What is unknown is a ``UserError``.
     """
     check_name(device)
     assignments = [*assignments]
@@ -120,10 +112,8 @@ def _short(out: Path, *, wanted: bool) -> bool:
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
-    """Spec A6: ``sweep`` with the manners of a stage: what is there is refused unless resumed or forced.
-
-    Raises:
-        UserError: as of :func:`sweep`, or ``out`` exists and neither ``force`` nor ``resume`` was given.
+    """Spec A6: :func:`sweep` with the manners of a stage: what is there is refused (``UserError``) unless resumed or
+    forced.
     """
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
@@ -151,24 +141,12 @@ def sweep(
     confirm: Callable[[str], None] | None = None,
     go_on: str = AGAIN,
 ) -> Path:
-    """Run on this machine what is not finished, and gather every number.
+    """Run on this machine what is not finished, and gather every number; returns ``results.csv``.
 
     It may be killed at any time and started again: what is finished is recognised and never run again, what was begun
-    goes on where it was.
-
-    Args:
-        planned: the cells.
-        out: the run's folder.
-        force: make finished ones anew.
-        quiet: no progress.
-        confirm: asked before something long begins; it raises where the answer is no.
-        go_on: what a user who interrupts it is told.
-
-    Returns:
-        ``results.csv``.
-
-    Raises:
-        UserError: another process runs it, the folder has another sweep, or a cell failed.
+    goes on where it was. ``force``: make finished ones anew. ``confirm`` is asked before something long begins; it
+    raises where the answer is no. A user who interrupts it is told to ``go_on``. Another process that runs it, another
+    sweep's folder, or a cell that failed is a ``UserError``.
     """
     say = (lambda text: None) if quiet else _say
     _check_folder(out)
