@@ -255,14 +255,10 @@ class Domain(ABC):
         return gymnasium.make(self.env_id, **arguments)
 
     def world(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Of the settings that states were collected with those that are the engine's, checked.
+        """Of the settings that states were collected with (``config`` of a data file, ``domain_config`` of an artefact)
+        the engine's.
 
-        Args:
-            config: ``domain_config`` of an artefact, or ``config`` of a data file; what it does not say is as
-                ``make_engine`` has it.
-
-        Raises:
-            UserError: a value that ``collect`` would not take.
+        What they do not say is as ``make_engine`` has it; what ``collect`` would not take is a ``UserError``.
         """
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked: Any = from_values(self.config_class, values, "collect") if values else None

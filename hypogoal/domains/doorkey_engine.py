@@ -96,9 +96,6 @@ class DoorKeyEngine(Engine):
         max_steps: steps after which an episode is truncated.
 
     Attributes:
-        ids: int64 (E,), the current state of each environment.
-        elapsed: int64 (E,), steps since its episode began.
-        n_states: ids met so far are 0 .. n_states - 1.
         changes: of configurations that have been worked out, by configuration, cell and action.
     """
 

@@ -48,11 +48,6 @@ class MontezumaEngine(TurnEngine):
         memory: states whose images are kept; 7 kB each, taken when first needed.
         seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
 
-    Attributes:
-        ids: int64 (E,), the current state of each environment.
-        elapsed: int64 (E,), steps since its episode began.
-        starts: the start states.
-
     Raises:
         UserError: no such ladder, too few start states, too small a memory, or no emulator.
     """
