@@ -65,10 +65,8 @@ def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
-    """Check, before any work is done, that nobody works on ``out`` and that nothing begun would be lost.
-
-    Raises:
-        UserError: another process writes it, or something unfinished is there and it was not said what to do with it.
+    """Refuse (``UserError``), before any work is done, to write what another process writes, or to lose what is
+    unfinished.
     """
     folder = draft_folder(out)
     if folder.is_dir() and os.access(folder, os.W_OK):
@@ -85,20 +83,12 @@ def unfinished(out: Path) -> bool:
 
 @contextlib.contextmanager
 def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: bool = False) -> Iterator[Draft]:
-    """Work on ``out``: a fresh draft, or with ``resume`` the one begun before, where it has a checkpoint.
+    """Work on ``out``: a fresh draft, or with ``resume``, which ``force`` does not undo, the one begun before with a
+    checkpoint.
 
-    Args:
-        out: the output.
-        identity: what makes it what it is; a draft begun with another is not gone on with.
-        force: begin anew whatever was begun.
-        resume: go on with what was begun; ``force`` does not undo that.
-
-    Yields:
-        The draft. When the block raises, it stays where it has a checkpoint and is removed otherwise.
-
-    Raises:
-        UserError: another process works on ``out``; something unfinished is there that was begun otherwise, or of
-            which it was not said what to do with it.
+    ``identity`` is what makes it what it is; a draft begun with another is not gone on with. When the block raises, the
+    draft stays where it has a checkpoint and is removed otherwise. Another process at work on ``out``, or something
+    unfinished that was begun otherwise, or of which it was not said what to do with it, is a ``UserError``.
     """
     folder = draft_folder(out)
     words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends

@@ -28,9 +28,7 @@ class Killed(UserError):
 class Complete(UserError):
     """What is to be gone on with is complete, made as asked: the command line says so and exits with code 0.
 
-    Args:
-        path: what the command would have made.
-        note: what else there is to say of it.
+    ``path`` is what the command would have made, ``note`` what else there is to say of it.
     """
 
     def __init__(self, path: object, note: str = ""):

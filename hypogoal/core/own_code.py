@@ -77,18 +77,11 @@ def require_trust(name: str, what: str) -> None:
 
 
 def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> Any:
-    """What ``name`` stands for: one that comes with hypogoal, an installed entry point, or ``module:object``.
+    """What ``name`` stands for: one of ``built_in``, an installed entry point of ``group``, or ``module:object``.
 
-    Modules of the current folder can be loaded too, whichever way hypogoal was started; installed ones come first.
-
-    Args:
-        name: as given.
-        what: what it is, for messages ("domain").
-        group: of the entry points.
-        built_in: those that come with hypogoal, name to ``module:object``.
-
-    Raises:
-        UserError: no such name, it cannot be loaded, or it is code that the user did not allow.
+    Modules of the current folder can be loaded too, whichever way hypogoal was started; installed ones come first. No
+    such name, one that cannot be loaded, or code that the user did not allow is a ``UserError``; ``what`` it is
+    ("domain") stands in the message.
     """
     entries = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     target = built_in.get(name) or entries.get(name)
