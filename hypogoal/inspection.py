@@ -6,30 +6,25 @@ Nothing outside the folder that was asked for is looked at.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hypogoal.core.artefacts import MANIFEST, open_artefact
+from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_json, read_text
+from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
+from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
-
-
-import contextlib
-import json
-from collections.abc import Callable, Iterator
-from functools import partial
-
-from hypogoal.core.artefacts import Artefact, extra_files, file_faults, find_input
-from hypogoal.core.files import read_json, read_text
-from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
-from hypogoal.core.tensors import load_tensors
 
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
