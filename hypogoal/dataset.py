@@ -6,8 +6,6 @@ The root's attributes say format version, domain, observation space, arguments a
 last, so a file without it was cut off.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -4,8 +4,6 @@ Estimates on the high side, from what is kept: states, replays, networks with th
 process with torch has before any of it (450 MB were measured while ``train-meta`` ran on DoorKey, light).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import prod
 from pathlib import Path

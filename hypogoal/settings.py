@@ -1,7 +1,5 @@
 """The stages that have settings, listed once: a new one is a line here, its file and its command."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any

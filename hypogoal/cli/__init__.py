@@ -3,8 +3,6 @@
 Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`` is quick.
 """
 
-from __future__ import annotations
-
 import _thread
 import contextlib
 import errno

@@ -1,7 +1,5 @@
 """The commands that make something: one stage each."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from dataclasses import fields

@@ -5,8 +5,6 @@ and the manifests are made from the same fields. Precedence: ``--set`` > option 
 default > default.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import hashlib

@@ -5,8 +5,6 @@
 when that process dies, however it does.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """Errors that a user reads: one line saying what, where and what to do next (Spec G2, G3)."""
 
-from __future__ import annotations
-
 from hypogoal.core.terminal import printable
 
 

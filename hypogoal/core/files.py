@@ -4,8 +4,6 @@ Sizes are looked at before anything is read, names before anything is opened. De
 all that is not read by a library of its own is opened with :func:`open_file`, which never waits.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -4,8 +4,6 @@ HDF5 can point out of its file (external links, external storage, virtual datase
 plugins) and declare terabytes in a kilobyte. None of it is needed here, and all of it is refused.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a ``manifest.json`` must look like before anything in it is believed (Spec A8, G2)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Before a stage starts: what it will need of memory and disk, and whether that is there (Spec G1)."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tasks on several cores: each in a process of its own, none of which outlives the one that asked for it."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import multiprocessing

@@ -9,8 +9,6 @@ toggling change the configuration: rare, so worked out in plain Python the first
 state met gets an id.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from typing import Any

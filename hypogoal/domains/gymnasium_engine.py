@@ -1,7 +1,5 @@
 """Any Gymnasium environment as an engine: many of it stepped in turn, states by id, each distinct one kept once."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import blake2b

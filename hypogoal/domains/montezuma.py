@@ -5,8 +5,6 @@ The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezum
 of a ladder on).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ wrappers do not offer, and frames that nobody looks at need not be drawn. What i
 test compares them with ``AtariPreprocessing`` and ``FrameStackObservation``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ An observation is four frames of which a step makes one: states share them. The 
 frames of older ones are forgotten.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -4,8 +4,6 @@ Positions are the RAM's (see ``montezuma_emulator``). They were read off the emu
 test marked ``atari`` plays every descent again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """What an experiment will cost on this machine, said before it starts (Spec G4)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

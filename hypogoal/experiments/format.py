@@ -4,8 +4,6 @@ The file is data. Its commands are stages of hypogoal and nothing else, and writ
 that come with hypogoal lie in ``presets/``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shlex

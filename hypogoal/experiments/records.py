@@ -5,8 +5,6 @@ that sees it can read it. ``logs/NAME.log`` is what a cell said; who holds the k
 the lock goes on to the cell's own processes, so it ends with the last of them. ``logs/NAME.json`` is how it went.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

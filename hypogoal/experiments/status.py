@@ -4,8 +4,6 @@ A cell is finished when its output's manifest says so, which is held against the
 of the output's files once (some ms per MB); ``hypogoal verify`` reads what is in them, too.
 """
 
-from __future__ import annotations
-
 import re
 import stat
 import time

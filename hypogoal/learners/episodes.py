@@ -1,7 +1,5 @@
 """The episodes played so far: how long each was, what it earned, how it ended (Spec E7, F5)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 A transition costs bytes, not images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Episodes of a trained agent: frame by frame for films, and as data for other software (Spec D1, E1)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 

@@ -1,7 +1,5 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

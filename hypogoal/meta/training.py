@@ -1,7 +1,5 @@
 """Options set up in a domain and trained for a number of steps: what ``train-options`` and ``train-meta`` share."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

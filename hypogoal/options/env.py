@@ -1,7 +1,5 @@
 """Options played as the actions of a Gymnasium environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """How the intra-option policies explore: which primitive actions there are, and when a random one is played."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

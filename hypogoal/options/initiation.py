@@ -5,8 +5,6 @@ initiation classifiers of skill chaining (Konidaris and Barto 2009); here it is 
 all together.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import partial

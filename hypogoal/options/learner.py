@@ -1,7 +1,5 @@
 """What all learners of intra-option policies do: act, explore, count, and keep it in artefacts (Spec D2, D8)."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass

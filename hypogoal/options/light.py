@@ -6,8 +6,6 @@ sub-goal. With ``experience=own`` (the paper) only the member whose option was r
 only its verdicts are asked for; then a transition may reach several steps ahead within its execution.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from typing import Any

@@ -6,8 +6,6 @@ time is up, or when the episode ends. Where every option begins at a start state
 also that of its episode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

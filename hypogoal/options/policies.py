@@ -1,7 +1,5 @@
 """What options do, out of an artefact's weights: greedy policies that start anew with each execution."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """What happened while options were played: episodes, choices, where options stopped (Spec E5, F3, F4, F5, F6)."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path

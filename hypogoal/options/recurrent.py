@@ -4,8 +4,6 @@ The GRU is unrolled over the option's own steps: acting carries its hidden state
 learning samples a step and replays the option's execution up to it. Every member learns from its own executions.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ among others: libraries round otherwise in batches of another size. So the first
 resumes it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spec B7: states that a policy visited while it learned, kept to train ensembles with."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Mapping
 from hashlib import blake2b

@@ -1,7 +1,5 @@
 """Minari datasets: episodes whose states a function labels, and episodes of agents. The package is not needed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

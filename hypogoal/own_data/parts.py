@@ -1,7 +1,5 @@
 """What users bring, checked, as the sets of states that a data file holds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter

@@ -1,7 +1,5 @@
 """Spec A1, B3: collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Spec B6: episodes of a trained agent as a Minari dataset, for offline learning with other software."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Spec B6: states that users bring, as a data file, and a data file's states as arrays for other software."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Spec B6: states marked by hand, in the folder of images that ``import`` takes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path

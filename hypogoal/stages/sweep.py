@@ -3,8 +3,6 @@
 ``hypogoal run`` is the sweep of a named experiment on this machine.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence

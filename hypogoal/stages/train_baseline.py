@@ -1,7 +1,5 @@
 """Spec A7, E7: train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -4,8 +4,6 @@ Without ``--options`` the policies start fresh (the paper's D5); with it they co
 count in every curve.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Spec A3: learn every member's option policy while options are chosen at random."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One cell's process: what every runner starts, on whichever machine (Spec G4)."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

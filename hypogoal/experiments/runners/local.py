@@ -1,7 +1,5 @@
 """The cells on this machine, in the plan's order: as many at once as cores and memory allow (Spec G4)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ have ended, whichever way (``afterany``): an element whose own needs are not the
 Nothing is asked of Slurm's accounting, which need not be there.
 """
 
-from __future__ import annotations
-
 import getpass
 import json
 import os

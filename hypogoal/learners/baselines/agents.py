@@ -1,7 +1,5 @@
 """PPO and DQN of stable-baselines3, made from the table of settings and trained on an engine."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import warnings
