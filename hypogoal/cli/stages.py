@@ -94,7 +94,7 @@ def training(told: Callable[..., None]) -> None:
         given = {name: value for name, value in given.items() if value is not None}
         with own_code.given(*words), own_code.vouched(*vouched):
             numbers = run(read, config, path, **given)
-        if numbers:
+        if isinstance(numbers, dict):  # not of many ensembles
             print_outcome(numbers, given["quiet"])
         give(path)
 
