@@ -94,7 +94,7 @@ def sweep(
 
     out = place_of(out)
     if cell is not None:
-        from hypogoal.experiments.runners.slurm import run_job
+        from hypogoal.experiments.runners.slurm_job import run_job
 
         run_job(out, cell)
         return
