@@ -25,8 +25,7 @@ from benchmarks.doorkey import machine
 from hypogoal.dataset import digest
 from hypogoal.domains.montezuma_emulator import N_ACTIONS, Emulator, Position
 from hypogoal.domains.montezuma_ladders import LADDERS
-from hypogoal.domains.montezuma_rollouts import PLAYS, Shown
-from hypogoal.domains.montezuma_states import emulator_of_process, gather, labels_of
+from hypogoal.domains.montezuma_states import PLAYS, Shown, emulator_of_process, gather, labels_of
 
 WANTED_RATE = 700  # made
 ROOMS = (1, 6, 9, 12, 18, 22)  # three ladders; one; one and snakes; lasers; lava; lava and one

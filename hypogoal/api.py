@@ -1,7 +1,5 @@
 """The Python interface: load what was trained, predict, and play options as actions of a Gymnasium environment."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hypogoal.core.artefacts import MANIFEST, open_artefact

@@ -6,8 +6,6 @@ The root's attributes say format version, domain, observation space, arguments a
 last, so a file without it was cut off.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -94,11 +92,7 @@ def leave_out(states: States, *known: NDArray[np.uint8]) -> States:
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
-    """Check the names of sub-goals, see ``plain_name``.
-
-    Raises:
-        UserError: there is none, one is no plain name, or two differ in upper and lower case only.
-    """
+    """Refuse (``UserError``) no names, ones that are not plain, and two that differ in upper and lower case only."""
     if not sub_goals:
         raise UserError("there are no sub-goals", None, "Give one at least, with a name.")
     for name in sub_goals:

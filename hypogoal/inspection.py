@@ -6,30 +6,25 @@ Nothing outside the folder that was asked for is looked at.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hypogoal.core.artefacts import MANIFEST, open_artefact
+from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_json, read_text
+from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
+from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
-
-
-import contextlib
-import json
-from collections.abc import Callable, Iterator
-from functools import partial
-
-from hypogoal.core.artefacts import Artefact, extra_files, file_faults, find_input
-from hypogoal.core.files import read_json, read_text
-from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
-from hypogoal.core.tensors import load_tensors
 
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
@@ -58,10 +53,8 @@ def _describe_part(path: Path) -> dict[str, Any]:
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
-    """What ``metrics.json`` holds of an evaluation, or of a run's own; None where there is none.
-
-    Raises:
-        UserError: it is damaged.
+    """What ``metrics.json`` holds of an evaluation, or of a run's own; None where there is none, damaged a
+    ``UserError``.
     """
     from hypogoal.evaluation.run import read_numbers
 
@@ -73,14 +66,8 @@ def numbers_of(path: Path) -> Mapping[str, Any] | None:
 
 
 def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
-    """The headline numbers of an evaluation as tables.
-
-    Args:
-        numbers: what :func:`numbers_of` found.
-        path: where, for the message.
-
-    Raises:
-        UserError: they are not what ``evaluate`` writes.
+    """The headline numbers of an evaluation, from :func:`numbers_of`, as tables; a ``UserError`` where they are
+    damaged.
     """
     from hypogoal.evaluation.questions import summary_table
 
@@ -112,15 +99,8 @@ def lines(about: dict[str, Any]) -> list[str]:
 def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     """Pictures of a data file's labelled and held-out states, for each room and label one, to check labels by eye.
 
-    Args:
-        path: the data file.
-        folder: where ``labelled/room-01-positives.png`` and so on are written; by sub-goal too where there are several.
-
-    Returns:
-        The pictures written.
-
-    Raises:
-        UserError: not a data file, its states are no pictures, or the folder cannot be written to.
+    They are ``labelled/room-01-positives.png`` and so on in ``folder``, by sub-goal too where there are several. No
+    data file, states that are no pictures, or a folder that cannot be written to are a ``UserError``.
     """
     from PIL import Image
 
@@ -157,11 +137,7 @@ def kinds_of(domain: str) -> Sequence[str]:
 
 
 def parts_of(run: Path) -> list[Path]:
-    """The data files and artefacts of a run.
-
-    Raises:
-        UserError: there is none.
-    """
+    """The data files and artefacts of a run; a ``UserError`` where there is none."""
     if not run.is_dir():
         raise UserError("no such file or folder", run, "Check the path.")
     artefacts = [manifest.parent for manifest in sorted(run.rglob(MANIFEST)) if not _hidden(manifest, run)]

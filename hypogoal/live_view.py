@@ -64,13 +64,8 @@ class Progressing:
 def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> None:
     """Show how a run's artefacts are doing, again and again until it is finished or interrupted.
 
-    Args:
-        run: the folder that ``hypogoal run`` or stages write into.
-        once: print the view once; so it is done too where there is no terminal, and where the run is finished.
-        boards: get the logs too.
-
-    Raises:
-        UserError: there is no such folder, or nothing in it that logs.
+    ``once``: print the view once; so it is done too where there is no terminal, and where the run is finished.
+    ``boards`` get the logs too. No such folder, or nothing in it that logs, is a ``UserError``.
     """
     console = screen()
 
@@ -110,11 +105,7 @@ def finished(run: Path) -> bool:
 
 
 def read_progress(run: Path) -> list[Progressing]:
-    """What is being made first, then what is complete, each by its path.
-
-    Raises:
-        UserError: there is no such folder, or nothing in it that logs.
-    """
+    """What is being made first, then what is complete, each by its path; a ``UserError`` where nothing logs."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'hypogoal run' or a stage writes into.")
     logs = [*run.rglob(LOG), *run.rglob(f".*{PARTIAL}/{FOLDER}/*.jsonl")]  # an ensemble's sub-goals have one each
@@ -214,15 +205,10 @@ EVENTS = "events.out.tfevents.1.hypogoal"  # TensorBoard looks for such names; t
 
 
 class Boards:
-    """Event files of logs: a folder per log, a tag per number.
+    """Event files of logs in a new folder ``out``, for TensorBoard: a folder per log, a tag per number.
 
     Names of logs and of their numbers are a stranger's: none leads out of ``out``, and for none a file is kept open.
-
-    Args:
-        out: the folder that TensorBoard will be shown; it must not be there yet.
-
-    Raises:
-        UserError: it is there, or the extra is not installed.
+    Where ``out`` is there, or the extra is not installed, it is a ``UserError``.
     """
 
     def __init__(self, out: Path):
@@ -243,10 +229,8 @@ class Boards:
     def add(self, place: str, lines: Iterable[Mapping[str, Any]], now: float) -> None:
         """What is new in a log; one that was cut off and is written again has the same numbers at the same steps.
 
-        Args:
-            place: its folder within ``out``; of a name that would lead out of it, ``out`` itself.
-            lines: the log so far.
-            now: the time of day, in seconds since 1970, which TensorBoard shows.
+        Its folder is ``place`` within ``out``, or ``out`` itself for a name that would lead out of it. TensorBoard
+        shows the time ``now``, in seconds since 1970.
         """
         folder = inside(self._out, printable(place)) or self._out
         events = []

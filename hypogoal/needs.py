@@ -4,8 +4,6 @@ Estimates on the high side, from what is kept: states, replays, networks with th
 process with torch has before any of it (450 MB were measured while ``train-meta`` ran on DoorKey, light).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import prod
 from pathlib import Path
@@ -57,13 +55,7 @@ def ensemble_disk(sub_goals: int, members: int) -> float:
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
-    """``train-options`` and ``train-meta``.
-
-    Args:
-        domain: where they play.
-        about: the ensemble manifest's configuration.
-        config: how options are learned.
-    """
+    """``train-options`` and ``train-meta`` in a domain; ``about`` is the ensemble manifest's configuration."""
     from hypogoal.meta.training import frames_kept  # with torch, which nobody else here needs
 
     oracle = config.termination == "oracle"

@@ -1,7 +1,5 @@
 """The stages that have settings, listed once: a new one is a line here, its file and its command."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -32,16 +30,10 @@ def configuration(
     *,
     given: bool = False,
 ) -> Any:
-    """A stage's settings, with the presets and defaults of the domain it works on.
+    """A stage's settings, with the presets and defaults of the domain it works on; see
+    :func:`hypogoal.core.config.resolve`.
 
-    Args:
-        stage: its command.
-        domain: by name.
-        preset, assignments, options: see :func:`hypogoal.core.config.resolve`.
-        given: the user gave the domain's name, no file did.
-
-    Raises:
-        UserError: no such domain, or as of ``resolve``.
+    ``given``: the user gave the domain's name, no file did. No such domain is a ``UserError``.
     """
     from hypogoal.domains.base import defaults_of, load_domain  # with Gymnasium, which a list of stages needs not
 

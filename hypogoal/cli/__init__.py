@@ -3,8 +3,6 @@
 Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`` is quick.
 """
 
-from __future__ import annotations
-
 import _thread
 import contextlib
 import errno
@@ -65,22 +63,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         os.getcwd()  # which may have been deleted
         return _called(given)
-    except UserError as error:
-        if debug:
-            raise
-        return _fail(with_notes(str(error), error), 2)
-    except NumericalError as error:
-        if debug:
-            raise
-        return _fail("; ".join([f"training stopped: {error}", *notes_of(error)]), 1)
     except Unprinted as error:
         # Not 0: whoever reads the output has not got it. Nor 2: the command was right.
         return _fail(f"the output is complete, but could not be printed ({error.strerror})", 1)
-    except OSError as error:
-        if debug:
-            raise
-        message, code = _refused(error)
-        return _fail(with_notes(message, error), code)
     except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
         if arguments is None:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is put in order: who is in a hurry need not wait
@@ -92,10 +77,22 @@ def main(arguments: list[str] | None = None) -> int:
         if ended is not None:
             message = getattr(error, "format_message", lambda: "")()
             return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(ended)
-        message, code = _internal(error)
+        message, code = _told(error)
         if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a pipe that nobody reads any more
             raise
         return _fail(message, code)
+
+
+def _told(error: BaseException) -> tuple[str, int]:
+    """What to tell, and the exit code."""
+    if isinstance(error, UserError):
+        return with_notes(str(error), error), 2
+    if isinstance(error, NumericalError):
+        return "; ".join([f"training stopped: {error}", *notes_of(error)]), 1
+    if isinstance(error, OSError):
+        message, code = _refused(error)
+        return with_notes(message, error), code
+    return _internal(error)
 
 
 def _internal(error: BaseException) -> tuple[str, int]:

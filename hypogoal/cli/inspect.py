@@ -1,7 +1,5 @@
 """The commands that only look: ``show``, ``verify``, ``watch``, ``config``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

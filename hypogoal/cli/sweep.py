@@ -1,7 +1,5 @@
 """Many cells with one command: ``run`` chains the stages, ``sweep`` runs experiments here or by Slurm (Spec A6, G4)."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated, Any

@@ -85,10 +85,8 @@ class Artefact:
         return int(self.manifest["seed"])
 
     def whole(self) -> Artefact:
-        """This artefact, every file of it as the manifest says: asked for before a stage starts (some ms per MB).
-
-        Raises:
-            UserError: a file is missing, was changed, or lies outside the folder.
+        """This artefact, asked for before a stage starts (some ms per MB): its files are as the manifest says, or
+        UserError.
         """
         faults = check_files(self)
         if faults:
@@ -96,10 +94,8 @@ class Artefact:
         return self
 
     def input(self, kind: str) -> Path:
-        """The path of the input of ``kind``: beside this artefact, else as recorded; its sha256 is as recorded.
-
-        Raises:
-            UserError: it was made from no such input, or that is gone or was changed since.
+        """The input of ``kind``: beside this artefact, else as recorded; gone, changed since, or never read is a
+        ``UserError``.
         """
         for entry in self.manifest["inputs"]:
             if entry["kind"] == kind:
@@ -124,11 +120,7 @@ class Settings(dict[str, Any]):
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a file, as hexadecimal digits.
-
-    Raises:
-        UserError: it is no regular file, or cannot be opened.
-    """
+    """The sha256 of a regular file that can be read (else a ``UserError``), as hexadecimal digits."""
     with open_file(path, "the file is", AGAIN) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -174,13 +166,10 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
 
 
 def check_kind(out: Path, kind: str) -> None:
-    """Check that what is there is an empty folder, or of the kind that is to be made: whole or damaged.
+    """Refuse (``UserError``) what is neither an empty folder nor of the kind that is to be made, whole or damaged.
 
     ``--force`` replaces only what the stage itself makes there. A wrong ``--out`` is one slip of the hand; what it hits
     may be months of work, or nothing of ours.
-
-    Raises:
-        UserError: it is something else.
     """
     if out.is_dir():
         if not any(out.iterdir()):
@@ -205,11 +194,7 @@ def _manifest_kind(folder: Path) -> str:
 
 
 def _is_data(path: Path) -> bool:
-    """Whether a file is one of collected states: HDF5 with names of sub-goals, which stand in front if it is cut off.
-
-    Raises:
-        Busy: another program writes it.
-    """
+    """Whether a file is one of collected states: HDF5 with names of sub-goals, which are in front if it is cut off."""
     with open_file(path, "what stands there is", AWAY) as raw:
         begin = raw.read(FRONT)
     if not begin.startswith(HDF5):
@@ -232,11 +217,7 @@ def _is_arrays(path: Path) -> bool:
 
 
 def check_parent(out: Path) -> None:
-    """Check that the folder of an output is there or can be made, and can be written to.
-
-    Raises:
-        UserError: it is not so.
-    """
+    """Refuse (``UserError``) an output whose folder is not there and cannot be made, or cannot be written to."""
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir():
         raise UserError("the output's folder cannot be made, a file is in the way", parent, "Choose another --out.")
@@ -314,14 +295,9 @@ def _input_entry(path: Path, out: Path) -> dict[str, str]:
 
 
 def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefact:
-    """Open a complete artefact and check that it is what the caller needs.
+    """A complete artefact of ``kind`` (one, several, or None for any).
 
-    Args:
-        path: the artefact's folder.
-        kind: the kind, or kinds, that the caller can use; None for any.
-
-    Raises:
-        UserError: missing, not an artefact, damaged, of another kind, or of a newer format.
+    Missing, no artefact, damaged, of another kind or of a newer format is a ``UserError``.
     """
     manifest_path = path / MANIFEST
     if not path.exists():

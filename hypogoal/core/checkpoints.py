@@ -7,16 +7,18 @@ Such a file is private to its stage and to the version that wrote it.
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import signal
 import threading
 import time
 import zlib
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,11 +96,8 @@ class Checkpoints:
         return self.path is not None and self.path.is_file()
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Called where the state is whole: saves it if it is time to, or if the stage is to stop.
-
-        Raises:
-            KeyboardInterrupt: a signal came; the state is saved.
-            UserError: as of :meth:`save`.
+        """Called where the state is whole: saves it if it is time to, or if a signal came, which then is a
+        ``KeyboardInterrupt``.
         """
         if self._signal is None and time.monotonic() < self._next:
             return
@@ -112,10 +111,9 @@ class Checkpoints:
             raise KeyboardInterrupt(self._signal)
 
     def save(self, state: State) -> None:
-        """Write ``state``. One with a tensor that holds NaN or Inf is not: the last good one stays (Spec G3).
+        """Write ``state``, or raise a ``UserError``; the one before is still there then.
 
-        Raises:
-            UserError: it cannot be written; the one before is still there.
+        One with a tensor that holds NaN or Inf is not written: the last good one stays (Spec G3).
         """
         from safetensors import SafetensorError
         from safetensors.numpy import save_file
@@ -140,11 +138,7 @@ class Checkpoints:
             ) from None
 
     def load(self) -> State | None:
-        """The state last saved; None where none was.
-
-        Raises:
-            UserError: the file is damaged.
-        """
+        """The state last saved; None where none was. A damaged file is a ``UserError``."""
         from safetensors import SafetensorError
         from safetensors.numpy import load_file
 
@@ -217,3 +211,66 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None
     """Continue from an ``optimiser_snapshot`` of one of the same parameters."""
     state = {int(number): known for number, known in snapshot.items()}
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+class Resumable:
+    """What goes on after a break as if there had been none: it gives what changes as a snapshot, and takes it back.
+
+    Attributes:
+        CHANGING: the names of the attributes that do. Each is a network, an optimiser, a generator of random numbers, a
+            tensor, a deque, itself resumable, a list of such, or of arrays, numbers, lists, dicts by name and None.
+    """
+
+    CHANGING: ClassVar[tuple[str, ...]] = ()
+
+    def snapshot(self) -> State:
+        """What a resumed run needs to go on exactly; valid until the next step."""
+        return {name: _taken(getattr(self, name)) for name in self.CHANGING}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of one made with the same arguments."""
+        for name in self.CHANGING:
+            setattr(self, name, _restored(getattr(self, name), snapshot[name]))
+
+
+def _taken(value: Any) -> Any:
+    import torch
+
+    if isinstance(value, Resumable):
+        return value.snapshot()
+    if isinstance(value, list | deque):
+        return [_taken(item) for item in value]
+    if isinstance(value, torch.nn.Module):
+        return value.state_dict()
+    if isinstance(value, torch.optim.Optimizer):
+        return optimiser_snapshot(value)
+    if isinstance(value, torch.Generator):
+        return value.get_state()
+    return value.bit_generator.state if isinstance(value, np.random.Generator) else value
+
+
+def _restored(value: Any, saved: Any) -> Any:
+    """``value`` as it was; changed in place where others hold it too."""
+    import torch
+
+    if isinstance(value, Resumable):
+        value.restore(saved)
+    elif isinstance(value, deque):
+        value.clear()
+        value.extend(saved)
+    elif isinstance(value, list) and value and isinstance(value[0], Resumable | deque):
+        for item, known in zip(value, saved, strict=True):
+            _restored(item, known)
+    elif isinstance(value, torch.nn.Module):
+        value.load_state_dict(saved)
+    elif isinstance(value, torch.optim.Optimizer):
+        restore_optimiser(value, saved)
+    elif isinstance(value, torch.Generator):
+        value.set_state(saved)
+    elif isinstance(value, np.random.Generator):
+        value.bit_generator.state = saved
+    elif isinstance(value, torch.Tensor):
+        value.copy_(saved)
+    else:
+        return copy.deepcopy(saved)
+    return value

@@ -17,20 +17,13 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def prepare(device: str = "auto") -> str:
-    """Use one torch thread without denormal numbers, and refuse a device that cannot be used.
+    """Use one torch thread without denormal numbers; ``cpu`` or ``cuda`` for one of ``DEVICES``, ``auto`` being the CPU
+    (decision 26).
 
-    One thread per process is as fast on small networks, does not suffer from busy neighbours, and makes results
-    the same bytes again on the same machine; other processors round otherwise. Denormal numbers (below 1e-38, where
-    Adam's moments of weights that are not used end) count as 0: arithmetic with them takes many times as long.
-
-    Args:
-        device: of ``DEVICES``; ``auto`` is the CPU (decision 26).
-
-    Returns:
-        ``cpu`` or ``cuda``.
-
-    Raises:
-        UserError: no such device, or torch finds none.
+    One thread per process is as fast on small networks, does not suffer from busy neighbours, and makes results the
+    same bytes again on the same machine; other processors round otherwise. Denormal numbers (below 1e-38, where Adam's
+    moments of weights that are not used end) count as 0: arithmetic with them takes many times as long. A device that
+    is none, or that torch does not find, is a ``UserError``.
     """
     import torch
 
@@ -44,11 +37,7 @@ def prepare(device: str = "auto") -> str:
 
 
 def check_name(device: str) -> None:
-    """Refuse what is no device's name; whether this machine has it is not looked at.
-
-    Raises:
-        UserError: it is not of ``DEVICES``.
-    """
+    """Refuse (``UserError``) what is no device's name; whether this machine has it is not looked at."""
     if device not in DEVICES:
         raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
 

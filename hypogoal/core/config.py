@@ -5,8 +5,6 @@ and the manifests are made from the same fields. Precedence: ``--set`` > option 
 default > default.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import hashlib
@@ -213,11 +211,7 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
 
 
 def parse_integers(text: str) -> list[int]:
-    """``0-3,7`` -> ``[0, 1, 2, 3, 7]``.
-
-    Raises:
-        UserError: it says something else.
-    """
+    """``0-3,7`` -> ``[0, 1, 2, 3, 7]``; anything else is a ``UserError``."""
     try:
         return [int(number) for item in text.split(",") for number in _range(item)]
     except ValueError:

@@ -5,8 +5,6 @@
 when that process dies, however it does.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -59,20 +57,14 @@ def draft_folder(out: Path) -> Path:
 
 
 def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
-    """Check that what is there, if anything, may be replaced: what is unfinished beside it was begun with ``force``.
-
-    Raises:
-        UserError: it may not.
-    """
+    """Refuse (``UserError``) to replace what is there, unless what is unfinished beside it was begun with ``force``."""
     if out.exists() and not force and not (resume and unfinished(out)):
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
-    """Check, before any work is done, that nobody works on ``out`` and that nothing begun would be lost.
-
-    Raises:
-        UserError: another process writes it, or something unfinished is there and it was not said what to do with it.
+    """Refuse (``UserError``), before any work is done, to write what another process writes, or to lose what is
+    unfinished.
     """
     folder = draft_folder(out)
     if folder.is_dir() and os.access(folder, os.W_OK):
@@ -89,20 +81,12 @@ def unfinished(out: Path) -> bool:
 
 @contextlib.contextmanager
 def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: bool = False) -> Iterator[Draft]:
-    """Work on ``out``: a fresh draft, or with ``resume`` the one begun before, where it has a checkpoint.
+    """Work on ``out``: a fresh draft, or with ``resume``, which ``force`` does not undo, the one begun before with a
+    checkpoint.
 
-    Args:
-        out: the output.
-        identity: what makes it what it is; a draft begun with another is not gone on with.
-        force: begin anew whatever was begun.
-        resume: go on with what was begun; ``force`` does not undo that.
-
-    Yields:
-        The draft. When the block raises, it stays where it has a checkpoint and is removed otherwise.
-
-    Raises:
-        UserError: another process works on ``out``; something unfinished is there that was begun otherwise, or of
-            which it was not said what to do with it.
+    ``identity`` is what makes it what it is; a draft begun with another is not gone on with. When the block raises, the
+    draft stays where it has a checkpoint and is removed otherwise. Another process at work on ``out``, or something
+    unfinished that was begun otherwise, or of which it was not said what to do with it, is a ``UserError``.
     """
     folder = draft_folder(out)
     words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
@@ -191,17 +175,9 @@ def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
 
 
 def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str, do: str) -> None:
-    """Refuse to go on with what was made of something else, naming the first thing that differs.
+    """Refuse (``UserError``) to go on with what was made of something else, naming the first thing that differs.
 
-    Args:
-        before: what made it.
-        now: what is to make it.
-        out: the output.
-        what: what was done with the former, for the message ("what is there was made").
-        do: what to do about it.
-
-    Raises:
-        UserError: they differ.
+    ``what`` was done with the former, for the message ("what is there was made"); ``do`` is what to do about it.
     """
     before, now = _that_matters(before), _that_matters(now)
     for key in {**before, **now}:
@@ -222,16 +198,11 @@ def _that_matters(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
-    """What to raise where ``--resume`` finds its output complete.
+    """What to raise where ``--resume`` finds ``out`` complete; a ``UserError`` where it was made of something else.
 
-    Args:
-        before: ``config``, ``versions`` and whatever else made it, such as a manifest.
-        now: the same, of what is to be made. Settings that only one of the two has are those of another hypogoal; other
-            versions are said and no more, since nothing is gone on with.
-        out: the output.
-
-    Raises:
-        UserError: it was made of something else.
+    ``before`` and ``now`` have ``config``, ``versions`` and whatever else makes it, such as a manifest. Settings that
+    only one of the two has are those of another hypogoal; other versions are said and no more, since nothing is gone on
+    with.
     """
     now = json.loads(json.dumps(now))
     keys = [key for key in now if key not in ("config", "versions")]
@@ -257,12 +228,9 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def sole_writer(out: Path) -> Iterator[None]:
-    """Write ``out`` as the only process that does: the lock on its draft is held.
+    """Write ``out`` as the only process that does (else a ``UserError``): the lock on its draft is held.
 
     The draft's folder is made where there is none and removed if it stays empty.
-
-    Raises:
-        UserError: another process does.
     """
     folder = draft_folder(out)
     until = time.monotonic() + PATIENCE_SECONDS

@@ -1,7 +1,5 @@
 """Errors that a user reads: one line saying what, where and what to do next (Spec G2, G3)."""
 
-from __future__ import annotations
-
 from hypogoal.core.terminal import printable
 
 
@@ -28,9 +26,7 @@ class Killed(UserError):
 class Complete(UserError):
     """What is to be gone on with is complete, made as asked: the command line says so and exits with code 0.
 
-    Args:
-        path: what the command would have made.
-        note: what else there is to say of it.
+    ``path`` is what the command would have made, ``note`` what else there is to say of it.
     """
 
     def __init__(self, path: object, note: str = ""):

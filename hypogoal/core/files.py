@@ -4,8 +4,6 @@ Sizes are looked at before anything is read, names before anything is opened. De
 all that is not read by a library of its own is opened with :func:`open_file`, which never waits.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -31,15 +29,9 @@ FORMULA = "=+-@＝＋－＠"  # signs with which a spreadsheet begins to compute
 
 
 def require_file(path: Path, what: str, do: str) -> int:
-    """The size in bytes of a regular file.
+    """The size in bytes of a regular file; what is missing, or a folder, device or pipe, is a ``UserError``.
 
-    Args:
-        path: the file.
-        what: what it is, for the message ("the weights are").
-        do: what to do where it is missing.
-
-    Raises:
-        UserError: it is missing, or a folder, device or pipe.
+    ``what`` it is stands in the message with its verb ("the weights are"), ``do`` is what to do about it.
     """
     try:
         if path.is_file():
@@ -69,16 +61,8 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
 
 
 def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
-    """A file of at most ``limit`` bytes.
-
-    Args:
-        path: the file.
-        what: what it is, for messages, with its verb ("the manifest is").
-        do: what to do about any of the errors.
-        limit: bytes.
-
-    Raises:
-        UserError: missing, no regular file, larger or not readable.
+    """A regular file of at most ``limit`` bytes; see :func:`require_file`. Larger or not readable, it is a
+    ``UserError``.
     """
     with open_file(path, what, do) as file:
         try:
@@ -92,11 +76,7 @@ def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> b
 
 
 def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file of at most ``limit`` bytes of UTF-8, its lines ended by a line feed; see :func:`read_bytes`.
-
-    Raises:
-        UserError: it is not UTF-8 either.
-    """
+    """The text of a file, see :func:`read_bytes`, in UTF-8 (else a ``UserError``), its lines ended by a line feed."""
     try:
         text = read_bytes(path, what, do, limit).decode()
     except UnicodeDecodeError:
@@ -122,11 +102,7 @@ def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> An
 
 
 def parse_json(text: str, where: object, what: str, do: str) -> Any:
-    """JSON whose numbers are finite, at most ``MAX_JSON_DEPTH`` deep, and whose texts can be printed.
-
-    Raises:
-        UserError: it is not, or not JSON at all.
-    """
+    """JSON whose numbers are finite, ``MAX_JSON_DEPTH`` deep at most, its texts printable; else a ``UserError``."""
     try:
         value = json.loads(text, parse_constant=_no_number)
         _check_depth(value)
@@ -137,10 +113,9 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
-    """TOML without keys in hundreds of parts (``a.a.a``), for which the parser takes the square of their number.
+    """TOML, else a ``UserError``.
 
-    Raises:
-        UserError: it is not, or not TOML at all.
+    Keys in hundreds of parts (``a.a.a``), for which the parser takes the square of their number, are refused.
     """
     try:
         for number, line in enumerate(text.split("\n"), 1):

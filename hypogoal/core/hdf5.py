@@ -4,8 +4,6 @@ HDF5 can point out of its file (external links, external storage, virtual datase
 plugins) and declare terabytes in a kilobyte. None of it is needed here, and all of it is refused.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 from collections.abc import Iterator
@@ -35,9 +33,8 @@ class Busy(UserError):
 def open_hdf5(path: Path, what: str, do: str) -> Any:
     """An HDF5 file opened for reading, locked where the file system can.
 
-    Raises:
-        UserError: missing, no regular file, truncated or not HDF5.
-        Busy: another program has it open to write, or it may not be read.
+    Missing, truncated or another file is a ``UserError``; open in another program to write, or not to be read,
+    ``Busy``.
     """
     import h5py
 
@@ -109,11 +106,7 @@ def attribute(file: Any, name: str) -> Any:
 
 
 def members(group: Any) -> list[str]:
-    """The names in a group, sorted.
-
-    Raises:
-        Foreign: it is no group, has too many, or names that are no plain ones.
-    """
+    """The names in a group, sorted; ``Foreign`` where it is no group, has too many, or names that are no plain ones."""
     import h5py
 
     if not isinstance(group, h5py.Group):  # the names in a dataset would be its values, of which there may be 2^62
@@ -131,8 +124,7 @@ def members(group: Any) -> list[str]:
 def find(file: Any, name: str) -> Any:
     """The group or dataset called ``name`` (``a/b``); None where it is missing.
 
-    Raises:
-        Foreign: a soft or external link leads to it, or it is not readable.
+    ``Foreign`` where a soft or external link leads to it, or it is not readable.
     """
     import h5py
 
@@ -191,11 +183,7 @@ def check_dataset(dataset: Any, kinds: str) -> int:
 
 
 def size_of(file: Any, name: str, kinds: str) -> int:
-    """What :func:`check_dataset` says of the dataset called ``name``.
-
-    Raises:
-        Foreign: it does, or there is none.
-    """
+    """What :func:`check_dataset` says of the dataset called ``name``; ``Foreign`` where there is none."""
     dataset = find(file, name)
     if dataset is None:
         raise Foreign(f"no readable {name!r}")
@@ -203,11 +191,7 @@ def size_of(file: Any, name: str, kinds: str) -> int:
 
 
 def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
-    """A dataset's values, after :func:`check_dataset`.
-
-    Raises:
-        Foreign: missing, refused, damaged, or larger than the memory that is free.
-    """
+    """A dataset's values after :func:`check_dataset`; ``Foreign`` where it is damaged or larger than free memory."""
     size = size_of(file, name, kinds)
     free = free_memory()
     if free is not None and size > free:

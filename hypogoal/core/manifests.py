@@ -1,7 +1,5 @@
 """What a ``manifest.json`` must look like before anything in it is believed (Spec A8, G2)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping
@@ -22,11 +20,9 @@ NUMBERS = "numbers.csv"  # which evaluations of format 1 have not
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """The manifest in a file, every key that all artefacts have checked, and the settings that other stages read.
+    """The manifest in a file: every key that all artefacts have and the settings that other stages read are checked.
 
-    Raises:
-        UserError: not JSON, of a newer format, changed since it was written, or a key or setting is missing or
-            malformed.
+    Not JSON, malformed, of a newer format or changed since it was written, it is a ``UserError``.
     """
     data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
     manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
@@ -56,11 +52,7 @@ def _text(manifest: Mapping[str, Any]) -> bytes:
 
 
 def check_writable(manifest: dict[str, Any], out: Path) -> None:
-    """Check, before anything is made, that the manifest which it will have could be read again.
-
-    Raises:
-        UserError: a setting, a number or a name is one that :func:`read_manifest` refuses.
-    """
+    """Refuse (``UserError``), before anything is made, a manifest that :func:`read_manifest` could not read again."""
     do = "Choose another value, or a name in UTF-8."
     try:
         _checked(parse_json(json.dumps(manifest), out, "the manifest would be", do), out)

@@ -68,32 +68,20 @@ def environment_of_children() -> dict[str, str]:
 
 
 def require_trust(name: str, what: str) -> None:
-    """Refuse to load ``module:object`` that the user neither gave nor allowed; other names pass.
+    """Refuse (``UserError``) to load ``module:object`` that the user neither gave nor allowed; other names pass.
 
-    Args:
-        name: what a file, or the user, calls it.
-        what: what it is to be, for the message ("domain").
-
-    Raises:
-        UserError: see above.
+    ``what`` it is to be ("domain") stands in the message.
     """
     if ":" in name and name not in allowed():
         raise UserError(f"a file names code of its own as its {what}", name, f"Do you trust it? Set {TRUST}={name}")
 
 
 def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> Any:
-    """What ``name`` stands for: one that comes with hypogoal, an installed entry point, or ``module:object``.
+    """What ``name`` stands for: one of ``built_in``, an installed entry point of ``group``, or ``module:object``.
 
-    Modules of the current folder can be loaded too, whichever way hypogoal was started; installed ones come first.
-
-    Args:
-        name: as given.
-        what: what it is, for messages ("domain").
-        group: of the entry points.
-        built_in: those that come with hypogoal, name to ``module:object``.
-
-    Raises:
-        UserError: no such name, it cannot be loaded, or it is code that the user did not allow.
+    Modules of the current folder can be loaded too, whichever way hypogoal was started; installed ones come first. No
+    such name, one that cannot be loaded, or code that the user did not allow is a ``UserError``; ``what`` it is
+    ("domain") stands in the message.
     """
     entries = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     target = built_in.get(name) or entries.get(name)
@@ -187,11 +175,7 @@ class UsersCode:
         return UserError(f"{self.what} {self.failed} {text}", place or self._place() or None, do)
 
     def refuse(self, gave: str, do: str) -> NoReturn:
-        """What it gave is not what it promised to.
-
-        Raises:
-            UserError: with the place where the code begins.
-        """
+        """Tell (``UserError``) that what it gave is not what it promised to, with the place where the code begins."""
         raise UserError(f"{self.what} {gave}", self._place() or None, do)
 
     def _place(self) -> str:

@@ -1,7 +1,5 @@
 """Before a stage starts: what it will need of memory and disk, and whether that is there (Spec G1)."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -13,22 +11,16 @@ CGROUP = Path("/sys/fs/cgroup")
 
 
 def preflight(stage: str, out: Path, needs: tuple[float, float], *, resume: bool = False, quiet: bool = False) -> None:
-    """Say what a stage will need, and refuse to start where that does not fit.
+    """Say, unless ``quiet``, what a stage will need, and refuse (``UserError``) to start where that does not fit.
 
-    Args:
-        stage: its command.
-        out: what it writes; nothing of it need be there yet.
-        needs: bytes of memory, of all its processes, and of disk, what it removes at the end included.
-        resume: what is complete is kept, for which nothing is needed.
-        quiet: say nothing where it fits.
-
-    Raises:
-        UserError: it does not fit; the numbers are in the message.
+    ``needs``: bytes of memory, of all its processes, and of disk, what it removes at the end included. With ``resume``
+    nothing is needed for what is complete. Nothing of ``out`` need be there yet.
     """
     if resume and out.exists() and not unfinished(out):
         return
     memory, disk = needs
-    free, space = free_memory(), free_disk(out)
+    free, folders = free_memory(), (folder for folder in out.absolute().parents if folder.is_dir())
+    space = shutil.disk_usage(next(folders)).free
     if free is not None:
         free += own_memory()  # which is part of what is needed: nobody needs it twice
     known = "unknown" if free is None else human(free)
@@ -43,11 +35,6 @@ def preflight(stage: str, out: Path, needs: tuple[float, float], *, resume: bool
         raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
     if not quiet:
         say(text, err=True)
-
-
-def free_disk(path: Path) -> int:
-    """Bytes that a user may still write where ``path`` is to be."""
-    return shutil.disk_usage(next(folder for folder in path.absolute().parents if folder.is_dir())).free
 
 
 def free_memory() -> int | None:

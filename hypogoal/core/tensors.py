@@ -20,11 +20,7 @@ MAX_HEADER_BYTES = 16 * 2**20  # names and shapes: 100 bytes a tensor
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write tensors by name.
-
-    Raises:
-        NumericalError: Spec G3, a number is NaN or Inf; nothing is written.
-    """
+    """Write tensors by name; a ``NumericalError``, and nothing is written, where a number is NaN or Inf (Spec G3)."""
     import torch
     from safetensors.torch import save
 
@@ -37,8 +33,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
 def load_tensors(path: Path) -> dict[str, Tensor]:
     """Read tensors by name: as many bytes as the file has, whatever its header declares.
 
-    Raises:
-        UserError: missing, truncated, not safetensors, or a number is NaN or Inf.
+    Missing, truncated, not safetensors, NaN or Inf is a ``UserError``.
     """
     import torch
     from safetensors import SafetensorError
@@ -64,11 +59,7 @@ def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def check_fit(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], where: object, do: str) -> None:
-    """Whether weights are those of a network, by name, shape and kind of number.
-
-    Raises:
-        UserError: a name is missing or too much, or a shape or kind differs.
-    """
+    """Refuse (``UserError``) weights that are not those of a network, by name, shape and kind of number."""
     for name in sorted({*wanted, *given}):
         one, other = wanted.get(name), given.get(name)
         if one is None or other is None or one.shape != other.shape or one.dtype != other.dtype:
@@ -78,8 +69,7 @@ def check_fit(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], where: 
 def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object) -> M:
     """The module that ``make`` makes, with these weights; nothing is allocated before they are known to fit.
 
-    Raises:
-        UserError: see :func:`check_fit`, or no module can be made as the manifest says.
+    Where they do not, or none can be made as the manifest says, it is a ``UserError``.
     """
     import torch
 

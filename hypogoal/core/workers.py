@@ -1,7 +1,5 @@
 """Tasks on several cores: each in a process of its own, none of which outlives the one that asked for it."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import multiprocessing
@@ -42,19 +40,12 @@ def allowed(wanted: int) -> int:
 
 
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
-    """Run tasks, ``workers`` at once; where that is one, in this process.
+    """Run tasks, ``workers`` at once; where that is one, in this process; ``done`` is told each one's number and
+    result.
 
-    When a task fails, or at Ctrl-C, those that run get SIGTERM and are waited for: who saves checkpoints saves one.
-
-    Own code that is allowed here is allowed there.
-
-    Args:
-        tasks: what to run; more than one at once, they and their results go from process to process.
-        workers: processes.
-        done: told the number and the result of each task as soon as it is there.
-
-    Raises:
-        Killed: one of the processes was.
+    More than one at once, they and their results go from process to process; own code that is allowed here is allowed
+    there. When a task fails, or at Ctrl-C, those that run get SIGTERM and are waited for: who saves checkpoints saves
+    one. Where the system kills a process, it is ``Killed``.
     """
     if min(workers, len(tasks)) <= 1:
         for number, task in enumerate(tasks):

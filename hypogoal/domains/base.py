@@ -82,11 +82,11 @@ class Engine(ABC):
 
     @abstractmethod
     def reset(self) -> NDArray[np.int64]:
-        """Put every environment at the start of an episode; returns the ids."""
+        """Put every environment at the start of an episode; returns the ids, int64 (E,)."""
 
     @abstractmethod
     def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment; where an episode ends, ``ids`` is a start state again afterwards."""
+        """Step every environment, actions (E,); where an episode ends, ``ids`` is a start state again afterwards."""
 
     @abstractmethod
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
@@ -97,11 +97,7 @@ class Engine(ABC):
         """True sub-goal predicates, bool (n, G): the oracle that only evaluation and the upper bound may see."""
 
     def room_for(self, count: int, out: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-        """Where to draw ``count`` observations: ``out``, or a new array.
-
-        Raises:
-            ValueError: ``out`` is of another shape or type, or in pieces.
-        """
+        """Where to draw ``count`` observations: ``out``, a ``ValueError`` where it does not fit, or a new array."""
         shape = (count, *self.observation_shape)
         if out is None:
             return np.empty(shape, np.uint8)
@@ -173,24 +169,18 @@ class TurnEngine(Engine):
         """One environment's step number ``elapsed`` of an episode: state, reward, terminated, truncated."""
 
     def reset(self) -> NDArray[np.int64]:
-        """Every environment at the start of an episode; returns the ids, int64 (E,)."""
         self.ids = np.array([self._begin(number) for number in range(self.count)], np.int64)
         self.elapsed = np.zeros(self.count, np.int64)
         return self.ids.copy()
 
     def restart(self, where: NDArray[np.bool_]) -> None:
-        """Begin a new episode now in the environments ``where``, bool (E,)."""
         ids, elapsed = self.ids.copy(), self.elapsed.copy()
         for number in np.flatnonzero(where).tolist():
             ids[number], elapsed[number] = self._begin(number), 0
         self.ids, self.elapsed = ids, elapsed
 
     def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment with actions int (E,); where an episode ends, a start state follows.
-
-        Raises:
-            IndexError: no such action, or not one for each environment.
-        """
+        """Step every environment; an ``IndexError`` where there is no such action, or not one for each environment."""
         played = actions.tolist()
         if len(played) != self.count or not all(0 <= action < self.n_actions for action in played):
             raise IndexError(f"actions are {self.count} numbers from 0 to {self.n_actions - 1}, not {played}")
@@ -265,14 +255,10 @@ class Domain(ABC):
         return gymnasium.make(self.env_id, **arguments)
 
     def world(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Of the settings that states were collected with those that are the engine's, checked.
+        """Of the settings that states were collected with (``config`` of a data file, ``domain_config`` of an artefact)
+        the engine's.
 
-        Args:
-            config: ``domain_config`` of an artefact, or ``config`` of a data file; what it does not say is as
-                ``make_engine`` has it.
-
-        Raises:
-            UserError: a value that ``collect`` would not take.
+        What they do not say is as ``make_engine`` has it; what ``collect`` would not take is a ``UserError``.
         """
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked: Any = from_values(self.config_class, values, "collect") if values else None
@@ -308,11 +294,7 @@ class Domain(ABC):
 
 
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
-    """One step of an engine, which may be someone's own.
-
-    Raises:
-        UserError: it does not give one id, finite reward and pair of truth values for each environment.
-    """
+    """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
     step = engine.step(actions)
     for name, kinds in (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b")):
         values = getattr(step, name, None)
@@ -329,14 +311,8 @@ def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
 def load_domain(name: str, *, given: bool = False) -> Domain:
     """A domain by its name, by an installed entry point (group ``hypogoal.domains``) or as ``module:object``.
 
-    ``module:object`` is code that will run, see :mod:`hypogoal.core.own_code`.
-
-    Args:
-        name: the domain.
-        given: the user gave this name, on the command line or in a program.
-
-    Raises:
-        UserError: no such domain, code that the user did not allow, or the object is not a domain.
+    The latter is code that will run, see :mod:`hypogoal.core.own_code`; ``given``: the user gave this name, on the
+    command line or in a program. What is no domain, or code that the user did not allow, is a ``UserError``.
     """
     try:
         with own_code.given(*([name] if given else [])):
@@ -352,11 +328,7 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
 
 
 def installed_domain(name: str, *, given: bool = False) -> Domain | None:
-    """The domain; None where it is not installed here: own data may name one that is not.
-
-    Raises:
-        UserError: the name is code that the user did not allow (see :func:`load_domain`).
-    """
+    """The domain; None where it is not installed here: own data may name one that is not. See :func:`load_domain`."""
     with own_code.given(*([name] if given else [])):
         own_code.require_trust(name, "domain")
         try:
@@ -366,10 +338,6 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
 
 
 def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str, Any]:
-    """The settings of a stage that this domain has by default, in place of the general ones; empty where none are.
-
-    Raises:
-        UserError: see :func:`installed_domain`.
-    """
+    """The settings of a stage that this domain has in place of the general ones; see :func:`installed_domain`."""
     installed = installed_domain(domain, given=given)
     return installed.defaults.get(stage, {}) if installed else {}

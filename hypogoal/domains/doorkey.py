@@ -3,8 +3,6 @@
 The parts: ``doorkey_env`` (the Gymnasium environment and the sub-goals), ``doorkey_engine`` (many environments, fast).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Sequence

@@ -9,8 +9,6 @@ toggling change the configuration: rare, so worked out in plain Python the first
 state met gets an id.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -96,9 +94,6 @@ class DoorKeyEngine(Engine):
         max_steps: steps after which an episode is truncated.
 
     Attributes:
-        ids: int64 (E,), the current state of each environment.
-        elapsed: int64 (E,), steps since its episode began.
-        n_states: ids met so far are 0 .. n_states - 1.
         changes: of configurations that have been worked out, by configuration, cell and action.
     """
 
@@ -137,17 +132,14 @@ class DoorKeyEngine(Engine):
 
     @property
     def tiles(self) -> NDArray[np.uint8]:
-        """What each cell code looks like, uint8 (N_CODES, 8, 8, 3)."""
         return tiles()
 
     def reset(self) -> NDArray[np.int64]:
-        """Every environment at the start of an episode; returns the ids, int64 (E,)."""
         self.ids = np.full(self.count, START, np.int64)
         self.elapsed = np.zeros(self.count, np.int64)
         return self.ids.copy()
 
     def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment with actions int (E,); where an episode ends, the start follows."""
         next_ids = self.follow(self.ids, actions)
         terminated = self.at_goal(next_ids)
         elapsed = self.elapsed + 1
@@ -189,7 +181,6 @@ class DoorKeyEngine(Engine):
         return self.changes[key]
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, 64, 64, 3) of any known states, into ``out`` where given."""
         out = self.room_for(len(ids), out)
         rows_of_tiles = tiles().reshape(-1, TILE, TILE * 3).view(_ROW_OF_TILE)[..., 0]
         drawn = rows_of_tiles[self.codes(ids)].reshape(-1, SIZE, SIZE, TILE)

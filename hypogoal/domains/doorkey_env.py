@@ -3,8 +3,6 @@
 This is the reference: the fast engine (``doorkey_engine.py``) is tested to be pixel- and step-exact with it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

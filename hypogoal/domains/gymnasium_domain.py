@@ -103,14 +103,12 @@ class GymnasiumDomain(Domain):
 
     @cached_property
     def observation_shape(self) -> tuple[int, ...]:
-        """(H, W, C)."""
         env = make_checked(self.make_env)
         env.close()
         return shape_of(env)
 
     @property
     def has_env(self) -> bool:
-        """Always."""
         return True
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
@@ -124,23 +122,18 @@ class GymnasiumDomain(Domain):
         return GymnasiumEngine(make, self._labels, layout_seed, count, max_steps=max_steps, memory=memory)
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
-        """Observations of a collection, at the most."""
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)
         return layouts * min(config.states, config.steps) * prod(self.observation_shape)
 
     def played_bytes(self, steps: int, frames: int) -> int:
-        """Pictures that training for so many steps keeps, at the most."""
         return min(2 * self.memory, steps) * prod(self.observation_shape)
 
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states: what play on each layout meets, each picture once.
 
-        Held-out states that look like one of those for learning are left out. Origins: ``layout_seed``, ``episode``
-        and ``step``, counted from 0.
-
-        Raises:
-            UserError: the labelled states have one class only of some sub-goal, or there are no unlabelled or no
-                held-out ones.
+        Held-out states that look like one of those for learning are left out. Origins: ``layout_seed``, ``episode`` and
+        ``step``, counted from 0. Labelled states of one class only, no unlabelled or no held-out ones are a
+        ``UserError``.
         """
         seeds_of_sets = config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds
         progress.expect(sum(map(len, seeds_of_sets)) * config.steps)

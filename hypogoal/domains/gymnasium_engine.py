@@ -1,7 +1,5 @@
 """Any Gymnasium environment as an engine: many of it stepped in turn, states by id, each distinct one kept once."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import blake2b
@@ -23,11 +21,7 @@ MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
 
 def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
-    """What a function of the user's own makes.
-
-    Raises:
-        UserError: it fails, or makes no environment.
-    """
+    """What a function of the user's own makes; a ``UserError`` where it fails, or makes no environment."""
     with UsersCode("the environment", make, failed="cannot be made:") as code:
         env: Any = make(**arguments)
         if not isinstance(env, gymnasium.Env):
@@ -36,10 +30,8 @@ def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
 
 
 def make_checked(make: MakeEnv) -> gymnasium.Env:
-    """An environment whose observations and actions hypogoal can work with.
-
-    Raises:
-        UserError: it cannot be made, its observations are no uint8 images, or its actions are not ``Discrete``.
+    """An environment whose observations, uint8 images, and actions, ``Discrete``, hypogoal can use; else a
+    ``UserError``.
     """
     env = made(make)
     with UsersCode("the environment", env, failed="has no spaces:"):
@@ -76,10 +68,8 @@ def with_channels(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """An environment's observation as uint8 (H, W, C), in memory of its own.
-
-    Raises:
-        UserError: it is not what the environment's observation space says.
+    """An environment's observation as uint8 (H, W, C), in memory of its own; a ``UserError`` where its space says
+    other.
     """
     code = UsersCode("the environment", env, "step")
     if not isinstance(observation, np.ndarray):
@@ -94,11 +84,7 @@ def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> ND
 
 
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-    """What ``env.reset(**arguments)`` gives: an observation, see :func:`as_image`, and a dict.
-
-    Raises:
-        UserError: it fails, or gives something else.
-    """
+    """What ``env.reset(**arguments)`` gives: an observation, see :func:`as_image`, and a dict; else a ``UserError``."""
     with UsersCode("the environment's reset", env, "reset") as code:
         given: Any = env.reset(**arguments)
         if not isinstance(given, tuple | list) or len(given) != 2 or not isinstance(given[1], dict):
@@ -107,11 +93,7 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """What ``env.step(action)`` gives: an observation, see :func:`as_image`, and the rest as it should be.
-
-    Raises:
-        UserError: it fails, or gives something else.
-    """
+    """What ``env.step(action)`` gives: an observation, see :func:`as_image`, and the rest; else a ``UserError``."""
     with UsersCode("the environment's step", env, "step") as code:
         given: Any = env.step(action)
         if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
@@ -184,12 +166,10 @@ class GymnasiumEngine(TurnEngine):
 
     @property
     def n_states(self) -> int:
-        """Ids known so far are 0 .. n_states - 1."""
         return len(self._labels) // max(1, len(self._label_functions))
 
     @property
     def oldest(self) -> int:
-        """Ids below this one are forgotten: there are no images of them."""
         return self.n_states - len(self._ring)
 
     def _begin(self, number: int) -> int:
@@ -229,11 +209,6 @@ class GymnasiumEngine(TurnEngine):
             self._ids.popitem(last=False)
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, H, W, C) of states (n,), into ``out`` where given.
-
-        Raises:
-            ValueError: there is no such state, or it is forgotten.
-        """
         if len(ids) and not self.oldest <= ids.min() <= ids.max() < self.n_states:
             raise ValueError(f"states {self.oldest} to {self.n_states - 1} are kept, not {ids.min()} to {ids.max()}")
         out = self.room_for(len(ids), out)
@@ -242,7 +217,6 @@ class GymnasiumEngine(TurnEngine):
         return out
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """True sub-goal predicates, bool (n, G); of forgotten states too."""
         every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._label_functions))
         return every[ids].copy()
 

@@ -1,11 +1,9 @@
 """Montezuma's Revenge, climbing down ladders (Spec B4, B5): the domain as the stages see it, how states are collected.
 
 The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezuma_ladders`` (where the ladders are),
-``montezuma_rollouts`` and ``montezuma_states`` (what is collected), ``montezuma_env`` and ``montezuma_engine`` (one
-game and many, from the top of a ladder on).
+``montezuma_states`` (what is collected), ``montezuma_env`` and ``montezuma_engine`` (one game and many, from the top
+of a ladder on).
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
@@ -27,8 +25,15 @@ from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observ
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, SUB_GOALS
 from hypogoal.domains.montezuma_ladders import GROUPS, LADDERS, distance_to_base, ladder_named
-from hypogoal.domains.montezuma_rollouts import PLAYS
-from hypogoal.domains.montezuma_states import KINDS, RoomStates, emulator_of_process, gather, labels_of, origins_of
+from hypogoal.domains.montezuma_states import (
+    KINDS,
+    PLAYS,
+    RoomStates,
+    emulator_of_process,
+    gather,
+    labels_of,
+    origins_of,
+)
 
 # The unlabelled rooms where none are given: the first of these ladder rooms that has no labels, and a room without a
 # ladder; where all have labels, two without.
@@ -85,14 +90,8 @@ class MontezumaConfig:
 
 
 class _Task(NamedTuple):
-    """The states of one room for one of the three sets.
-
-    Attributes:
-        name: of the set.
-        begin: the index there of the first of them.
-        wanted: how many.
-        gather: plays in the room, in whatever process.
-        kept: where they are until all are there.
+    """``wanted`` states of a room for the set called ``name``, there from index ``begin`` on: gathered, and kept till
+    all are there.
     """
 
     name: str
@@ -108,11 +107,7 @@ def labelled_rooms(groups: int) -> tuple[int, ...]:
 
 
 def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
-    """The rooms of the unlabelled states: those given, or one with a ladder that has no labels and one without.
-
-    Raises:
-        UserError: there is no such room.
-    """
+    """The rooms of the unlabelled states: those given, or one with a ladder that has no labels and one without."""
     for room in config.unlabelled_rooms:
         if not 0 <= room < ROOMS:
             raise UserError("no such room", f"unlabelled_rooms={room}", f"Rooms are 0 to {ROOMS - 1}.")
@@ -128,13 +123,8 @@ def _states_of(states: RoomStates) -> States:
 
 
 class MontezumaDomain(Domain):
-    """Spec B6: the ladders of Montezuma's Revenge.
-
-    Attributes:
-        starts: the ladders at whose tops episodes can begin.
-        kinds: what the values of the origin ``kind`` mean.
-        resumes: collecting goes on where it was.
-        defaults: per stage, this domain's own: Table 1; for options, what lets them learn on a laptop.
+    """Spec B6: the ladders of Montezuma's Revenge; by default Table 1, and for options what lets them learn on a
+    laptop.
     """
 
     name = "montezuma"
@@ -267,7 +257,6 @@ class MontezumaDomain(Domain):
         return tuple(dict.fromkeys((ladder.top.room, ladder.base.room)))
 
     def picture(self, room: int) -> NDArray[np.uint8]:
-        """A room as the console shows it, but for the agent: uint8 (210, 160, 3)."""
         return picture(emulator_of_process(), room)
 
 

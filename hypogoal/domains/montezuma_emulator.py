@@ -5,8 +5,6 @@ wrappers do not offer, and frames that nobody looks at need not be drawn. What i
 test compares them with ``AtariPreprocessing`` and ``FrameStackObservation``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -56,12 +54,7 @@ THREE_PLACES = (20, 75, 130)  # so far apart that neither the agent nor what is 
 
 
 def stack_frames(frames: Sequence[NDArray[np.uint8]], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-    """Four frames (84, 84) as an observation, uint8 (84, 84, 4): ``np.stack(frames, axis=-1)``, ten times faster.
-
-    Args:
-        frames: the oldest first.
-        out: where to put it, contiguous; None, a new array.
-    """
+    """Four frames (84, 84), the oldest first, as uint8 (84, 84, 4): ``np.stack(frames, axis=-1)``, ten times faster."""
     import cv2
 
     merged: Any = cv2.merge(frames, out)
@@ -105,10 +98,8 @@ def row_of(room: int) -> int:
 
 
 def load_ale(seed: int) -> Any:
-    """A raw emulator with the game's ROM in it, deterministic, one frame per act.
-
-    Raises:
-        UserError: ale-py or OpenCV is not installed or broken, or it has no such ROM.
+    """A raw emulator with the game's ROM in it, deterministic, one frame per act; a ``UserError`` where it is not
+    there.
     """
     try:
         import cv2  # noqa: F401

@@ -4,8 +4,6 @@ An observation is four frames of which a step makes one: states share them. The 
 frames of older ones are forgotten.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -48,11 +46,6 @@ class MontezumaEngine(TurnEngine):
         memory: states whose images are kept; 7 kB each, taken when first needed.
         seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
 
-    Attributes:
-        ids: int64 (E,), the current state of each environment.
-        elapsed: int64 (E,), steps since its episode began.
-        starts: the start states.
-
     Raises:
         UserError: no such ladder, too few start states, too small a memory, or no emulator.
     """
@@ -91,16 +84,13 @@ class MontezumaEngine(TurnEngine):
 
     @property
     def n_states(self) -> int:
-        """Ids known so far are 0 .. n_states - 1."""
         return len(self._alive)
 
     @property
     def oldest(self) -> int:
-        """Ids below this one, but for the S start states', are forgotten: there are no images of them."""
         return self.n_states - len(self._seen)
 
     def _begin(self, number: int) -> int:
-        """An episode of one environment; returns the start state."""
         begin = draw_start(self.starts, self.along, self._rng)
         self._emulators[number].restore(self.starts[begin].snapshot)
         return begin
@@ -129,11 +119,7 @@ class MontezumaEngine(TurnEngine):
         return ids
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, 84, 84, 4) of states (n,), into ``out`` where given.
-
-        Raises:
-            ValueError: there is no such state, it is forgotten, or ``out`` is of the wrong kind.
-        """
+        """Observations uint8 (n, 84, 84, 4) of states (n,); a ``ValueError`` where one is not there, or forgotten."""
         fixed, oldest = len(self.starts), self.oldest
         out = self.room_for(len(ids), out)
         for image, state in zip(out, self._known(ids).tolist(), strict=True):
@@ -152,7 +138,6 @@ class MontezumaEngine(TurnEngine):
         return np.frombuffer(self._alive, np.bool_)[self._known(ids)]
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Spec B4: the true predicates, bool (n, 1); of forgotten states too."""
         return labels_of(self.positions(ids), self.alive(ids))
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
@@ -179,11 +164,7 @@ class MontezumaEngine(TurnEngine):
         }
 
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments.
-
-        Raises:
-            ValueError: it was made with others.
-        """
+        """Continue from a ``snapshot`` of an engine made with the same arguments; with others, a ``ValueError``."""
         from ale_py import ALEState
 
         if snapshot["arguments"].tobytes() != self._arguments:

@@ -3,8 +3,6 @@
 This is the reference: the training engine (``montezuma_engine.py``) is tested to be exact to it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ Positions are the RAM's (see ``montezuma_emulator``). They were read off the emu
 test marked ``atari`` plays every descent again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -66,11 +64,7 @@ FAR = 10**9  # more than any way is long
 
 
 def ladder_named(name: str) -> Ladder:
-    """A ladder by its name.
-
-    Raises:
-        UserError: there is none of that name.
-    """
+    """A ladder by its name; a ``UserError`` where there is none."""
     if name not in BY_NAME:
         raise UserError("unknown ladder", name, f"Choose one of {', '.join(BY_NAME)}.")
     return BY_NAME[name]

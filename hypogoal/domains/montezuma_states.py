@@ -1,19 +1,58 @@
-"""States of one room of Montezuma's Revenge: which are kept, of what kind they are, and their labels (Spec B4, B5)."""
+"""States of one room of Montezuma's Revenge: how they are brought about, by scripted rollouts and random play, which
+are kept, of what kind they are, and their labels (Spec B4, B5, B7).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import cycle
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import digest
-from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ON_LADDER, RAM, Emulator
-from hypogoal.domains.montezuma_ladders import BASES, GROUPS, LADDERS, REACH, TOPS, at_base, ladders_of, within
-from hypogoal.domains.montezuma_rollouts import PLAYS, Shown
+from hypogoal.domains.montezuma_emulator import (
+    DOWN,
+    EDGE_Y,
+    FRAME_SKIP,
+    LEFT,
+    LEFT_EDGE,
+    N_ACTIONS,
+    NOOP,
+    OBSERVATION_SHAPE,
+    ON_LADDER,
+    RAM,
+    RIGHT,
+    RIGHT_EDGE,
+    SPRITE_HEIGHT,
+    SPRITE_LEFT,
+    SPRITE_TOP,
+    SPRITE_WIDTH,
+    UP,
+    Emulator,
+    Position,
+    Snapshot,
+    picture,
+)
+from hypogoal.domains.montezuma_ladders import (
+    BASES,
+    GROUPS,
+    LADDERS,
+    REACH,
+    SHAFT_ENTRY,
+    SHAFT_EXIT,
+    TOPS,
+    Ladder,
+    at_base,
+    ladders_of,
+    within,
+)
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DYING, ELSEWHERE = range(len(KINDS))
@@ -29,6 +68,29 @@ SPARE = 1.25  # times as many as are wanted are gathered, to choose from
 FEWEST_POSITIVES, FEWEST_AT_A_BASE = 0.1, 0.02
 MOST_STEPS = 60  # agent steps for each wanted state, after which a room is given up; two to four are usual
 HELD_OUT_EACH = 3  # one in so many stacks may be held out
+
+ROLLOUT_STEPS = 40
+RANDOM_STEPS = 200
+SETTLE = 4  # agent steps that fill the stack with what the start looks like
+PHASES = (2, 200)  # frames that the room's enemies have been moving before the first step
+ROLLOUTS_PER_PHASE = 4
+STARTS = {"base": 0.5, "ladder": 0.15, "top": 0.1, "anywhere": 0.25}  # shares, among those that a room has
+
+LONGEST_REPEAT = 8  # agent steps of one action
+JITTER = 0.1  # share of the steps on which another action comes in between
+HEADINGS = (DOWN, UP, LEFT, RIGHT)
+HEADING = 0.7  # share of the actions that are one of the headings; the others are any
+CLOSE = 1  # how far from a base, in the RAM's units, an agent that wants to be there stays where it is
+STEPS_ASIDE = 3  # walked at most from a base or top before a rollout begins
+HELD = 0.5  # share of the starts at a base where the agent holds it, against the conveyor belt in room 1
+STRIDE = 4  # how far the agent walks and climbs in an agent step, in the RAM's units
+
+# Where the agent can be put.
+BLACK_SHARE = 0.95  # of the agent's box, where it stands in the open; its feet are all in the open
+FEET = 4  # rows
+SNAP = 3  # of the row in which one enters, the floor is drawn so much lower in some rooms
+LAVA_ROOMS = (10, 18, 20, 22)
+LAVA_BELOW = 220  # y; nobody stands on lava, unless put there
 
 
 @dataclass(frozen=True)
@@ -129,7 +191,7 @@ def gather(
         room: 0..23.
         wanted: how many states.
         seed, stream: of everything that is random here, see ``rng_for``.
-        play: how the agent plays: a name in ``montezuma_rollouts.PLAYS``.
+        play: how the agent plays: a name in ``PLAYS``.
         held_out: which side of ``may_be_held_out``.
         runs_on: whether to keep states at bases of ladders that run on through the floor.
 
@@ -179,10 +241,8 @@ def gather(
 def choose(
     kinds: NDArray[np.int64], positions: NDArray[np.int64], wanted: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Which ``wanted`` of states (n,) to keep: of each kind its share, spread over positions (n, 3); others at random.
-
-    Returns:
-        Their indices, in order.
+    """The indices, in order, of ``wanted`` of states (n,): of each kind its share, spread over positions (n, 3), others
+    at random.
     """
     order = rng.permutation(len(kinds))
     latest: dict[tuple[int, ...], int] = {}  # kind and position -> turn of the last state so far
@@ -194,3 +254,191 @@ def choose(
     first = np.concatenate([spread[kinds[spread] == kind][: int(share * wanted)] for kind, share in SHARES.items()])
     others = order[~np.isin(order, first)][: wanted - len(first)]
     return np.sort(np.concatenate([first, others]))
+
+
+class Placing(NamedTuple):
+    """Where a rollout begins.
+
+    Attributes:
+        x, y: the agent is put there.
+        action, steps: then it plays that for so many agent steps, unseen.
+        hold: while the stack fills, it goes back to the base that it is near, instead of doing nothing.
+    """
+
+    x: int
+    y: int
+    action: int = NOOP
+    steps: int = 0
+    hold: bool = False
+
+
+class Shown(NamedTuple):
+    """One state of a rollout: what is seen, uint8 (84, 84, 4), the RAM, uint8 (128,), and the last two actions."""
+
+    stack: NDArray[np.uint8]
+    ram: NDArray[np.uint8]
+    action: int
+    previous_action: int
+
+
+def expert_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iterator[Shown]:
+    """Spec B5: the states of rollouts from around a room's bases, ladders, tops and platforms; without end.
+
+    Actions are repeated, most of them headings; some are chosen to get to a base. A rollout ends when the agent leaves
+    the room, or when it would come to life again after a death.
+    """
+    bases = [base for base in BASES if base.room == room]
+    starts = _starts(emulator, room, rng)
+    kinds = list(starts)
+    weights = np.array([STARTS[kind] for kind in kinds])
+    while True:
+        scene = _scene(emulator, room, rng)
+        for _ in range(ROLLOUTS_PER_PHASE):
+            emulator.restore(scene)
+            start = starts[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]()
+            if (begun := _begin(emulator, room, start, bases)) is not None:
+                yield from _rollout(emulator, room, begun, _expert_actions(emulator, bases, rng))
+
+
+def random_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iterator[Shown]:
+    """Spec B7: the states of random actions, each as likely, from the sides of a room; without end."""
+    places = standing_places(emulator, room)
+    row = places[places[:, 1] == places[:, 1].max()]
+    sides = [Placing(*row[row[:, 0].argmin()].tolist()), Placing(*row[row[:, 0].argmax()].tolist())]
+    while True:
+        emulator.restore(_scene(emulator, room, rng))
+        if (begun := _begin(emulator, room, sides[rng.integers(2)])) is not None:
+            yield from _rollout(emulator, room, begun, rng.integers(N_ACTIONS, size=RANDOM_STEPS).tolist())
+
+
+def _rollout(
+    emulator: Emulator, room: int, begun: tuple[int, int], actions: Iterator[int] | Sequence[int]
+) -> Iterator[Shown]:
+    shown = Shown(emulator.stack, emulator.ram().copy(), *begun)
+    yield shown
+    for action in actions:
+        emulator.step(action)
+        ram = emulator.ram().copy()
+        revived = shown.ram[RAM["dying"]] > 0 and ram[RAM["dying"]] == 0
+        if revived or ram[RAM["room"]] != room or emulator.ale.game_over():
+            return
+        shown = Shown(emulator.stack, ram, action, shown.action)
+        yield shown
+
+
+def _expert_actions(emulator: Emulator, bases: Sequence[Position], rng: np.random.Generator) -> Iterator[int]:
+    action, left = NOOP, 0
+    homing = rng.random() if bases else 0.0
+    for _ in range(ROLLOUT_STEPS):
+        if left == 0 and rng.random() < homing:
+            action, left = _towards_base(emulator.position(), bases)
+        elif left == 0:
+            action, left = _wander(rng)
+        left -= 1
+        yield int(rng.integers(N_ACTIONS)) if rng.random() < JITTER else action
+
+
+def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, int]:
+    """An action that brings the agent to the nearest base or holds it there, and for how many agent steps."""
+    base = min(bases, key=lambda base: abs(position.x - base.x) + abs(position.y - base.y))
+    aside = base.x - position.x
+    if abs(aside) > CLOSE:
+        return (RIGHT if aside > 0 else LEFT), max(1, round(abs(aside) / STRIDE))
+    return (DOWN if position.y > base.y else NOOP), 1
+
+
+def _wander(rng: np.random.Generator) -> tuple[int, int]:
+    """An action, and for how many agent steps."""
+    heading = rng.random() < HEADING
+    action = HEADINGS[rng.integers(len(HEADINGS))] if heading else int(rng.integers(N_ACTIONS))
+    return action, int(rng.integers(1, LONGEST_REPEAT + 1))
+
+
+def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> Snapshot:
+    """The room with its enemies at some phase; the agent is put in its place later."""
+    while True:
+        scene = emulator.place(room, RIGHT_EDGE, EDGE_Y, phase=int(rng.integers(*PHASES, endpoint=True)), settle=0)
+        if scene is not None:
+            return scene
+
+
+def _begin(emulator: Emulator, room: int, start: Placing, bases: Sequence[Position] = ()) -> tuple[int, int] | None:
+    """Bring the agent to its start and fill the stack: the last two actions, None where it is not alive in the room."""
+    emulator.write("x", start.x)
+    emulator.write("y", start.y)
+    emulator.frames(start.action, FRAME_SKIP * start.steps)
+    action = previous = NOOP
+    for _ in range(SETTLE):
+        previous = action
+        action = _towards_base(emulator.position(), bases)[0] if start.hold else NOOP
+        emulator.step(action)
+    return (action, previous) if emulator.alive() and emulator.position().room == room else None
+
+
+def _starts(emulator: Emulator, room: int, rng: np.random.Generator) -> dict[str, Callable[[], Placing]]:
+    """For each kind of start that the room has, what draws one. Where it has several ladders, they take turns."""
+    places = standing_places(emulator, room)
+    bases = _in_turn([base for base in BASES if base.room == room], rng)
+    tops = _in_turn([top for top in TOPS if top.room == room], rng)
+    climbs = _in_turn([climb for ladder in LADDERS for climb in _climbs(ladder) if climb[0].room == room], rng)
+
+    def beside(spot: Position, held: float) -> Placing:
+        x = spot.x + int(rng.integers(-REACH, REACH + 1))
+        if rng.random() < held:
+            return Placing(x, spot.y, hold=True)
+        return Placing(x, spot.y, (LEFT, RIGHT)[rng.integers(2)], int(rng.integers(STEPS_ASIDE + 1)))
+
+    def climbing(end: Position, action: int, longest: int) -> Placing:
+        return Placing(end.x, end.y, action, int(rng.integers(1, longest + 1)))
+
+    starts: dict[str, Callable[[], Placing]] = {}
+    if bases:
+        starts["base"] = lambda: beside(next(bases), HELD)
+    if climbs:
+        starts["ladder"] = lambda: climbing(*next(climbs))
+    if tops:
+        starts["top"] = lambda: beside(next(tops), 0.0)
+    starts["anywhere"] = lambda: Placing(*places[rng.integers(len(places))].tolist())
+    return starts
+
+
+def standing_places(emulator: Emulator, room: int) -> NDArray[np.int64]:
+    """Places x, y (n, 2) of a room where an agent that is put there stands on something, in the open.
+
+    Of all places many are inside walls, where the game never looks, and where the agent can climb about. So the
+    agent's box has to be black, with something under its feet. Room 15 is black nowhere: of it the row in which one
+    enters is taken.
+    """
+    black = (picture(emulator, room) == 0).all(2)
+    x = np.arange(LEFT_EDGE, RIGHT_EDGE + 1)
+    y = np.arange(SHAFT_EXIT, SHAFT_ENTRY + 1)
+    boxes = sliding_window_view(black, (SPRITE_HEIGHT + 1, SPRITE_WIDTH))  # the last row is the one under the feet
+    boxes = boxes[np.ix_(SPRITE_TOP - y, x + SPRITE_LEFT)]
+    stands = (boxes[:, :, :-1].mean((2, 3)) >= BLACK_SHARE) & boxes[:, :, -1 - FEET : -1].all((2, 3))
+    stands &= boxes[:, :, -1].mean(2) <= 0.5
+    if room in LAVA_ROOMS:
+        stands[y < LAVA_BELOW] = False
+    rows, columns = np.nonzero(stands)
+    if not len(rows):
+        return np.stack([x, np.full_like(x, EDGE_Y)], axis=1)
+    level = np.where(np.abs(y - EDGE_Y) <= SNAP, EDGE_Y, y)
+    return np.unique(np.stack([x[columns], level[rows]], axis=1), axis=0)
+
+
+def _in_turn(things: Sequence[Any], rng: np.random.Generator) -> Iterator[Any] | None:
+    """One after the other, over and over, in a random order; None where there are none."""
+    return cycle([things[index] for index in rng.permutation(len(things)).tolist()]) if things else None
+
+
+def _climbs(ladder: Ladder) -> list[tuple[Position, int, int]]:
+    """From where a ladder is climbed, which way, and for how many agent steps at most without leaving the room."""
+    one_room = ladder.top.room == ladder.base.room
+    up = (ladder.top.y if one_room else SHAFT_ENTRY) - ladder.base.y
+    down = ladder.top.y - (ladder.base.y if one_room else SHAFT_EXIT)
+    return [(ladder.base, UP, up // STRIDE - 1), (ladder.top, DOWN, down // STRIDE - 1)]
+
+
+PLAYS: dict[str, Callable[[Emulator, int, np.random.Generator], Iterator[Shown]]] = {
+    "expert": expert_play,
+    "random": random_play,
+}

@@ -1,7 +1,5 @@
 """Experiments as data: cells, each one ordinary command with its own output (Spec A6, G4)."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

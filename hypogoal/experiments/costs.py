@@ -1,7 +1,5 @@
 """What an experiment will cost on this machine, said before it starts (Spec G4)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -34,12 +32,7 @@ RATES = (
 class Estimates:
     """What commands cost, by their settings, which are those that their stages will have, and by an experiment's rates.
 
-    Args:
-        rates: by name of ``RATES``.
-        domain: whose presets and defaults hold.
-
-    Raises:
-        UserError: a rate is none.
+    The latter are called as in ``RATES``, else a ``UserError``; presets and defaults are those of ``domain``.
     """
 
     def __init__(self, rates: Mapping[str, Any], domain: str):
@@ -53,11 +46,7 @@ class Estimates:
         self._resolved = cache(self._resolve)  # of thousands of cells there are some tens
 
     def priced(self, cells: Sequence[Cell]) -> list[Cell]:
-        """Cells with what they cost.
-
-        Raises:
-            UserError: a setting that a stage has not.
-        """
+        """Cells with what they cost; a ``UserError`` where a stage has not such a setting."""
         settings = {(cell.stage, cell.out): self.settings(cell) for cell in cells}
         return [replace(cell, cost=self._cost(cell, settings)) for cell in cells]
 

@@ -4,8 +4,6 @@ The file is data. Its commands are stages of hypogoal and nothing else, and writ
 that come with hypogoal lie in ``presets/``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shlex
@@ -135,11 +133,7 @@ class Experiment:
 
 
 def read_experiment(path: Path) -> Experiment:
-    """An experiment in a TOML file.
-
-    Raises:
-        UserError: not such a file.
-    """
+    """An experiment in a TOML file; a ``UserError`` where it is none."""
     text = read_text(path, "the experiment is", "Give a .toml file.", MAX_PRESET_BYTES)
     table = parse_toml(text, path, "the experiment is", MEND)
     _check_keys(table, KEYS, path)
@@ -263,18 +257,11 @@ def make_plan(
     device: str = "auto",
     short: bool = False,
 ) -> Plan:
-    """The cells of an experiment.
+    """The cells of an experiment in the folder ``out``; what cannot be, or is not there, is a ``UserError``.
 
-    Args:
-        experiment: which.
-        out: the run's folder.
-        assignments: ``SETTING=VALUES``, with commas between, in place of the file's; ``workers=N``, ``evaluate=false``;
-            where it has a domain also ``STAGE.KEY=VALUE``.
-        preset, device: where it has a domain.
-        short: for one that is to have one agent and no more, names without their axes.
-
-    Raises:
-        UserError: it is asked for what cannot be, or its commands for what is not there.
+    ``assignments`` are ``SETTING=VALUES``, with commas between, in place of the file's; ``workers=N``,
+    ``evaluate=false``; where it has a domain also ``STAGE.KEY=VALUE``, and ``preset`` and ``device``. ``short``: for
+    one that is to have one agent and no more, names without their axes.
     """
     return _Planner(experiment, out, [*assignments], preset, device).plan(short=short)
 

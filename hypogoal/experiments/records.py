@@ -5,8 +5,6 @@ that sees it can read it. ``logs/NAME.log`` is what a cell said; who holds the k
 the lock goes on to the cell's own processes, so it ends with the last of them. ``logs/NAME.json`` is how it went.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 import time
@@ -97,11 +95,7 @@ def excuse(run: Path, cells: Sequence[Cell]) -> None:
 
 
 def open_log(run: Path, cell: Cell) -> BinaryIO:
-    """A cell's log to append to, locked: nobody else runs this cell while it, or a copy of it, is open.
-
-    Raises:
-        UserError: another process runs the cell.
-    """
+    """A cell's log to append to, locked: nobody else runs the cell while it, or a copy, is open (a ``UserError``)."""
     path = log_of(run, cell)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.parent.is_symlink() or path.is_symlink() or (path.exists() and not path.is_file()):
@@ -132,13 +126,7 @@ def is_running(run: Path, cell: Cell) -> bool:
 
 
 def write_plan(run: Path, plan: Plan, factor: float) -> None:
-    """Write the plan down.
-
-    Args:
-        run: the run's folder, made where it is not there.
-        plan: the experiment.
-        factor: how much slower this machine is than the one that costs are of.
-    """
+    """Write the plan into the run's folder; ``factor``: how much slower this machine is than that of costs."""
     run.mkdir(parents=True, exist_ok=True)
     rows = [_row(moved(cell, str(run), RUN)) for cell in plan.cells]
     about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
@@ -165,12 +153,7 @@ class LostPlan(UserError):
 
 
 def read_plan(run: Path) -> tuple[Plan, float]:
-    """The plan of a run's folder, and its machine's factor (see :func:`write_plan`).
-
-    Raises:
-        UserError: there is none, or one of a newer format.
-        LostPlan: what is there is not one.
-    """
+    """The plan of a run's folder and its machine's factor, see :func:`write_plan`; damaged, it is ``LostPlan``."""
     path = run / PLAN
     if not path.is_file():
         raise UserError("no sweep here", run, "Give the folder of a sweep that was started as --out.")
@@ -215,10 +198,8 @@ def made_anew(run: Path, cell: Cell) -> None:
 
 
 def check_same(run: Path, cells: Sequence[Cell]) -> None:
-    """Refuse cells that do not go on with what the folder has: every cell of before, commands as they were.
-
-    Raises:
-        UserError: a cell of before is not there any more, its command is another, or a preset file was changed.
+    """Refuse (``UserError``) cells that do not go on with what the folder has: all of before, with the same command and
+    presets.
     """
     if not (run / PLAN).is_file():
         return

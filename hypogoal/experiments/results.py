@@ -27,11 +27,7 @@ COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # behind those of 
 
 
 def write_results(plan: Plan, run: Path) -> Path:
-    """Gather every number of the cells that are done and write ``results.csv``, whole or not at all.
-
-    Raises:
-        UserError: an artefact is damaged.
-    """
+    """Write ``results.csv``, every number of cells that are done; a ``UserError`` where an artefact is damaged."""
     names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
     path = run / RESULTS
     try:

@@ -4,8 +4,6 @@ A cell is finished when its output's manifest says so, which is held against the
 of the output's files once (some ms per MB); ``hypogoal verify`` reads what is in them, too.
 """
 
-from __future__ import annotations
-
 import re
 import stat
 import time
@@ -60,12 +58,8 @@ class Status:
 
 
 def read_status(run: Path) -> Status:
-    """Look at every cell.
-
-    A cell is done as of :func:`done_of`; the next start checks it file by file.
-
-    Raises:
-        UserError: there is no sweep.
+    """Look at every cell (``UserError``: there is no sweep); done is as of :func:`done_of`, which the next start checks
+    file by file.
     """
     plan, factor = read_plan(run)
     states: list[State] = []
@@ -220,10 +214,8 @@ def stamp_of(cell: Cell) -> tuple[int, int] | None:
 
 
 def left_of(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells that are not finished; of evaluation and report also those that read what is still to be made.
-
-    Raises:
-        UserError: as of :func:`is_finished`.
+    """The cells that are not :func:`is_finished`; of evaluation and report also those that read what is still to be
+    made.
     """
     left: list[Cell] = []
     pending: set[Path] = set()

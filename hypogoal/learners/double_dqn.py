@@ -1,7 +1,5 @@
 """Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies and exploration schedules."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

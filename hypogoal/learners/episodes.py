@@ -1,16 +1,13 @@
 """The episodes played so far: how long each was, what it earned, how it ended (Spec E7, F5)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hypogoal.core.checkpoints import State
+from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.files import write_table
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Step
 
 EPISODE_COLUMNS = ("step", "length", "reward", "terminated")
@@ -18,13 +15,9 @@ LAST = 100  # episodes, of which success and length are told
 
 
 class Episodes(list[tuple[int, int, float, int]], Resumable):
-    """A row of ``EPISODE_COLUMNS`` for every finished episode of some environments, in the order in which they ended.
+    """A row of ``EPISODE_COLUMNS`` for every finished episode of E environments, in the order in which they ended.
 
-    Args:
-        environments: E.
-
-    Attributes:
-        steps: environment steps so far, summed over the environments.
+    ``steps`` are environment steps so far, summed over the environments.
     """
 
     CHANGING = ("steps", "_length", "_reward")
@@ -60,10 +53,8 @@ class Episodes(list[tuple[int, int, float, int]], Resumable):
         write_table(folder / "episodes.csv", EPISODE_COLUMNS, self)
 
     def snapshot(self) -> State:
-        """As of :class:`Resumable`."""
         return {**super().snapshot(), "rows": np.array(self, np.float64).reshape(-1, len(EPISODE_COLUMNS))}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """As of :class:`Resumable`."""
         super().restore(snapshot)
         self[:] = [(int(row[0]), int(row[1]), row[2], int(row[3])) for row in snapshot["rows"].tolist()]

@@ -1,7 +1,5 @@
 """The parameters of small networks as one vector: what is done to each of them is done once."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -3,8 +3,6 @@
 A transition costs bytes, not images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.resumable import Resumable
+from hypogoal.core.checkpoints import Resumable
 
 FAN = 64  # children of a node: 1e5 leaves are three levels, and NumPy's cost is by the call
 
@@ -109,7 +107,6 @@ class PrioritisedReplay(Resumable):
         self.tree.set(indices, priorities**self.alpha)
 
     def snapshot(self) -> dict[str, Any]:
-        """What a resumed run needs to go on exactly."""
         return {
             "data": {name: values[: self.size].copy() for name, values in self.data.items()},
             "priorities": self.tree.get(np.arange(self.size)),

@@ -3,8 +3,6 @@
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting

@@ -1,7 +1,5 @@
 """Episodes of a trained agent: frame by frame for films, and as data for other software (Spec D1, E1)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
@@ -59,14 +57,9 @@ class Episode:
 
 
 def agent_of(artefact: Artefact, seed: int) -> OptionLoop:
-    """One environment in which the agent of a meta artefact plays.
+    """One environment in which the agent of a meta artefact plays; ``seed`` is of the draws.
 
-    Args:
-        artefact: its weights are read; those of a policy over options and of initiation sets, where it has them.
-        seed: of the draws.
-
-    Raises:
-        UserError: a file of it, or its ensemble, is missing or damaged, or its domain is not installed.
+    A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
     """
     source, files = open_artefact(artefact.input("ensemble"), "ensemble"), artefact.manifest["files"]
     settings = {
@@ -90,11 +83,7 @@ def agent_of(artefact: Artefact, seed: int) -> OptionLoop:
 
 
 def play_episode(loop: OptionLoop) -> list[Frame]:
-    """One episode: a frame per step, and one for the state in which each execution ended.
-
-    Args:
-        loop: from :func:`agent_of`.
-    """
+    """One episode of :func:`agent_of`: a frame per step, and one for the state in which each execution ended."""
     frames = []
     for step, moved in enumerate(_steps(loop)):
         option, left = int(moved.options[0]), loop.config.option_timeout - int(loop.age[0])
@@ -111,12 +100,7 @@ def play_episode(loop: OptionLoop) -> list[Frame]:
 
 
 def play_episodes(loop: OptionLoop, count: int) -> Iterator[Episode]:
-    """So many episodes one after the other.
-
-    Args:
-        loop: from :func:`agent_of`.
-        count: episodes.
-    """
+    """So many episodes of :func:`agent_of`, one after the other."""
     for _ in range(count):
         observations, steps = [], []
         for moved in _steps(loop):

@@ -1,7 +1,5 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
@@ -80,12 +78,10 @@ class CategoricalHead(Head):
         self.options = options
 
     def draw(self, scores: Tensor, offered: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """As of :class:`Head`."""
         option = torch.multinomial(self._log(scores, offered).exp(), 1, generator=generator)
         return option[:, 0], option.float()
 
     def log_prob(self, scores: Tensor, offered: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
-        """As of :class:`Head`."""
         log = self._log(scores, offered)
         entropy = -(log.exp() * log.masked_fill(~offered, 0.0)).sum(1)
         return log.gather(1, drawn.long()).squeeze(1), entropy
@@ -103,13 +99,11 @@ class GaussianHead(Head):
         self.log_std = nn.Parameter(torch.zeros(options))
 
     def draw(self, scores: Tensor, offered: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """As of :class:`Head`."""
         spread = self.log_std.to(scores.device).exp()
         drawn = scores + spread * torch.randn(scores.shape, generator=generator).to(scores.device)
         return self.best(drawn, offered), drawn
 
     def log_prob(self, scores: Tensor, offered: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
-        """Log density of the drawn scores and the entropy, float32 (N,) each."""
         normal = torch.distributions.Normal(scores, self.log_std.to(scores.device).exp().expand_as(scores))
         return normal.log_prob(drawn).sum(1), normal.entropy().sum(1)
 

@@ -1,7 +1,5 @@
 """The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,7 +17,6 @@ from hypogoal.domains.base import Engine
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
-from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.networks import apply_to_states
 
@@ -29,14 +26,9 @@ Decisions = dict[str, NDArray[Any]]  # columns (n, ...)
 
 
 class MetaPolicy(Chooser):
-    """Chooses options for every environment and learns from what they return.
+    """Chooses among O options for every environment and learns from what they return.
 
-    Args:
-        engine: gives observations of state ids.
-        options: the number of options, O.
-        config: see :class:`MetaConfig`.
-        seed: of weights, draws and minibatches.
-        device: where the networks are; options are drawn on the CPU.
+    ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
     """
 
     CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "_finished", "updates")
@@ -60,7 +52,6 @@ class MetaPolicy(Chooser):
     def choose(
         self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """Draw an option for each of n environments in states ``ids`` among those offered, bool (n, O)."""
         with torch.no_grad():
             scores = self._outputs(ids)[:, :-1].cpu()
             mask = torch.from_numpy(offered)
@@ -74,7 +65,6 @@ class MetaPolicy(Chooser):
         return options.numpy()
 
     def record(self, outcome: Outcome) -> None:
-        """The chosen options ended as ``outcome`` says."""
         came_of_it = {
             "environment": outcome.environments,
             "returned": outcome.returns,
@@ -86,7 +76,6 @@ class MetaPolicy(Chooser):
         self._finished.append({name: values[outcome.environments] for name, values in self._open.items()} | came_of_it)
 
     def learn(self) -> dict[str, float]:
-        """Update when enough decisions are finished; returns numbers to log, empty when none was due."""
         if sum(len(part["state"]) for part in self._finished) < self.config.decisions:
             return {}
         decisions, self._finished = _joined(self._finished), []
@@ -145,15 +134,10 @@ class MetaPolicy(Chooser):
         self.optimiser.step()
 
     def state(self) -> dict[str, Tensor]:
-        """Weights, for an artefact."""
         return {name: value.contiguous() for name, value in self.policy.state_dict().items()}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Weights of an artefact.
-
-        Raises:
-            UserError: they are not of such a policy.
-        """
+        """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
         check_fit(self.state(), state, "meta.safetensors", AGAIN)
         self.policy.load_state_dict(state)
 
@@ -183,3 +167,40 @@ def clipped_surrogate(log_prob: Tensor, old: Tensor, advantages: Tensor, clip: f
     """
     ratio = (log_prob - old).exp()
     return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()
+
+
+def smdp_advantages(
+    returns: NDArray[np.float64],
+    discounts: NDArray[np.float64],
+    values: NDArray[np.float64],
+    next_values: NDArray[np.float64],
+    terminated: NDArray[np.bool_],
+    ended: NDArray[np.bool_],
+    trace: float,
+) -> NDArray[np.float64]:
+    """Spec E1: generalised advantages of consecutive decisions of one environment.
+
+    delta_t = R_t + gamma^tau_t (1 - terminated_t) V(s'_t) - V(s_t);
+    A_t = delta_t + gamma^tau_t lambda (1 - ended_t) A_{t+1}.
+
+    Args:
+        returns: R_t, rewards inside the option, discounted from its start, (T,).
+        discounts: gamma ** tau_t, (T,).
+        values: V(s_t), (T,).
+        next_values: V of the state reached, (T,).
+        terminated: nothing follows the state reached, (T,).
+        ended: the episode ended there, for whatever reason, (T,).
+        trace: lambda.
+
+    Returns:
+        A_t, (T,).
+
+    Source: Schulman et al. 2016 (GAE) with the SMDP discount of Sutton, Precup and Singh 1999.
+    """
+    advantages = np.zeros(len(returns))
+    following = 0.0
+    for t in reversed(range(len(returns))):
+        delta = returns[t] + discounts[t] * (not terminated[t]) * next_values[t] - values[t]
+        following = delta + discounts[t] * trace * (not ended[t]) * following
+        advantages[t] = following
+    return advantages

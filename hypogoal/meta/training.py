@@ -1,7 +1,5 @@
 """Options set up in a domain and trained for a number of steps: what ``train-options`` and ``train-meta`` share."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,16 +39,9 @@ def assemble(
 ) -> OptionLoop:
     """The environments of one layout, an ensemble's options in them, fresh policies of these and over these.
 
-    Args:
-        domain: where to play.
-        ensemble: an ensemble artefact's folder.
-        about: its manifest's configuration.
-        config: of the stage.
-        seed: of weights, exploration, choices and, where there are several, start states.
-        device: where the networks are.
-
-    Raises:
-        UserError: the domain has no such start, or options are to end at true sub-goals that it does not have.
+    ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
+    several, start states. Where the domain has no such start, or not the true sub-goals at which options are to end, it
+    is a ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = _columns(domain, sub_goals) if oracle else []
@@ -99,8 +90,7 @@ def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
 def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
     """Spec D4: what an engine of a domain with named starts is told; nothing where there is one place only.
 
-    Raises:
-        UserError: the domain has no such start, or it has several and none is given.
+    Where the domain has no such start, or has several and none is given, it is a ``UserError``.
     """
     if not domain.starts:
         if config.start or config.along:
@@ -122,13 +112,10 @@ def frames_kept(config: PlayConfig, options: int) -> int:
 
 
 def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, checkpoints: Checkpoints) -> None:
-    """Step ``loop`` until ``steps`` more environment steps were taken, logging as it goes (``metrics.jsonl``).
+    """Step ``loop`` until ``steps`` more environment steps were taken, logging every ``LOG_INTERVAL`` steps.
 
-    Args:
-        loop: as it was when ``steps`` began; where there is a checkpoint, it goes on from there.
-        steps: environment steps.
-        log, progress: are told of every ``LOG_INTERVAL`` steps.
-        checkpoints: spec G1; of no use where the engine cannot be resumed.
+    ``loop`` is as it was when ``steps`` began; where there is a checkpoint (spec G1), it goes on from there. Those are
+    of no use where the engine cannot be resumed.
     """
     recorder = loop.recorder
     end = recorder.steps + steps
@@ -178,15 +165,7 @@ def description(loop: OptionLoop, about: Mapping[str, Any], config: PlayConfig, 
 def write_trained(
     folder: Path, loop: OptionLoop, domain: Domain, about: Mapping[str, Any], config: PlayConfig, seed: int
 ) -> None:
-    """Into an artefact's folder: what was learned and what happened meanwhile.
-
-    Args:
-        folder: of the artefact.
-        loop: when it was trained.
-        domain: where it was played.
-        about: the ensemble manifest's configuration.
-        config, seed: of the stage.
-    """
+    """Into an artefact's folder: what was learned and what happened meanwhile."""
     loop.recorder.write(folder)
     if loop.visited:
         loop.visited.write(folder, domain, about, seed)

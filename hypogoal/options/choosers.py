@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.resumable import Resumable
+from hypogoal.core.checkpoints import Resumable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,9 +56,8 @@ class Chooser(Resumable, ABC):
     ) -> NDArray[np.int64]:
         """For each of n environments in states ``ids`` one of the options offered, bool (n, O): int64 (n,)."""
 
-    @abstractmethod
     def record(self, outcome: Outcome) -> None:
-        """The chosen options ended as ``outcome`` says."""
+        """The chosen options ended as ``outcome`` says; by default nothing is remembered."""
 
     def learn(self) -> dict[str, float]:
         """The updates that are due; returns numbers to log, empty when none was due."""
@@ -68,9 +67,8 @@ class Chooser(Resumable, ABC):
         """Weights, for an artefact."""
         return {}
 
-    @abstractmethod
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Weights of an artefact."""
+        """Weights of an artefact; by default there are none."""
 
 
 class RandomChooser(Chooser):
@@ -84,24 +82,14 @@ class RandomChooser(Chooser):
     def choose(
         self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """One of the offered options for each environment, int64 (n,)."""
         return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
-
-    def record(self, outcome: Outcome) -> None:
-        """Nothing to remember."""
-
-    def load(self, state: Mapping[str, Tensor]) -> None:
-        """No weights."""
 
 
 class EvenChooser(RandomChooser):
     """Spec D4: the offered option that has had the fewest steps so far, so that each gets as many as another.
 
     Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
-
-    Args:
-        options: O.
-        rng: breaks ties.
+    Ties are broken by ``rng``.
     """
 
     CHANGING = ("rng", "steps")

@@ -1,7 +1,5 @@
 """Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting

@@ -1,7 +1,5 @@
 """Options played as the actions of a Gymnasium environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -61,11 +59,8 @@ class Options:
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """The Gymnasium environment that they were trained in, with the settings that its states were collected with.
 
-        Args:
-            arguments: of the environment, such as ``layout_seed``.
-
-        Raises:
-            UserError: the domain is not installed here, is code that the user did not allow, or has no environment.
+        ``arguments`` are the environment's, such as ``layout_seed``. A domain that is not installed here, is code that
+        the user did not allow, or has no environment is a ``UserError``.
         """
         domain = load_domain(self.domain)
         return domain.make_env(**{**domain.world(self.domain_config), **arguments})

@@ -1,15 +1,13 @@
 """How the intra-option policies explore: which primitive actions there are, and when a random one is played."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
 
@@ -18,11 +16,7 @@ LONGEST = 10_000  # steps that a random action is kept at most: Dabney et al. 20
 
 
 def action_set(engine: Engine, name: str) -> NDArray[np.int64]:
-    """The engine's actions that a policy chooses among, int64 (A,): all, or those of ``engine.action_sets[name]``.
-
-    Raises:
-        UserError: the engine has no set of that name.
-    """
+    """The actions to choose among, int64 (A,): all, or ``engine.action_sets[name]``; else a ``UserError``."""
     if name == ALL:
         return np.arange(engine.n_actions)
     if name not in engine.action_sets:
@@ -37,27 +31,17 @@ def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:
 
 
 def check_actions(state: Mapping[str, Tensor], actions: NDArray[np.int64], name: str) -> None:
-    """Refuse to continue policies that chose among other actions.
-
-    Raises:
-        UserError: they did.
-    """
+    """Refuse (``UserError``) to continue policies that chose among other actions."""
     if not np.array_equal(actions_of(state, len(actions)), actions):
         raise UserError("these options were trained with other actions", f"actions={name}", "Give the same --set.")
 
 
 class Exploration(Resumable):
-    """Random actions in place of a policy's own, for every environment.
+    """Random actions, of A, in place of a policy's own, for each of E environments.
 
     ``independent``: at each step with chance epsilon, one action for one step. ``persistent``: epsilon-z-greedy
-    exploration; with chance epsilon a random action is begun and kept for n steps, P(n) proportional to
-    n ** -persistence, but not beyond its execution's end.
-
-    Args:
-        config: see :class:`OptionConfig`.
-        environments: E.
-        actions: A, how many actions there are.
-        rng: where chance comes from.
+    exploration; with chance epsilon a random action is begun and kept for n steps, P(n) proportional to n **
+    -persistence, but not beyond its execution's end.
 
     Source: Dabney, Ostrovski and Barreto 2020, Temporally-Extended epsilon-Greedy Exploration.
     """
@@ -71,12 +55,8 @@ class Exploration(Resumable):
         self._left = np.zeros(environments, dtype=np.int64)
 
     def mix(self, policy: NDArray[np.int64], epsilon: NDArray[np.float64], age: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Actions int64 (E,): the policy's (E,), or random ones.
-
-        Args:
-            policy: what the policies would play.
-            epsilon: of each environment's policy, (E,).
-            age: steps since each environment's execution began, (E,).
+        """Actions int64 (E,): the policy's (E,), or random ones, by ``epsilon`` (E,), ``age`` (E,) steps after
+        executions began.
         """
         count = len(policy)
         begins = self.rng.random(count) < epsilon

@@ -5,8 +5,6 @@ initiation classifiers of skill chaining (Konidaris and Barto 2009); here it is 
 all together.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -16,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
-from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.domains.base import Engine
@@ -47,14 +45,8 @@ def _narrowed(
 class Narrowed:
     """What an artefact's initiation sets leave of the options offered in an observation; all, where that is none.
 
-    Args:
-        state: the tensors of ``initiation.safetensors``.
-        shape: of an observation.
-        options: O.
-        threshold: an option is held back where its chance is below this.
-
-    Raises:
-        UserError: the tensors are not of so many options on such observations.
+    ``state`` is the tensors of ``initiation.safetensors``, a ``UserError`` where they are not of so many options on
+    observations of this shape; an option is held back where its chance is below ``threshold``.
     """
 
     def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float):
@@ -74,12 +66,7 @@ class Narrowed:
 class Initiation(Resumable):
     """The probability that an option reaches its sub-goal before its time is up, and which options it lets start.
 
-    Args:
-        engine: gives observations of state ids.
-        options: O.
-        config: ``initiation_threshold`` and ``initiation_ignored``.
-        seed: of weights and draws.
-        device: where the network is.
+    Of ``config`` it asks ``initiation_threshold`` and ``initiation_ignored``; ``seed`` is of weights and draws.
     """
 
     CHANGING = ("network", "optimiser", "rng", "states", "option", "reached", "executions", "count", "_due")
@@ -107,13 +94,10 @@ class Initiation(Resumable):
         return chances
 
     def narrow(self, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Of the options offered in states (n,), those that will probably get there; all where none would be left.
+        """Of the options offered, bool (n, O), in states (n,), those that will probably get there; all where none would
+        be left.
 
         For a share of the states all are left, so that an option that has learned since is found out.
-
-        Args:
-            ids: int64 (n,).
-            offered: bool (n, O).
         """
         narrowed = _narrowed(offered, self.chances(ids), self.executions, self.config.initiation_threshold)
         ignored = self.rng.random(len(ids)) < self.config.initiation_ignored
@@ -161,11 +145,7 @@ class Initiation(Resumable):
         return state | {"executions": torch.from_numpy(self.executions.copy())}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from what an artefact holds; no execution is remembered.
-
-        Raises:
-            UserError: it is not of so many options on such observations.
-        """
+        """Continue from what an artefact holds, no execution remembered; a ``UserError`` where it does not fit."""
         check_fit(self.state(), state, NAME, AGAIN)
         self.network.load_state_dict(below(PREFIX, state))
         self.executions[:] = state["executions"].numpy()

@@ -1,7 +1,5 @@
 """What all learners of intra-option policies do: act, explore, count, and keep it in artefacts (Spec D2, D8)."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
@@ -151,10 +149,8 @@ class Learner(Resumable, ABC):
         return state | {name: torch.from_numpy(getattr(self, name).copy()) for name in COUNTERS}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from the weights and counters of an artefact; replays start empty.
-
-        Raises:
-            UserError: they are not of as many options with the same actions.
+        """Continue from the weights and counters of an artefact; replays start empty. What does not fit is a
+        ``UserError``.
         """
         check_actions(state, self.actions, self.config.actions)
         self.load_weights(state)

@@ -6,8 +6,6 @@ sub-goal. With ``experience=own`` (the paper) only the member whose option was r
 only its verdicts are asked for; then a transition may reach several steps ahead within its execution.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from typing import Any
@@ -84,12 +82,10 @@ class LightLearner(Learner):
 
     @torch.no_grad()
     def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
-        """As of :class:`Learner`."""
         values = apply_to_states(self.online, self.engine, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        """As of :class:`Learner`."""
         last = {"option": moved.options, "end": moved.terminated, "timeout": moved.timed_out}
         rows = self.ahead.add(moved.ids, self._index[moved.actions], moved.next_ids, moved.ended, **last)
         self.replay.add(**rows)
@@ -117,7 +113,6 @@ class LightLearner(Learner):
         return owner & here[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
-        """As of :class:`Learner`."""
         numbers: dict[str, float] = {}
         if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
             self._due = 0
@@ -207,11 +202,9 @@ class LightLearner(Learner):
             follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)
 
     def weights(self) -> dict[str, Tensor]:
-        """As of :class:`Learner`."""
         return {f"online.{name}": value for name, value in self.online.state_dict().items()}
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """As of :class:`Learner`."""
         weights = below("online.", weights)
         check_fit(self.online.state_dict(), weights, "options.safetensors", AGAIN)
         self.online.load_state_dict(weights)

@@ -6,17 +6,14 @@ time is up, or when the episode ends. Where every option begins at a start state
 also that of its episode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import State
+from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine, Step, step_of
 from hypogoal.options.choosers import Chooser, Outcome
 from hypogoal.options.config import OptionConfig
@@ -39,19 +36,10 @@ def offered_options(verdicts: NDArray[np.bool_]) -> NDArray[np.bool_]:
 class OptionLoop(Resumable):
     """Steps every environment once per call of :meth:`step`.
 
-    Args:
-        engine: the environments.
-        terminations: the options' termination classifiers.
-        learner: the intra-option policies.
-        chooser: the policy over options.
-        recorder: episodes and choices are told to it.
-        config: timeouts, masks, whether options begin at start states.
-        gamma: the meta-level's discount per environment step (E1).
-        initiation: holds options back where they do not reach their sub-goals (D7); None, it holds none back.
-        visited: is shown every state (B7).
-
-    Raises:
-        UserError: options are to begin at start states, and the engine cannot begin an episode when asked.
+    Episodes and choices are told to ``recorder``; ``config`` has timeouts, masks and whether options begin at start
+    states, a ``UserError`` where the engine cannot begin an episode when asked. ``gamma`` is the meta-level's discount
+    per environment step (E1). ``initiation`` holds options back where they do not reach their sub-goals (D7);
+    ``visited`` is shown every state (B7).
     """
 
     CHANGING = (
@@ -165,10 +153,8 @@ class OptionLoop(Resumable):
         self.option[done] = NONE
 
     def snapshot(self) -> State:
-        """As of :class:`Resumable`; the engine's in it."""
         return {"engine": self.engine.snapshot(), **super().snapshot()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """As of :class:`Resumable`."""
         self.engine.restore(snapshot["engine"])
         super().restore(snapshot)

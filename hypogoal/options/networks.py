@@ -1,7 +1,5 @@
 """Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,15 +16,11 @@ SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
 
 class CellEmbedding(nn.Module):
-    """A convolution whose kernel and stride are one cell (8 pixels), then ReLU.
+    """A convolution whose kernel and stride are one cell (8 pixels), to ``channels`` features each, then ReLU.
 
-    Where an image is made of few distinct tiles, the same function is a look-up: convolve each tile once, then
-    gather by tile code. Both ways give the same values and gradients (a test asserts it). An image that whole cells do
-    not fill is continued in black.
-
-    Args:
-        observation_shape: (H, W, C) of the images.
-        channels: features per cell.
+    Where an image is made of few distinct tiles, the same function is a look-up: convolve each tile once, then gather
+    by tile code. Both ways give the same values and gradients (a test asserts it). An image that whole cells do not
+    fill is continued in black.
     """
 
     def __init__(self, observation_shape: tuple[int, ...], channels: int = 8):
@@ -63,9 +57,6 @@ class PictureEmbedding(nn.Module):
     takes 10 ms and acting for 8 environments 0.8 ms; with the usual 8x8/4 and 4x4/2 it is 19 and 1.2 ms.
 
     What the strides do not reach is not seen: of 84 pixels the last 6, of others up to 11.
-
-    Args:
-        observation_shape: (H, W, C) of the images.
     """
 
     def __init__(self, observation_shape: tuple[int, ...]):
@@ -85,11 +76,7 @@ class PictureEmbedding(nn.Module):
 
 
 def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | PictureEmbedding:
-    """Cells where whole ones fill the image, else convolutions over the picture.
-
-    Raises:
-        UserError: it is too small for these.
-    """
+    """Cells where whole ones fill the image, else convolutions over it; a ``UserError`` where it is too small."""
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:
@@ -193,14 +180,10 @@ def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDAr
 
 
 class Pixels:
-    """Pictures of states as float32, ready for :class:`PictureEmbedding`, always in the same memory.
+    """Pictures of states as float32, ready for :class:`PictureEmbedding`, on the CPU always in the same memory.
 
     To convert them once for several networks, and into memory that is in use already, is a third of an update's time.
-
-    Args:
-        engine: gives observations of state ids.
-        most: pictures at once, at most.
-        device: where they are to be used; only on the CPU is the memory the same.
+    There are ``most`` of them at once.
     """
 
     def __init__(self, engine: Engine, most: int, device: torch.device):

@@ -1,7 +1,5 @@
 """What options do, out of an artefact's weights: greedy policies that start anew with each execution."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -21,13 +19,7 @@ Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
 
 
 def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any]) -> Policies:
-    """Greedy policies from an options artefact's weights.
-
-    Args:
-        config: its manifest's configuration.
-        weights: the tensors of ``options.safetensors``.
-        about: the ensemble manifest's configuration.
-    """
+    """Greedy policies from an options artefact's weights and configuration, and that of its ensemble (``about``)."""
     if config["termination"] == "oracle":
         raise UserError(
             "these options end at the true sub-goals, which only the domain's engine can see",
@@ -46,14 +38,7 @@ def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: 
 
 
 class LightPolicies:
-    """Policies of options that share one network (Spec D8).
-
-    Args:
-        weights: see :func:`make_policies`.
-        shape: of an observation.
-        options: O.
-        actions: the primitive actions among which the network chooses.
-    """
+    """Policies of options that share one network (Spec D8), which chooses among the primitive ``actions``."""
 
     def __init__(self, weights: Mapping[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]):
         make = partial(LightQNetwork, shape, options, len(actions))
@@ -71,11 +56,7 @@ class LightPolicies:
 
 
 class PaperPolicies:
-    """Policies of options that have a network each (Spec D2, D8), which is made when it is first played.
-
-    Args:
-        weights, shape, options, actions: see :class:`LightPolicies`.
-    """
+    """Policies of options that have a network each (Spec D2, D8), which is made when it is first played."""
 
     def __init__(self, weights: Mapping[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]):
         self.weights, self.shape, self.actions = dict(weights), shape, actions

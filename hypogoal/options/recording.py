@@ -1,7 +1,5 @@
 """What happened while options were played: episodes, choices, where options stopped (Spec E5, F3, F4, F5, F6)."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.learners.episodes import Episodes
 from hypogoal.options.choosers import Outcome
@@ -122,7 +120,6 @@ class Recorder(Resumable):
         self._window[:] = 0
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """As of :class:`Resumable`."""
         super().restore(snapshot)
         self.executions = [deque((Execution(*row) for row in rows), EXECUTIONS_KEPT) for rows in self.executions]
 
@@ -141,9 +138,7 @@ class Recorder(Resumable):
     def write_executions(self, folder: Path, distance: Callable[[NDArray[np.int64]], NDArray[np.int64]]) -> None:
         """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
 
-        Args:
-            folder: where.
-            distance: of positions (n, 3) from where the sub-goal truly holds, int (n,).
+        ``distance`` is of positions (n, 3) from where the sub-goal truly holds, int (n,).
         """
         rows = [row for option in self.executions for row in option]
         at = self.engine.positions(np.array([row.state for row in rows], dtype=np.int64).reshape(-1))

@@ -4,8 +4,6 @@ The GRU is unrolled over the option's own steps: acting carries its hidden state
 learning samples a step and replays the option's execution up to it. Every member learns from its own executions.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping
@@ -15,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
 from hypogoal.domains.base import Engine
@@ -200,12 +198,10 @@ class RecurrentLearner(Learner):
         return float(loss.detach())
 
     def weights(self) -> dict[str, Tensor]:
-        """As of :class:`Learner`."""
         states = [member.online.state_dict() for member in self.members]
         return {f"{option}.{name}": value for option, state in enumerate(states) for name, value in state.items()}
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """As of :class:`Learner`."""
         for option, member in enumerate(self.members):
             of_option = below(f"{option}.", weights)
             check_fit(member.online.state_dict(), of_option, f"option {option} of options.safetensors", AGAIN)

@@ -5,17 +5,15 @@ among others: libraries round otherwise in batches of another size. So the first
 resumes it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.core.resumable import Resumable
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
@@ -74,22 +72,14 @@ class Terminations(Resumable):
 
 
 def oracle_terminations(engine: Engine, columns: Sequence[int]) -> Terminations:
-    """Spec E6: the true sub-goal predicates, one option per sub-goal; an upper bound, never the method.
-
-    Args:
-        engine: knows them.
-        columns: which of its sub-goals, in this order.
-    """
+    """Spec E6: the true predicates of these sub-goals, by number, one option each; an upper bound, never the method."""
     return Terminations(lambda ids: engine.labels(ids)[:, columns], len(columns))
 
 
 def learned_terminations(engine: Engine, ensembles: Sequence[Ensemble], *, running_only: bool = False) -> Terminations:
-    """Spec D1: option g*K + k terminates where member k of sub-goal g's ensemble says yes.
+    """Spec D1: option g*K + k terminates where member k of sub-goal g's ensemble, of G with K members each, says yes.
 
-    Args:
-        engine: gives observations of state ids, and positions where the ensembles need them.
-        ensembles: G ensembles of K members each.
-        running_only: nobody asks for other options than the running ones: with K members a state costs a K-th.
+    ``running_only``: nobody asks for other options than the running ones: with K members a state costs a K-th.
     """
     stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
     networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]

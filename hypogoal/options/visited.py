@@ -1,7 +1,5 @@
 """Spec B7: states that a policy visited while it learned, kept to train ensembles with."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Mapping
 from hashlib import blake2b
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.resumable import Resumable
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.domains.base import Domain, Engine
@@ -86,13 +84,8 @@ class Visited(Resumable):
         return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.origins, columns, strict=True)))
 
     def write(self, folder: Path, domain: Domain, about: Mapping[str, Any], seed: int) -> None:
-        """``visited.h5`` into ``folder``: a data file whose states are all unlabelled ones.
-
-        Args:
-            folder: of the artefact.
-            domain: where it was played.
-            about: the ensemble manifest's configuration: what the domain and its collection were called.
-            seed: of the stage.
+        """``visited.h5`` into ``folder``: a data file whose states are all unlabelled; ``about`` is the ensemble's
+        configuration.
         """
         nothing = np.zeros((0, *self.engine.observation_shape), np.uint8)
         none = States(nothing, np.zeros((0, len(domain.sub_goals)), np.bool_))
@@ -101,7 +94,6 @@ class Visited(Resumable):
         write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)
 
     def snapshot(self) -> dict[str, Any]:
-        """What a resumed run needs to go on exactly."""
         digests = sorted(self._kept)
         return {
             "known": self._known.copy(),
@@ -112,7 +104,6 @@ class Visited(Resumable):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of one made with the same arguments."""
         self._known, self._before = snapshot["known"].copy(), snapshot["before"].copy()
         rows = zip(snapshot["digests"].tolist(), snapshot["pictures"], snapshot["origins"], strict=True)
         self._kept = {digest: (picture, origin) for digest, picture, origin in rows}

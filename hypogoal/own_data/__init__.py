@@ -2,10 +2,9 @@
 
 from hypogoal.own_data.arrays import read_arrays, write_arrays
 from hypogoal.own_data.images import read_images
-from hypogoal.own_data.marking import KINDS, Marks, mark_states
+from hypogoal.own_data.marking import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
 from hypogoal.own_data.minari import MAIN_FILE, read_minari, write_minari
 from hypogoal.own_data.parts import Parts, collected_of
-from hypogoal.own_data.states_to_mark import Played, Recorded, Source, recorded_states
 
 __all__ = [
     "KINDS", "MAIN_FILE", "Marks", "Parts", "Played", "Recorded", "Source", "collected_of", "mark_states",

@@ -1,7 +1,5 @@
 """NumPy arrays: a ``.npz`` file, or a folder of ``.npy`` files with the same names."""
 
-from __future__ import annotations
-
 import difflib
 import tokenize
 import zipfile
@@ -31,13 +29,10 @@ DAMAGED = (
 
 
 def read_arrays(path: Path) -> Parts:
-    """Arrays by name: those of ``NEEDED``, those of ``OPTIONAL`` where given, and ``sub_goals`` (G texts) where given.
+    """Arrays by name, of a ``.npz`` file or a folder of ``.npy`` files: ``NEEDED``, where given ``OPTIONAL`` and
+    ``sub_goals`` (G texts).
 
-    Args:
-        path: a ``.npz`` file, or a folder of ``.npy`` files.
-
-    Raises:
-        UserError: missing, damaged, of other names, larger than memory, or holding Python objects, which would be code.
+    Missing, damaged, of other names, larger than memory, or Python objects, which would be code: a ``UserError``.
     """
     arrays = _folder(path) if path.is_dir() else _file(path, others=False)
     missing = [name for name in NEEDED if name not in arrays]
@@ -55,11 +50,7 @@ def read_arrays(path: Path) -> Parts:
 
 
 def read_states(path: Path) -> NDArray[np.uint8]:
-    """The states (N, H, W, C) of a ``.npz`` file that nobody has labelled: ``unlabelled``, or else ``observations``.
-
-    Raises:
-        UserError: see :func:`read_arrays`.
-    """
+    """The states (N, H, W, C) of a ``.npz`` file without labels: ``unlabelled``, or else ``observations``."""
     arrays = _file(path)
     for name in ("unlabelled", "observations"):
         if name in arrays:
@@ -68,11 +59,7 @@ def read_states(path: Path) -> NDArray[np.uint8]:
 
 
 def write_arrays(path: Path, dataset: Dataset) -> None:
-    """A data file's states as :func:`read_arrays` takes them, where its sub-goals share their states.
-
-    Raises:
-        UserError: they do not.
-    """
+    """A data file's states as :func:`read_arrays` takes them; a ``UserError`` where its sub-goals do not share them."""
     columns: dict[str, list[NDArray[np.bool_]]] = {"labelled": [], "heldout": []}
     first: dict[str, NDArray[np.uint8]] = {}
     for split, labels in columns.items():
@@ -130,11 +117,7 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _require_known(names: Iterable[str], path: Path) -> None:
-    """A misspelt array is not left out in silence: held-out states would be missed by nobody.
-
-    Raises:
-        UserError: there is another name than those of ``KNOWN``.
-    """
+    """Refuse (``UserError``) a misspelt array: held-out states that are left out in silence are missed by nobody."""
     for name in names:
         if name not in KNOWN:
             near = difflib.get_close_matches(name, KNOWN, n=1)

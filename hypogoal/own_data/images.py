@@ -30,11 +30,8 @@ GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", 
 def read_images(folder: Path) -> Parts:
     """The images of one sub-goal, in the order of their names; grey where all are, else red, green and blue.
 
-    Args:
-        folder: see above; ``heldout`` may be missing.
-
-    Raises:
-        UserError: a folder is missing or empty, an image cannot be read, or they are of different sizes.
+    A folder that is missing (but for ``heldout``) or empty, an image that cannot be read, or different sizes are a
+    ``UserError``.
     """
     names = ["positive", "negative", "unlabelled"]
     if (folder / "heldout").is_dir():
@@ -63,11 +60,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Path]:
-    """The files of a folder that :func:`read_image` may read, in the order of their names.
-
-    Raises:
-        UserError: there are none; ``do`` is what to do then.
-    """
+    """The files of a folder for :func:`read_image`, by name; where there are none a ``UserError`` that says ``do``."""
     files = sorted(
         file for file in folder.iterdir() if file.suffix.lower() in (*SUFFIXES, ARRAY) and file.name[0] != "."
     )
@@ -77,14 +70,9 @@ def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Pa
 
 
 def read_image(file: Path) -> NDArray[np.uint8]:
-    """One state, uint8 (H, W, C): of an image its grey or its three colours, of an array what is in it.
+    """One state, uint8 (H, W, C): of an image its grey or its three colours, of a ``.npy`` file the array in it.
 
-    Args:
-        file: an image, or a ``.npy`` file with an array uint8 (H, W, C).
-
-    Raises:
-        UserError: it cannot be read, is too large, has more than 8 bits a channel or several pictures, or is
-            transparent in places.
+    Too large, more than 8 bits a channel, several pictures, transparent in places, or not readable: a ``UserError``.
     """
     import PIL.Image
 

@@ -1,5 +1,5 @@
-"""States that a person marks one by one: the window that shows them, and the folder of images, which ``import`` takes,
-whole at any moment (Spec B6).
+"""States that a person marks one by one: recorded ones, or those of an environment that is played; the window that
+shows them, and the folder of images, which ``import`` takes, whole at any moment (Spec B6).
 """
 
 from __future__ import annotations
@@ -7,18 +7,22 @@ from __future__ import annotations
 import io
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence, Set
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, replace_file, sync
-from hypogoal.own_data.images import read_image, size_text
-from hypogoal.own_data.states_to_mark import Source
+from hypogoal.core.own_code import UsersCode
+from hypogoal.dataset import open_dataset
+from hypogoal.domains.gymnasium_engine import as_image, begun, make_checked, shape_of, stepped
+from hypogoal.own_data.arrays import read_states
+from hypogoal.own_data.images import image_files, read_image, size_text
 
 KINDS = ("positive", "negative", "unlabelled")
 PICTURE = 520  # pixels of a picture's height, about
@@ -35,14 +39,8 @@ class Marks:
     """One file a state, ``folder/KIND/DIGEST.png`` (``.npy`` where a state is no grey or colour image).
 
     Each mark is on the disk before the next key is read: a crash loses none. A state is marked once, the last word
-    counts.
-
-    Args:
-        folder: where, made with the first mark; what is in it already is gone on with.
-        kinds: the marks that there are.
-
-    Raises:
-        UserError: a link in the folder leads out of it.
+    counts. The folder is made with the first mark; what is in it already is gone on with. A link that leads out of it
+    is a ``UserError``.
     """
 
     def __init__(self, folder: Path, kinds: Sequence[str] = KINDS):
@@ -62,17 +60,17 @@ class Marks:
         return file.parent.name if file else None
 
     def mark(self, state: NDArray[np.uint8], kind: str) -> None:
-        """Mark a state, uint8 (H, W, C); another mark of it is taken back.
-
-        Raises:
-            UserError: states marked before are of another shape.
+        """Mark a state, uint8 (H, W, C), of the shape of those before (else a ``UserError``); another mark of it is
+        taken back.
         """
         name, before = _name(state), self.of(state)
         if before is not None:
             self._move(name, kind)
             self._before.append((name, before))
             return
-        self._require_like(state)
+        if self._files and (shape := read_image(next(iter(self._files.values()))).shape) != state.shape:
+            what = f"the states are {size_text(state.shape)}, those marked before {size_text(shape)}"
+            raise UserError(what, self.folder, "Give another --out.")
         for each in self.kinds:
             (self.folder / each).mkdir(parents=True, exist_ok=True)
         suffix, content = _encoded(state)
@@ -107,13 +105,6 @@ class Marks:
         self._files[name] = before.replace(self.folder / kind / before.name)
         sync(self.folder / kind)
 
-    def _require_like(self, state: NDArray[np.uint8]) -> None:
-        for file in self._files.values():
-            if (shape := read_image(file).shape) != state.shape:
-                what = f"the states are {size_text(state.shape)}, those marked before {size_text(shape)}"
-                raise UserError(what, self.folder, "Give another --out.")
-            return
-
 
 def _name(state: NDArray[np.uint8]) -> str:
     return blake2b(np.ascontiguousarray(state).tobytes(), digest_size=8).hexdigest()
@@ -132,16 +123,10 @@ def _encoded(state: NDArray[np.uint8]) -> tuple[str, bytes]:
 
 
 def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) -> None:
-    """Show the states of ``source`` and mark them by keyboard, until the window is closed.
+    """Show the states of ``source`` and mark them by keyboard, each at once, until the window is closed.
 
-    Args:
-        source: the states.
-        marks: where the marks go, each at once.
-        sub_goal: its name.
-        fps: steps a second that are played whether a key is held or not; 0: one step for each key.
-
-    Raises:
-        UserError: there is no screen, or no pygame.
+    ``fps``: steps a second that are played whether a key is held or not; 0: one step for each key. Without a screen, or
+    pygame, it is a ``UserError``.
     """
     keys = {kind[0]: kind for kind in marks.kinds}  # p, n, u
     modes: list[str | None] = [None, *(kind for kind in ("negative", "unlabelled", "positive") if kind in marks.kinds)]
@@ -277,3 +262,163 @@ class _Window:
         pygame: Any = self._pygame
         pressed = pygame.key.get_pressed()
         return frozenset(name for name in HELD if pressed[pygame.key.key_code(name)])
+
+
+GRID_KEYS = {
+    "left": ("left", "a"),
+    "right": ("right", "d"),
+    "forward": ("up", "w"),
+    "toggle": ("space",),
+    "pickup": ("page up", "e"),
+    "drop": ("page down", "q"),
+    "done": ("return",),
+}
+"""Keys of actions that have these names, as MiniGrid's have; the first as MiniGrid's own manual control."""
+
+DIRECTIONS = {"UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s")}
+FIRE = ("space",)
+FALLBACK = tuple("0123456789bcfghijkotvxyz")
+"""Keys of actions without one by their name: their number, from 10 on a letter that nothing above has, nor marking."""
+
+
+class Source:
+    """A state at a time.
+
+    Attributes:
+        state: the one that is shown, uint8 (H, W, C).
+        note: where it is from.
+        help: which keys do what, in lines.
+    """
+
+    state: NDArray[np.uint8]
+    note: str
+    help: tuple[str, ...]
+
+    def press(self, key: str, held: Set[str]) -> bool:
+        """What a key does, of those ``held`` down; false where nothing."""
+        raise NotImplementedError
+
+    def idle(self) -> bool:
+        """What happens when no key is held, in real time; false where nothing."""
+        return False
+
+    def marked(self) -> None:
+        """The state was marked; what is played goes on as it is."""
+
+
+class Recorded(Source):
+    """States that were recorded before, (N, H, W, C); a marked one makes way for the next."""
+
+    help = ("left, right: the state before, the next one", "page up, page down: ten at once")
+
+    def __init__(self, states: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]):
+        self._states = states
+        self._show(0)
+
+    def _show(self, index: int) -> None:
+        self._index, self.state = index, self._states[index]
+        self.note = f"state {index + 1} of {len(self._states)}"
+
+    def press(self, key: str, held: Set[str]) -> bool:
+        """One or ten on, or back."""
+        before, steps = self._index, {"left": -1, "right": 1, "page up": -10, "page down": 10}
+        self._show(min(max(before + steps.get(key, 0), 0), len(self._states) - 1))
+        return self._index != before
+
+    def marked(self) -> None:
+        """On to the next."""
+        self.press("right", frozenset())
+
+
+class Played(Source):
+    """An environment that is played by keyboard; its states are those that an agent would see.
+
+    ``make`` makes it: observations uint8 (H, W, C) or (H, W), actions ``Discrete``, else a ``UserError``. ``reset`` is
+    given ``layout_seed``; the next layout is one more.
+    """
+
+    def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
+        self._env = make_checked(make)
+        self._names = action_names(self._env)
+        self._layout = layout_seed
+        self.help = (*action_help(self._names), "r: begin again, l: next layout")
+        self._begin()
+
+    def _begin(self) -> None:
+        observation, _info = begun(self._env, seed=self._layout)
+        self._show(observation, 0, over=False)
+
+    def _show(self, observation: Any, steps: int, *, over: bool) -> None:
+        self.state = as_image(self._env, observation, shape_of(self._env))
+        self._steps, self._over = steps, over
+        ended = "; the episode is over, any action begins another" if over else ""
+        self.note = f"layout seed {self._layout}, step {steps}{ended}"
+
+    def press(self, key: str, held: Set[str]) -> bool:
+        """Play the action of a key, or of the keys held together."""
+        if key in ("r", "l"):
+            self._layout += key == "l"
+            self._begin()
+            return True
+        action = action_of(self._names, key, held)
+        if action is None:
+            return False
+        return self._play(action)
+
+    def idle(self) -> bool:
+        """Play NOOP where there is one."""
+        return not self._over and "NOOP" in self._names and self._play(self._names.index("NOOP"))
+
+    def _play(self, action: int) -> bool:
+        if self._over:
+            self._begin()
+            return True
+        observation, _reward, terminated, truncated, _info = stepped(self._env, action)
+        self._show(observation, self._steps + 1, over=terminated or truncated)
+        return True
+
+
+def action_names(env: gymnasium.Env) -> tuple[str, ...]:
+    """What an environment calls its actions, else their numbers: MiniGrid has ``actions``, Atari its meanings."""
+    count = int(env.action_space.n)  # type: ignore[attr-defined]
+    with UsersCode("the names of the environment's actions", env):
+        inner = env.unwrapped
+        if hasattr(inner, "get_action_meanings"):
+            names = tuple(map(str, inner.get_action_meanings()))
+        else:
+            names = tuple(str(getattr(action, "name", action)) for action in getattr(inner, "actions", ()))
+    return names if len(names) == count else tuple(map(str, range(count)))
+
+
+def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
+    """The action that a key stands for: by name as MiniGrid's, by the keys held together as Atari's, else by number."""
+    if "NOOP" in names:
+        down = {key, *held}
+        parts = [name for name, keys in DIRECTIONS.items() if down & set(keys)]
+        vertical = next((name for name in parts if name in ("UP", "DOWN")), "")
+        level = next((name for name in parts if name in ("RIGHT", "LEFT")), "")
+        name = vertical + level + ("FIRE" if down & set(FIRE) else "")
+        return names.index(name) if name in names else None
+    return next((index for index, keys in enumerate(keys_of(names)) if key in keys), None)
+
+
+def keys_of(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Which keys play each action: those of its name, else one of ``FALLBACK``; none where there are more actions."""
+    return [GRID_KEYS.get(name) or FALLBACK[index : index + 1] for index, name in enumerate(names)]
+
+
+def action_help(names: Sequence[str]) -> tuple[str, ...]:
+    """Which keys play which actions, in lines."""
+    if "NOOP" in names:
+        return ("arrows or w a s d, space: move, fire; together, too",)
+    told = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
+    return tuple(", ".join(told[first : first + 3]) for first in range(0, len(told), 3))
+
+
+def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]] | NDArray[np.uint8]:
+    """The unlabelled states of a data file or of a ``.npz`` file, or the images of a folder; else a ``UserError``."""
+    if path.is_dir():
+        return [read_image(file) for file in image_files(path)]
+    if path.suffix == ".npz":
+        return read_states(path)
+    return open_dataset(path).unlabelled()

@@ -1,7 +1,5 @@
 """Minari datasets: episodes whose states a function labels, and episodes of agents. The package is not needed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -109,17 +107,10 @@ def _told(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.boo
 
 
 def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, actions: int, description: str) -> int:
-    """Episodes as a Minari dataset of format ``hdf5``, pictures as they were seen.
+    """Episodes, one at least, as a Minari dataset of format ``hdf5``, pictures as they were seen; returns its steps.
 
-    Args:
-        folder: to be filled; ``data/`` is made in it.
-        episodes: at least one; ``infos/option`` says which option led to a state, -1 at the start.
-        name: its id, for example ``doorkey/options-v0``.
-        actions: how many primitive ones there are.
-        description: what one should know of it.
-
-    Returns:
-        Steps, all episodes together.
+    ``name`` is its id, such as ``doorkey/options-v0``, ``actions`` how many primitive ones there are. ``infos/option``
+    says which option led to a state, -1 at the start.
     """
     shape: tuple[int, ...] = ()
     total = count = 0

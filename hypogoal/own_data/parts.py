@@ -1,7 +1,5 @@
 """What users bring, checked, as the sets of states that a data file holds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
@@ -47,14 +45,8 @@ def collected_of(
 ) -> tuple[Collected, list[str]]:
     """The states in the form of a data file, and what is allowed but may surprise, a line each.
 
-    Args:
-        parts: what was found.
-        sub_goals: G names; may be left out for one.
-        share: of the labelled states that is held out where there are no held-out ones, of each class.
-        seed: of which ones.
-
-    Raises:
-        UserError: shapes, types or labels that cannot be used, or a class that is missing.
+    Of one sub-goal the name may be left out. Where there are no held-out states, a ``share`` of the labelled ones of
+    each class is, by ``seed``. What cannot be used, or a missing class, is a ``UserError``.
     """
     warned: list[str] = []
     images = as_images(parts.observations, "the labelled observations")
@@ -93,11 +85,7 @@ def collected_of(
 
 
 def require_memory(size: int, where: Path) -> None:
-    """Weigh states of ``size`` bytes before they are read.
-
-    Raises:
-        UserError: with the copies that are made of them they need more memory than is free.
-    """
+    """Refuse (``UserError``) states whose ``size`` bytes, with the copies made of them, exceed the free memory."""
     free = free_memory()
     if free is not None and COPIES * size > free:
         what = f"the states need {human(COPIES * size)} of memory, {human(free)} are free"
@@ -107,10 +95,8 @@ def require_memory(size: int, where: Path) -> None:
 def _apart(
     states: States, others: Sequence[NDArray[np.uint8]], kind: str, of: str, do: str, warned: list[str]
 ) -> States:
-    """Those of a kind of states that look like none of the others, which are ``of`` another kind.
-
-    Raises:
-        UserError: there are none; ``do`` is what to do then.
+    """Those of a kind of states that look like none of the others, which are ``of`` another kind; none left: a
+    ``UserError``.
     """
     kept = leave_out(states, *others)
     count = len(states.labels)
@@ -123,11 +109,7 @@ def _apart(
 
 
 def as_images(values: NDArray[Any], what: str, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
-    """Observations uint8 (N, H, W, C), of ``shape`` (H, W, C) where given.
-
-    Raises:
-        UserError: another type or shape, or none at all.
-    """
+    """Observations uint8 (N, H, W, C), of ``shape`` (H, W, C) where given; else, or of none, a ``UserError``."""
     found = f"{values.dtype} {values.shape}"
     if values.dtype.kind == "f":
         do = "Where 0..1, give (255 * x).round().astype('uint8')."
@@ -153,11 +135,7 @@ def as_images(values: NDArray[Any], what: str, shape: tuple[int, ...] | None = N
 
 
 def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = None) -> NDArray[np.bool_]:
-    """Labels bool (count, G).
-
-    Raises:
-        UserError: another number of them, or other values than 0 and 1.
-    """
+    """Labels bool (count, G); another number of them, or other values than 0 and 1, are a ``UserError``."""
     found = f"{values.dtype} {values.shape}"
     columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or len(columns) != count or columns.shape[1] == 0:
@@ -172,11 +150,7 @@ def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = N
 
 
 def named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
-    """The names of ``count`` sub-goals.
-
-    Raises:
-        UserError: not as many, the same one twice, or no plain names.
-    """
+    """The names of ``count`` sub-goals; a ``UserError`` where there are not as many plain ones, each once."""
     names = tuple(sub_goals) or (("sub-goal",) if count == 1 else ())
     if len(names) != count:
         do = f"Give --sub-goal NAME {count} times, in the order of the labels' columns."
@@ -188,10 +162,8 @@ def named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
 def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.bool_]:
     """Which states (N,) are held out: ``share`` of each combination of labels (N, G), at random, but never all of one.
 
-    What is too little of one combination to be a state is added to the next one's share.
-
-    Raises:
-        UserError: there are too few states to hold one out.
+    What is too little of one combination to be a state is added to the next one's share. No state at all is a
+    ``UserError``.
     """
     rng = rng_for(seed, "held-out")
     chosen = np.zeros(len(labels), np.bool_)
@@ -209,10 +181,8 @@ def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.b
 
 
 def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], warned: list[str]) -> None:
-    """Each sub-goal (G,) must hold in some labelled states (N, G) and not in others; where few do, one is warned.
-
-    Raises:
-        UserError: a class is missing.
+    """Each sub-goal (G,) must hold in some labelled states (N, G) and not in others (else a ``UserError``); where few
+    do, one is warned.
     """
     for column, goal in enumerate(goals):
         positives, among = int(labels[:, column].sum()), f"among {len(labels)} labelled states"

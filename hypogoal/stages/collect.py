@@ -1,7 +1,5 @@
 """Spec A1, B3: collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,20 +27,10 @@ def collect(
     resume: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Collect ``domain``'s states into ``out``.
+    """Collect ``domain``'s states into the HDF5 file ``out``, with an instance of its ``config_class``.
 
-    Args:
-        domain: see :mod:`hypogoal.domains.base`.
-        config: an instance of the domain's ``config_class``.
-        out: the HDF5 file to write.
-        name: by which later stages find the domain; its own where None.
-        seed: of whatever the domain draws at random.
-        force: replace an existing file.
-        resume: go on with what was begun, of a domain whose collecting can be resumed.
-        quiet: no progress.
-
-    Returns:
-        Numbers of states and positives per split and sub-goal.
+    ``name`` is that by which later stages find the domain; its own where None. ``resume``: go on with what was begun,
+    of a domain whose collecting can be resumed. Returns numbers of states and positives per split and sub-goal.
     """
     require_names(domain.sub_goals)  # not after all the play, when the file is written
     given, out = out, claim(out, kind=DATA, force=force, resume=resume)

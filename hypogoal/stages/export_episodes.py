@@ -1,7 +1,5 @@
 """Spec B6: episodes of a trained agent as a Minari dataset, for offline learning with other software."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -22,21 +20,11 @@ NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")
 def export_episodes(
     meta: Path, out: Path, *, episodes: int = 20, seed: int = 0, force: bool = False, quiet: bool = False
 ) -> int:
-    """Let the agent of a meta artefact play, and write what happened as a Minari dataset.
+    """Let the agent of a meta artefact play, and write what happened as a Minari dataset; returns its steps.
 
-    Args:
-        meta: the artefact that ``train-meta`` wrote.
-        out: the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
-        episodes: how many.
-        seed: of the draws of options.
-        force: replace an empty folder at ``out``; any other has to be moved away.
-        quiet: no progress.
-
-    Returns:
-        Steps, all episodes together.
-
-    Raises:
-        UserError: no such agent, no such name, or there is something at ``out``.
+    ``out`` is the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
+    ``seed`` is of the draws of options. With ``force`` an empty folder is replaced; any other has to be moved away. No
+    such agent, no such name, or something at ``out`` is a ``UserError``.
     """
     prepare()
     if not NAME.fullmatch(out.name):

@@ -1,7 +1,5 @@
 """Spec B6: states that users bring, as a data file, and a data file's states as arrays for other software."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,24 +30,14 @@ def import_data(
     seed: int = 0,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Write the states of ``source`` into the data file ``out``.
+    """Write the states of ``source`` into the data file ``out``; returns numbers of states and positives, as
+    :func:`collect`.
 
-    Args:
-        source: a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
-        out: the HDF5 file to write.
-        sub_goals: their names, in the order of the labels' columns.
-        labels: for a Minari dataset, by sub-goal ``module:function`` from an observation to a truth.
-        key: for a Minari dataset whose observations are dictionaries, which part is the image.
-        share: of the labelled states that is held out where no held-out ones are given.
-        domain: what the states are of, for ``train-options`` and later stages.
-        seed: of which states are held out.
-        force: replace an existing file.
-
-    Returns:
-        Numbers of states and positives per split and sub-goal.
-
-    Raises:
-        UserError: see ``hypogoal.own_data``.
+    ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
+    ``sub_goals`` are names in the order of the labels' columns; of a Minari dataset ``labels`` has by sub-goal
+    ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is the image.
+    ``share`` of the labelled states, by ``seed``, is held out where no held-out ones are given. ``domain`` is what they
+    are of, for later stages. Errors: see ``hypogoal.own_data``.
     """
     claim(out, kind=DATA, inputs=[source], force=force)
     if (source / MAIN_FILE).exists():
@@ -86,11 +74,7 @@ def _too_small(domain: str, shape: tuple[int, ...]) -> list[str]:
 
 
 def export_data(data: Path, out: Path, *, force: bool = False) -> None:
-    """Write the states of a data file as ``.npz``, which ``import_data`` takes again.
-
-    Raises:
-        UserError: ``out`` exists or is no ``.npz``, or the sub-goals do not share their states.
-    """
+    """Write the states of a data file as ``.npz``, which ``import_data`` takes again; see :func:`write_arrays`."""
     if out.suffix != ".npz":
         raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
     out = claim(out, kind=ARRAYS, inputs=[data], force=force)

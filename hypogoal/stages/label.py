@@ -1,7 +1,5 @@
 """Spec B6: states marked by hand, in the folder of images that ``import`` takes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -29,29 +27,22 @@ def label(
     fps: int = 0,
     resume: bool = False,
 ) -> dict[str, int]:
-    """Show states in a window and keep what a person says of them.
+    """Show states in a window and keep what a person says of them; returns how many states of each kind are marked.
 
-    Args:
-        source: a data file, a ``.npz`` file or a folder of images, whose states are shown one after another; or what is
-            played: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
-            environment.
-        out: the folder; its name is the sub-goal's.
-        layout_seed: of the layout that is played.
-        arguments: of the environment.
-        heldout: the marks are for evaluation: ``out/heldout``.
-        fps: steps a second in real time; 0: a step for each key.
-        resume: go on with a folder that there is.
-
-    Returns:
-        How many states of each kind are marked.
-
-    Raises:
-        UserError: no such source, ``out`` exists, or there is no screen.
+    ``source`` is a data file, a ``.npz`` file or a folder of images, whose states are shown one after another; or what
+    is played: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
+    environment, with ``arguments``. ``out`` is the folder, whose name is the sub-goal's; ``heldout``: the marks are for
+    evaluation, in ``out/heldout``. ``fps``: steps a second in real time; 0: a step for each key. No such source, an
+    ``out`` that exists and is not to be gone on with (``resume``), or no screen is a ``UserError``.
     """
     require_names([out.resolve().name])
     if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
         raise UserError("it exists already", out, "Give --resume to go on with it, or another --out.")
-    states = _source(source, layout_seed, arguments or {})
+    states: Source
+    if Path(source).exists():
+        states = Recorded(recorded_states(Path(source)))
+    else:
+        states = Played(partial(environment_of, source, arguments or {}), layout_seed)
     out.parent.mkdir(parents=True, exist_ok=True)
     with sole_writer(out):
         marks = Marks(out / HELD_OUT, KINDS[:2]) if heldout else Marks(out)
@@ -59,21 +50,9 @@ def label(
         return marks.counts()
 
 
-def _source(source: str, layout_seed: int, arguments: Mapping[str, Any]) -> Source:
-    if Path(source).exists():
-        return Recorded(recorded_states(Path(source)))
-    return Played(partial(environment_of, source, arguments), layout_seed)
-
-
 def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
-    """An environment by its id, of a domain, or by the function that makes it.
-
-    Args:
-        source: an id (``ALE/Freeway-v5``), a domain's name, or ``module:object``.
-        arguments: of the environment.
-
-    Raises:
-        UserError: there is no such thing.
+    """An environment by its id (``ALE/Freeway-v5``), of a domain, or by the function that makes it; else a
+    ``UserError``.
     """
     import ale_py
     import minigrid  # noqa: F401 - registers its environments when it is loaded

@@ -3,8 +3,6 @@
 ``hypogoal run`` is the sweep of a named experiment on this machine.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -55,10 +53,8 @@ AGAIN = "give the same command again to go on"
 
 
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
-    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment.
-
-    Raises:
-        UserError: no such stage or domain, or no experiment is on that domain.
+    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment. Else a
+    ``UserError``.
     """
     if stage == "collect":
         return load_domain(domain, given=True).config_class
@@ -82,20 +78,12 @@ def plan(
     device: str = "auto",
     short: bool = False,
 ) -> Plan:
-    """The cells of an experiment.
+    """The cells of an experiment in the folder ``out``: a name, one of the paper's figures, or an own TOML file.
 
-    Args:
-        experiment: a name, one of the paper's figures, or an own TOML file (see ``experiments.format``).
-        out: the run's folder.
-        preset: of a named experiment; a figure has its own.
-        assignments: ``KEY=VALUE`` or ``STAGE.KEY=VALUE``; of an own experiment ``AXIS=VALUES``.
-        seeds: the run seeds, ``0-9``.
-        device: of the training stages.
-        short: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
-            was begun with other names keeps those.
-
-    Raises:
-        UserError: unknown experiment or preset, a setting that no stage has, or no such device.
+    ``assignments`` are ``KEY=VALUE`` or ``STAGE.KEY=VALUE``, of an own experiment ``AXIS=VALUES``; ``preset`` is of a
+    named one, a figure has its own; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages.
+    ``short``: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
+    was begun with other names keeps those. What is unknown is a ``UserError``.
     """
     check_name(device)
     assignments = [*assignments]
@@ -122,10 +110,8 @@ def _short(out: Path, *, wanted: bool) -> bool:
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
-    """Spec A6: ``sweep`` with the manners of a stage: what is there is refused unless resumed or forced.
-
-    Raises:
-        UserError: as of :func:`sweep`, or ``out`` exists and neither ``force`` nor ``resume`` was given.
+    """Spec A6: :func:`sweep` with the manners of a stage: what is there is refused (``UserError``) unless resumed or
+    forced.
     """
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
@@ -133,11 +119,7 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
 
 
 def _begun(out: Path, planned: Plan) -> bool:
-    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with.
-
-    Raises:
-        LostPlan: that is not known any more.
-    """
+    """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with."""
     try:
         before, _ = read_plan(out)
         check_same(out, planned.cells)
@@ -157,24 +139,12 @@ def sweep(
     confirm: Callable[[str], None] | None = None,
     go_on: str = AGAIN,
 ) -> Path:
-    """Run on this machine what is not finished, and gather every number.
+    """Run on this machine what is not finished, and gather every number; returns ``results.csv``.
 
     It may be killed at any time and started again: what is finished is recognised and never run again, what was begun
-    goes on where it was.
-
-    Args:
-        planned: the cells.
-        out: the run's folder.
-        force: make finished ones anew.
-        quiet: no progress.
-        confirm: asked before something long begins; it raises where the answer is no.
-        go_on: what a user who interrupts it is told.
-
-    Returns:
-        ``results.csv``.
-
-    Raises:
-        UserError: another process runs it, the folder has another sweep, or a cell failed.
+    goes on where it was. ``force``: make finished ones anew. ``confirm`` is asked before something long begins; it
+    raises where the answer is no. A user who interrupts it is told to ``go_on``. Another process that runs it, another
+    sweep's folder, or a cell that failed is a ``UserError``.
     """
     say = (lambda text: None) if quiet else _say
     _check_folder(out)
@@ -204,11 +174,7 @@ def submit(
     quiet: bool = False,
     confirm: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Have Slurm run what is not finished; arguments as of :func:`sweep`, returns the jobs.
-
-    Raises:
-        UserError: as of :func:`sweep` and ``slurm.submit``.
-    """
+    """Have Slurm run what is not finished; arguments and errors as of :func:`sweep`, returns the jobs."""
     at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
     planned = replace(planned, workers=at_once)
     slurm.check(out, options)
@@ -277,11 +243,7 @@ def _begin(
 
 
 def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str], None]) -> None:
-    """Have each cell's stage say whether what is there is what its command makes.
-
-    Raises:
-        UserError: one is not.
-    """
+    """Refuse (``UserError``) what is there and not, as each cell's stage says, what its command makes."""
     alone = [replace(cell, needs=()) for cell in cells]
     outcome = run_cells(replace(planned, cells=alone, anew=frozenset(), workers=cores()), out, say=say, check=True)
     for name, why in outcome.failed.items():
@@ -290,10 +252,8 @@ def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str],
 
 
 def gather(out: Path) -> Path:
-    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former.
-
-    Raises:
-        UserError: there is no sweep, or an artefact is damaged.
+    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former. No sweep, a
+    damaged artefact: a ``UserError``.
     """
     planned, _ = read_plan(out)
     results = write_results(planned, out)

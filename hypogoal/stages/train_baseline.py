@@ -1,7 +1,5 @@
 """Spec A7, E7: train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path
@@ -34,21 +32,11 @@ def train_baseline(
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Train the agent and write the artefact ``out``.
+    """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
 
-    Args:
-        domain: doorkey, or module:object.
-        config: see :class:`BaselineConfig`.
-        out: the artefact to write: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
-        data: states of the domain: the agent plays in the world they are of. None: in that of its defaults.
-        seed, force, resume, quiet, device: as for every stage.
-
-    Returns:
-        Steps, episodes, and success and length over the last 100 episodes.
-
-    Raises:
-        UserError: unknown domain or device, states of another domain, or ``out`` exists.
-        NumericalError: NaN or Inf in a weight.
+    With ``data``, states of the domain, it plays in the world they are of, else in that of the domain's defaults.
+    Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states of
+    another domain, or an ``out`` that exists is a ``UserError``, NaN or Inf in a weight a ``NumericalError``.
     """
     from hypogoal.learners.baselines.agents import train, weights
     from hypogoal.learners.baselines.engine_env import EngineEnv
@@ -88,11 +76,7 @@ def train_baseline(
 
 
 def _world_of(data: Path, name: str, domain: Domain) -> dict[str, Any]:
-    """The settings of the world that states are of.
-
-    Raises:
-        UserError: they are of another domain.
-    """
+    """The settings of the world that states are of; a ``UserError`` where they are of another domain."""
     dataset = open_dataset(data)
     if dataset.domain != name:
         raise UserError(

@@ -4,8 +4,6 @@ Without ``--options`` the policies start fresh (the paper's D5); with it they co
 count in every curve.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -35,17 +33,10 @@ def train_meta(
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Train the meta-policy over the options of an ensemble artefact and write the artefact ``out``.
+    """Train the meta-policy over an ensemble's options, or over these ``options`` of it, and write the artefact
+    ``out``.
 
-    Args:
-        ensemble: the ensemble artefact.
-        config: see :class:`TrainMetaConfig`.
-        out: the artefact to write.
-        options: an options artefact, made from the same ensemble, to continue from.
-        seed, force, resume, quiet, device: as for every stage.
-
-    Returns:
-        Steps, episodes, and success and length over the last 100 episodes.
+    Returns steps, episodes, and success and length over the last 100 episodes.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()

@@ -1,7 +1,5 @@
 """Spec A3: learn every member's option policy while options are chosen at random."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +27,8 @@ def train_options(
 ) -> dict[str, Any]:
     """Train the options of an ensemble artefact and write the artefact ``out``.
 
-    Returns:
-        Steps, episodes, and success and length over the last 100 episodes of random choice; where each option begins
-        an episode, instead of these two the shares of ``recorder.recent``.
+    Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
+    begins an episode, instead of these two the shares of ``recorder.recent``.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()

@@ -36,9 +36,9 @@ from hypogoal.domains.montezuma_emulator import (
     pixel,
 )
 from hypogoal.domains.montezuma_ladders import LADDERS
-from hypogoal.domains.montezuma_rollouts import PLAYS, standing_places
 from hypogoal.domains.montezuma_states import (
     KINDS,
+    PLAYS,
     RoomStates,
     choose,
     emulator_of_process,
@@ -47,6 +47,7 @@ from hypogoal.domains.montezuma_states import (
     labels_of,
     may_be_held_out,
     origins_of,
+    standing_places,
 )
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.meta.config import TrainOptionsConfig

@@ -1,7 +1,5 @@
 """One cell's process: what every runner starts, on whichever machine (Spec G4)."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time
@@ -51,17 +49,11 @@ class Running:
 
 
 def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False, check: bool = False) -> Running:
-    """Start a cell; it goes on where it was, and ends when this process does.
+    """Start a cell, a ``UserError`` where another process runs it; it goes on where it was, and ends when this process
+    does.
 
-    Args:
-        cell: what to run.
-        run: the run's folder.
-        cores: processes that it may use.
-        force: make it again, whatever is there; what an attempt of that has begun is gone on with.
-        check: it is there: have its stage say whether this command makes what is there.
-
-    Raises:
-        UserError: another process runs it.
+    ``cores`` are the processes that it may use. ``force``: make it again, whatever is there; what an attempt of that
+    has begun is gone on with. ``check``: it is there, have its stage say whether this command makes what is there.
     """
     log = open_log(run, cell)
     try:

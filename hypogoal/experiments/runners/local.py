@@ -1,7 +1,5 @@
 """The cells on this machine, in the plan's order: as many at once as cores and memory allow (Spec G4)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,19 +20,14 @@ REPORT_SECONDS = 15.0
 class Outcome:
     """What became of the cells: of each that failed why, and those that wait for such a one."""
 
-    done: list[Cell] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
     waiting: list[Cell] = field(default_factory=list)
 
 
 def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool = False) -> Outcome:
-    """Run what is not finished; a cell that fails stops only those that need it.
+    """Run what is not finished; a cell that fails stops only those that need it. ``say`` is told what happens.
 
-    Args:
-        plan: the cells, which of them are to be made again though finished, and how many cores they may use.
-        run: the run's folder.
-        say: told what happens, a line at a time.
-        check: all are there: have the stage of each say whether its command makes what is there.
+    ``check``: all are there, have the stage of each say whether its command makes what is there.
     """
     outcome = Outcome(waiting=list(plan.cells))
     places = {cell.name: place for place, cell in enumerate(plan.cells)}
@@ -50,7 +43,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                     outcome.waiting.remove(cell)
                     try:
                         if cell.name not in plan.anew and is_finished(cell) and not check:
-                            _add(outcome, made, cell)
+                            made.add(cell.out)
                         else:
                             startable.append(cell)
                     except UserError as error:
@@ -73,7 +66,7 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                 else:
                     if started.cell.name in plan.anew:
                         made_anew(run, started.cell)
-                    _add(outcome, made, started.cell)
+                    made.add(started.cell.out)
                     say(f"[{len(made)}/{total}] {started.cell.name} done in {started.seconds:.0f} s")
             if running and time.monotonic() - told > REPORT_SECONDS:
                 told = time.monotonic()
@@ -101,11 +94,6 @@ def _allotted(startable: list[Cell], running: list[Running], workers: int, budge
         return cores
     left = budget - sum(started.cell.cost.memory * started.cores for started in running)
     return min(cores, max(0, int(left // cell.cost.memory))) if cell.cost.memory else cores
-
-
-def _add(outcome: Outcome, made: set[Path], cell: Cell) -> None:
-    outcome.done.append(cell)
-    made.add(cell.out)
 
 
 def _fail(outcome: Outcome, cell: Cell, why: str, say: Callable[[str], None]) -> None:

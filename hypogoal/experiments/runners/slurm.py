@@ -5,8 +5,6 @@ have ended, whichever way (``afterany``): an element whose own needs are not the
 Nothing is asked of Slurm's accounting, which need not be there.
 """
 
-from __future__ import annotations
-
 import getpass
 import json
 import re
@@ -88,19 +86,11 @@ def arrays(plan: Plan, todo: Sequence[Cell], most: int = MOST_ELEMENTS) -> list[
 
 
 def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> list[dict[str, Any]]:
-    """Write a script for each array into ``run/slurm`` and submit it; one more job gathers the numbers at the end.
+    """Write a script for each array of ``todo`` into ``run/slurm`` and submit it; one more job gathers the numbers at
+    the end.
 
-    Args:
-        plan: all cells.
-        run: the run's folder, which every node must see under the same path.
-        todo: those that are not finished.
-        options: what to ask of Slurm.
-
-    Returns:
-        Of each job its number (``id``), name and cells.
-
-    Raises:
-        UserError: there is no Slurm, it refuses, or jobs of this sweep are still in its queue.
+    Every node must see the run's folder under the same path. Returns of each job its number (``id``), name and cells.
+    No Slurm, one that refuses, or jobs of this sweep still in its queue are a ``UserError``.
     """
     check(run, options)
     if alive := queued(run):
@@ -118,7 +108,8 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
             jobs.append({"id": numbers[array.name], "name": array.name, "cells": [cell.name for cell in array.cells]})
             replace_text(folder / JOBS, json.dumps(jobs, indent=1) + "\n")
         script = folder / f"{GATHER}.sh"
-        replace_text(script, _gather(run, options))
+        memory = f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M"
+        replace_text(script, "\n".join([*_head(run, GATHER, options), memory, *_sweep(run, "--gather"), ""]))
         jobs.append({"id": _sbatch(script, list(numbers.values())), "name": GATHER, "cells": []})
     except UserError:
         for job in jobs:
@@ -137,11 +128,7 @@ def most_elements() -> int:
 
 
 def check(run: Path, options: Options) -> None:
-    """Check, before anything is written, that jobs can be asked for.
-
-    Raises:
-        UserError: there is no Slurm, or an option or the run's path is not one that a batch script can have.
-    """
+    """Refuse (``UserError``), before anything is written, where there is no Slurm, or what no batch script can have."""
     if shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     for text in (options.partition, options.time, options.memory, *options.extra):
@@ -198,14 +185,6 @@ def _sweep(run: Path, what: str) -> list[str]:
     ]
 
 
-def _gather(run: Path, options: Options) -> str:
-    lines = _head(run, GATHER, options)
-    lines += [
-        f"#SBATCH --mem={ceil(LEAST_MEMORY / 2**20)}M",
-    ]
-    return "\n".join([*lines, *_sweep(run, "--gather")]) + "\n"
-
-
 def _sbatch(script: Path, after: Sequence[str]) -> str:
     dependency = [f"--dependency=afterany:{':'.join(after)}"] if after else []
     done = _command("sbatch", "--parsable", *dependency, str(script))
@@ -247,10 +226,8 @@ def queued(run: Path) -> list[str]:
 
 
 def cancel(run: Path) -> int:
-    """Have Slurm end every job of a run; cells that run save where they are. Returns how many jobs there were.
-
-    Raises:
-        UserError: there are none, or Slurm does not end them.
+    """Have Slurm end every job of a run (else a ``UserError``); cells that run save where they are. Returns how many
+    there were.
     """
     alive = queued(run)
     if not alive:

@@ -1,7 +1,5 @@
 """One cell inside a Slurm job: it saves and is queued again before its time is up, and saves when it is cancelled."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -46,8 +44,7 @@ class _Signals:
 def run_job(run: Path, name: str) -> None:
     """Run the cell called ``name`` of the sweep in ``run``; the job's processors are what it may use.
 
-    Raises:
-        UserError: there is no such cell, something it needs is not there, or it failed.
+    Where there is no such cell, what it needs is not there, or it fails, it is a ``UserError``.
     """
     signals = _Signals()
     plan, _ = read_plan(run)

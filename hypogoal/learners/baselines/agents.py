@@ -1,7 +1,5 @@
 """PPO and DQN of stable-baselines3, made from the table of settings and trained on an engine."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import warnings
@@ -103,22 +101,14 @@ class _Watch(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm, step: int) -> None:
-    """Spec G3.
-
-    Raises:
-        NumericalError: a weight of the agent is NaN or infinite.
-    """
+    """Spec G3: a ``NumericalError`` where a weight of the agent is NaN or infinite."""
     for name, weight in model.policy.named_parameters():
         if not torch.isfinite(weight).all():
             raise NumericalError(f"NaN or Inf in {type(model).__name__}'s {name} at step {step}")
 
 
 def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int, device: str = "cpu") -> BaseAlgorithm:
-    """A fresh agent with the hyperparameters ``chosen``.
-
-    Raises:
-        UserError: PPO has more environments than steps between two updates.
-    """
+    """A fresh agent; a ``UserError`` where PPO has more environments than steps between two updates."""
     if isinstance(chosen, PPOSettings) and env.num_envs > chosen.rollout:
         what = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
         raise UserError(what, f"environments={env.num_envs}", f"Give --set environments={chosen.rollout} or fewer.")
@@ -178,22 +168,10 @@ def train(
     checkpoints: Checkpoints | None = None,
     device: str = "cpu",
 ) -> BaseAlgorithm:
-    """Spec E7: train a fresh agent for ``steps`` environment steps (rounded up to whole rollouts).
+    """Spec E7: train a fresh agent for ``steps`` environment steps of all environments, rounded up to whole rollouts.
 
-    Args:
-        env: the engine's environments; ``env.episodes`` is filled.
-        chosen: hyperparameters.
-        steps: environment steps, summed over the environments.
-        seed: of everything random.
-        log, progress: are told of every ``LOG_INTERVAL`` steps.
-        checkpoints: spec G1; of no use where the engine cannot be resumed.
-        device: where the agent's networks are.
-
-    Returns:
-        The trained agent.
-
-    Raises:
-        NumericalError: NaN or Inf in a weight.
+    ``env.episodes`` is filled; ``log`` and ``progress`` are told of every ``LOG_INTERVAL`` steps. Checkpoints (spec G1)
+    are of no use where the engine cannot be resumed. NaN or Inf in a weight is a ``NumericalError``.
     """
     if checkpoints is None or not env.engine.resumes:
         checkpoints = Checkpoints(None)

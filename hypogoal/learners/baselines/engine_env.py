@@ -1,7 +1,5 @@
 """An engine as a stable-baselines3 vectorised environment, and the list of episodes played in it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Feature networks of the baselines: RGB image in, vector out."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from functools import partial

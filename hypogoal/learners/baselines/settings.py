@@ -4,8 +4,6 @@ The paper gives Tables 4 and 5 only for the agents it trains itself and says no 
 read the two tables as theirs too. Where it is silent the value is stable-baselines3's default or ours, and says so.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
@@ -69,11 +67,7 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 
 
 def hyperparameters(agent: str, name: str) -> PPOSettings | DQNSettings:
-    """The hyperparameters of ``agent`` (ppo, dqn) in setting ``name`` (paper, tuned).
-
-    Raises:
-        UserError: there is no such agent or setting.
-    """
+    """Those of ``agent`` (ppo, dqn) in setting ``name`` (paper, tuned); a ``UserError`` where there are none."""
     try:
         return HYPERPARAMETERS[agent, name]
     except KeyError:
