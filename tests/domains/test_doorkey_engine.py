@@ -136,8 +136,8 @@ def test_wrong_keys_end_episodes(keyring: bool) -> None:
     seen: Counter[str] = Counter()
     for layout_seed in LAYOUTS[:15]:
         play_side_by_side(layout_seed, keyring, seen, "ends")
-    assert seen["a wrong key"] >= 20
-    assert seen["terminated"] - seen["a wrong key"] >= 20
+    assert seen["a wrong key"] >= 5
+    assert seen["terminated"] - seen["a wrong key"] >= 5
     assert seen["hold 2"] == seen["hold 3"] == 0 or keyring  # the red key first, then a wrong one
 
 
