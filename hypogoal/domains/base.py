@@ -51,12 +51,14 @@ class Plan(NamedTuple):
         actions: int64 (A,), those that are followed.
         following: int64 (N, A), the state after each of them, one of ``ids``.
         final: bool (N,), an episode ends there, so nothing follows.
+        solved: bool (N,), it ends there with the task solved.
     """
 
     ids: NDArray[np.int64]
     actions: NDArray[np.int64]
     following: NDArray[np.int64]
     final: NDArray[np.bool_]
+    solved: NDArray[np.bool_]
 
 
 class Engine(ABC):

@@ -263,7 +263,7 @@ class DoorKeyEngine(Engine):
         following[~final] = self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))).reshape(
             len(origin), -1
         )
-        return Plan(ids, actions, following, final)
+        return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:
         """Primitive steps from the start to the goal, at least; None where a key must be dropped (no key ring)."""

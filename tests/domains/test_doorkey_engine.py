@@ -158,7 +158,7 @@ def test_nothing_is_beyond_a_wrong_key() -> None:
 def test_the_plan_is_what_follows() -> None:
     """Spec H3: every state and action of the plan, stepped; nothing follows where an episode ends."""
     engine = DoorKeyEngine(5, 1, wrong_key="ends")
-    ids, actions, following, final = engine.plan()
+    ids, actions, following, final, solved = engine.plan()
     assert set(following.ravel().tolist()) <= set(ids.tolist())
     for column, action in enumerate(actions.tolist()):
         expected = engine.follow(ids[~final], np.full((~final).sum(), action))
@@ -166,6 +166,7 @@ def test_the_plan_is_what_follows() -> None:
     assert (following[final] == ids[final][:, None]).all()
     labels = engine.labels(ids)
     assert np.array_equal(final, labels[:, 4] | labels[:, 0] | labels[:, 1])
+    assert np.array_equal(solved, labels[:, 4])
 
 
 def test_an_engine_of_many_is_many_engines_of_one() -> None:
