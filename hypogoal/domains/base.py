@@ -43,6 +43,24 @@ class Step(NamedTuple):
     truncated: NDArray[np.bool_]
 
 
+class Plan(NamedTuple):
+    """What follows in the states that can be reached from the start, as far as it can be told.
+
+    Attributes:
+        ids: int64 (N,), the states.
+        actions: int64 (A,), those that are followed.
+        following: int64 (N, A), the state after each of them, one of ``ids``.
+        final: bool (N,), an episode ends there, so nothing follows.
+        solved: bool (N,), it ends there with the task solved.
+    """
+
+    ids: NDArray[np.int64]
+    actions: NDArray[np.int64]
+    following: NDArray[np.int64]
+    final: NDArray[np.bool_]
+    solved: NDArray[np.bool_]
+
+
 class Engine(ABC):
     """Many environments of one layout, stepped together; every distinct state has an integer id.
 
@@ -141,6 +159,10 @@ class Engine(ABC):
 
     def reachable(self) -> NDArray[np.int64] | None:
         """Ids of all states that can be reached, one for each image; None where nobody knows them."""
+        return None
+
+    def plan(self) -> Plan | None:
+        """What follows on each action in each state; None where nobody knows."""
         return None
 
     def shortest_path(self) -> int | None:

@@ -18,7 +18,15 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, leave_out
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.domains.doorkey_env import DOOR_LABELS, MAX_STEPS, OBSERVATION_SHAPE, SUB_GOALS, Layout, layout_of
+from hypogoal.domains.doorkey_env import (
+    DOOR_LABELS,
+    MAX_STEPS,
+    OBSERVATION_SHAPE,
+    SUB_GOALS,
+    WRONG_KEYS,
+    Layout,
+    layout_of,
+)
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,12 @@ class DoorKeyConfig:
         choices=DOOR_LABELS,
     )
     keyring: bool = setting(True, "several keys can be held", source="the authors' code")
+    wrong_key: str = setting(
+        "harmless",
+        "holding the blue or the green key is 'harmless', or 'ends' the episode without reward",
+        source="ours: a task in which choosing decides",
+        choices=WRONG_KEYS,
+    )
 
 
 Source: TypeAlias = tuple[int, int, Layout]  # layout seed, draw (see ``collect``), layout
@@ -93,7 +107,7 @@ def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[Layout]) -> list[Sou
 
 
 def _sweep(config: DoorKeyConfig, layout_seed: int, draw: int, layout: Layout, progress: Any) -> _Sweep:
-    engine = DoorKeyEngine(layout, keyring=config.keyring, door_label=config.door_label)
+    engine = DoorKeyEngine(layout, keyring=config.keyring, door_label=config.door_label, wrong_key=config.wrong_key)
     sweep = _Sweep(layout_seed, draw, engine, engine.reachable())
     progress.advance()
     return sweep
@@ -118,7 +132,7 @@ class DoorKeyDomain(Domain):
     sub_goals = SUB_GOALS
     observation_shape = OBSERVATION_SHAPE
     config_class = DoorKeyConfig
-    engine_settings = ("keyring", "door_label")
+    engine_settings = ("keyring", "door_label", "wrong_key")
     env_id = "hypogoal/DoorKey-8x8-v0"
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:
@@ -173,7 +187,7 @@ class DoorKeyDomain(Domain):
         return Collected(OBSERVATION_SHAPE, SUB_GOALS, learnt, others, test)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, **arguments: Any) -> DoorKeyEngine:
-        """An engine of ``count`` environments of one layout; ``arguments``: ``keyring``, ``door_label``."""
+        """An engine of ``count`` environments of one layout; ``arguments``: its ``engine_settings``."""
         return DoorKeyEngine(layout_seed, count, max_steps=max_steps, **arguments)
 
 

@@ -19,7 +19,7 @@ from minigrid.core.grid import Grid
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.typing import NDArray
 
-from hypogoal.domains.base import Engine, Step
+from hypogoal.domains.base import Engine, Plan, Step
 from hypogoal.domains.doorkey_env import (
     DOOR_COLOUR,
     KEY_COLOURS,
@@ -90,7 +90,7 @@ class DoorKeyEngine(Engine):
     Args:
         layout: the layout, or the seed of that of ``DoorKeyEnv(layout_seed=...)``.
         count: environments (E).
-        keyring, door_label: see ``DoorKeyEnv``.
+        keyring, door_label, wrong_key: see ``DoorKeyEnv``.
         max_steps: steps after which an episode is truncated.
 
     Attributes:
@@ -110,7 +110,9 @@ class DoorKeyEngine(Engine):
         keyring: bool = True,
         max_steps: int = MAX_STEPS,
         door_label: str = "open",
+        wrong_key: str = "harmless",
     ):
+        self.harsh = wrong_key == "ends"
         self.layout = layout if isinstance(layout, Layout) else layout_of(layout)
         self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
         self.changes: dict[int, int] = {}
@@ -126,6 +128,7 @@ class DoorKeyEngine(Engine):
         self._codes = np.zeros((256, CELLS), np.uint8)
         self._code_bytes = self._codes.data.cast("B")  # writes a row several times faster than NumPy
         self._on_goal = np.zeros(256, np.bool_)
+        self._final = np.zeros(256, np.bool_)
         start = self.layout.start * 4 + self.layout.direction
         self._new_id(self._number_of((LOCKED, *self.layout.keys)) * POSES + start)
         self.reset()
@@ -141,13 +144,13 @@ class DoorKeyEngine(Engine):
 
     def step(self, actions: NDArray[np.int64]) -> Step:
         next_ids = self.follow(self.ids, actions)
-        terminated = self.at_goal(next_ids)
+        terminated = self._final.take(next_ids)
         elapsed = self.elapsed + 1
         truncated = elapsed >= self.max_steps
         ended = terminated | truncated
         self.ids = np.where(ended, START, next_ids)
         self.elapsed = np.where(ended, 0, elapsed)
-        return Step(next_ids, terminated.astype(np.float32), terminated, truncated)
+        return Step(next_ids, self.at_goal(next_ids).astype(np.float32), terminated, truncated)
 
     def follow(self, ids: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
         """MiniGrid's rules: the states that follow, int64 (n,), on actions int (n,) of 0 .. 6."""
@@ -222,15 +225,15 @@ class DoorKeyEngine(Engine):
     def distances(self, drop: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Breadth-first search: ids of all states reachable from the start, nearest first, and steps to each.
 
-        States on the goal are included and not gone beyond. Without ``drop`` they are a few thousand; with it
-        some ten million.
+        States in which the episode ends are included and not gone beyond. Without ``drop`` they are a few thousand;
+        with it some ten million.
         """
         actions = np.array([action for action in range(N_ACTIONS) if drop or action != DROP])
         rings, depth = [np.array([START])], 0  # the states so many steps away
         seen = np.ones(1, np.bool_)
         steps = [np.zeros(1, np.int64)]
         while len(rings[-1]):
-            origin = rings[-1][~self.at_goal(rings[-1])]
+            origin = rings[-1][~self._final[rings[-1]]]
             following = np.unique(self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))))
             seen = np.concatenate([seen, np.zeros(self.n_states - len(seen), np.bool_)])
             new = following[~seen[following]]
@@ -251,6 +254,17 @@ class DoorKeyEngine(Engine):
         _, first = np.unique(images, return_index=True)
         return ids[np.sort(first)]
 
+    def plan(self) -> Plan:
+        """Of all states but those that only dropping a key leads to, of which there are some ten million."""
+        ids, actions = self.distances()[0], np.array([action for action in range(N_ACTIONS) if action != DROP])
+        final = self._final[ids]
+        following = np.repeat(ids[:, None], len(actions), axis=1)
+        origin = ids[~final]
+        following[~final] = self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))).reshape(
+            len(origin), -1
+        )
+        return Plan(ids, actions, following, final, self.at_goal(ids))
+
     def shortest_path(self) -> int | None:
         """Primitive steps from the start to the goal, at least; None where a key must be dropped (no key ring)."""
         ids, steps = self.distances()
@@ -259,11 +273,12 @@ class DoorKeyEngine(Engine):
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float:
         """Spec F5: share of ``episodes`` of uniformly random actions that reach the goal in ``max_steps``."""
-        ids = np.full(episodes, START, np.int64)
+        ids, solved = np.full(episodes, START, np.int64), 0
         for _ in range(self.max_steps):
             ids = self.follow(ids, rng.integers(N_ACTIONS, size=len(ids)))
-            ids = ids[~self.at_goal(ids)]
-        return 1.0 - len(ids) / episodes
+            solved += int(self.at_goal(ids).sum())
+            ids = ids[~self._final[ids]]
+        return solved / episodes
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
         """What a resumed run needs to go on exactly: where each environment is, and the ids given so far."""
@@ -298,8 +313,8 @@ class DoorKeyEngine(Engine):
             return known
         new = self.n_states
         if new == len(self._site):
-            self._site, self._ahead, self._codes, self._on_goal = (
-                _doubled(table) for table in (self._site, self._ahead, self._codes, self._on_goal)
+            self._site, self._ahead, self._codes, self._on_goal, self._final = (
+                _doubled(table) for table in (self._site, self._ahead, self._codes, self._on_goal, self._final)
             )
             self._code_bytes = self._codes.data.cast("B")
         configuration, pose = divmod(site, POSES)
@@ -309,6 +324,8 @@ class DoorKeyEngine(Engine):
         self._code_bytes[new * CELLS : (new + 1) * CELLS] = row
         self._site[new], self._ahead[new] = site, configuration * CELLS + _AHEAD[pose]
         self._on_goal[new] = cell == self.layout.goal
+        wrong = self.harsh and bool((self._places[configuration, 1:3] >= HELD).any())
+        self._final[new] = self._on_goal[new] or wrong
         self._id_at[configuration, pose] = new
         self.n_states += 1
         return new

@@ -24,6 +24,7 @@ KEY_COLOURS = ("blue", "green", "red")  # in the order of the first three sub-go
 PLACING_ORDER = ("red", "green", "blue")  # the matching key first, as in the authors' fork
 SUB_GOALS = ("collect-blue-key", "collect-green-key", "collect-red-key", "open-red-door", "go-to-goal")
 DOOR_LABELS = ("open", "in-front")
+WRONG_KEYS = ("harmless", "ends")
 MISSION = "use the red key to open the door and then get to the goal"
 
 
@@ -101,6 +102,7 @@ class DoorKeyGrid(MiniGridEnv):
         layout_seed: the layout of every episode; None, the layout follows from ``reset(seed)``.
             ``layout_seed=s`` is the layout of ``reset(seed=s)``.
         door_label: definition of ``open-red-door`` in ``info["labels"]``, see ``sub_goals_reached``.
+        wrong_key: whether an episode ``ends`` (terminated, reward 0) once the blue or the green key is held.
     """
 
     def __init__(
@@ -109,13 +111,16 @@ class DoorKeyGrid(MiniGridEnv):
         max_steps: int = MAX_STEPS,
         layout_seed: int | None = None,
         door_label: str = "open",
+        wrong_key: str = "harmless",
         render_mode: str | None = None,
     ):
         if door_label not in DOOR_LABELS:
             raise ValueError(f"door_label must be one of {DOOR_LABELS}, not {door_label!r}")
+        if wrong_key not in WRONG_KEYS:
+            raise ValueError(f"wrong_key must be one of {WRONG_KEYS}, not {wrong_key!r}")
         self.keyring = keyring
         self.layout_seed = layout_seed
-        self.door_label = door_label
+        self.door_label, self.wrong_key = door_label, wrong_key
         self.ring: list[Key] = []
         super().__init__(
             mission_space=MissionSpace(mission_func=self._gen_mission),
@@ -166,7 +171,8 @@ class DoorKeyGrid(MiniGridEnv):
             self._use_ring(pick_up=action == self.actions.pickup)
             played = self.actions.done  # all that is left to MiniGrid is to count the step and to look
         observation, reward, terminated, truncated, info = super().step(played)
-        return observation, float(reward), terminated, truncated, info | {"labels": self._named_labels()}
+        wrong = self.wrong_key == "ends" and not {*self.held} <= {DOOR_COLOUR}
+        return observation, float(reward), terminated or wrong, truncated, info | {"labels": self._named_labels()}
 
     def _use_ring(self, pick_up: bool) -> None:
         x, y = self.front_pos

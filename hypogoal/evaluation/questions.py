@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hypogoal.evaluation import curves, distance, explorer, hypotheses, ranking, rooms, saliency, selection
+from hypogoal.evaluation import choosing, curves, distance, explorer, hypotheses, ranking, rooms, saliency, selection
 from hypogoal.evaluation.numbers import QUANTITIES, Metrics
 from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
 from hypogoal.evaluation.provenance import domains_of, provenance_section
@@ -24,6 +24,7 @@ QUESTIONS: list[Question] = [
     explorer.QUESTION,
     saliency.QUESTION,
     selection.QUESTION,
+    choosing.QUESTION,
 ]
 OLDER = "; evaluated by an older hypogoal: its intervals are bootstraps, too narrow with few runs. Evaluate again"
 

@@ -62,6 +62,17 @@ class PlayConfig(OptionConfig):
     max_episode_steps: int = setting(
         500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
     )
+    cap: float = setting(
+        0.0,
+        "an episode is cut after so many times the layout's shortest path; 0 for max_episode_steps",
+        source="ours: a task in which choosing decides",
+        low=0.0,
+    )
+    world: tuple[str, ...] = setting(
+        (),
+        "what is otherwise in the world than where the states were collected: settings of the domain as name=value",
+        source="ours: a task in which choosing decides",
+    )
     termination: str = setting(
         "learned",
         "members' verdicts, or the true sub-goals (upper bound)",

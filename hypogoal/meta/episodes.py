@@ -56,8 +56,8 @@ class Episode:
     terminated: bool
 
 
-def agent_of(artefact: Artefact, seed: int) -> OptionLoop:
-    """One environment in which the agent of a meta artefact plays; ``seed`` is of the draws.
+def agent_of(artefact: Artefact, seed: int, environments: int = 1) -> OptionLoop:
+    """Environments in which the agent of a meta artefact plays; ``seed`` is of the draws.
 
     A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
     """
@@ -66,7 +66,7 @@ def agent_of(artefact: Artefact, seed: int) -> OptionLoop:
         field.name: artefact.config[field.name] for field in fields(TrainMetaConfig) if field.name in artefact.config
     }
     settings |= {
-        "environments": 1,
+        "environments": environments,
         "replay": REPLAY,
         "decisions": 2,
         "save_visited": 0,

@@ -1,12 +1,13 @@
 """Options set up in a domain and trained for a number of steps: what ``train-options`` and ``train-meta`` share."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.config import as_dict
+from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
@@ -18,15 +19,17 @@ from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import STACK
 from hypogoal.options.initiation import Initiation
+from hypogoal.options.learner import Learner
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
+from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import learned_terminations, oracle_terminations
 from hypogoal.options.visited import Visited
 
 LOG_INTERVAL = 2_000  # environment steps
-LEARNERS: dict[str, type[LightLearner] | type[RecurrentLearner]] = {"light": LightLearner, "paper": RecurrentLearner}
+LEARNERS: dict[str, type[Learner]] = {"light": LightLearner, "paper": RecurrentLearner, "planned": PlannedLearner}
 
 
 def assemble(
@@ -46,8 +49,12 @@ def assemble(
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = _columns(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
-    arguments = domain.world(about["domain_config"]) | start_arguments(domain, config, options, seed)
+    arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
+    if config.cap:
+        if (shortest := engine.shortest_path()) is None:
+            raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
+        engine.max_steps = math.ceil(config.cap * shortest)
     if oracle:
         terminations = oracle_terminations(engine, columns)
     else:
@@ -73,6 +80,16 @@ def assemble(
         initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
+
+
+def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -> dict[str, Any]:
+    """The domain's settings that an ensemble's states were collected with, but for what ``config.world`` changes."""
+    changed = parse_assignments(config.world)
+    for name in changed:
+        if name not in domain.engine_settings:
+            known = ", ".join(domain.engine_settings) or "none"
+            raise UserError(f"{domain.name} has no such setting of its world", f"world={name}", f"It has {known}.")
+    return about["domain_config"] | domain.world(changed)
 
 
 def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
@@ -150,13 +167,15 @@ def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, che
             checkpoints.offer(state)
 
 
-def description(loop: OptionLoop, about: Mapping[str, Any], config: PlayConfig, **more: Any) -> dict[str, Any]:
+def description(
+    loop: OptionLoop, domain: Domain, about: Mapping[str, Any], config: PlayConfig, **more: Any
+) -> dict[str, Any]:
     """An artefact's configuration: the stage's, what it has of its ensemble's (``about``), and ``more``."""
     return as_dict(config) | {
         "sub_goals": about["sub_goals"],
         "members": loop.terminations.options // len(about["sub_goals"]),
         "domain": about["domain"],
-        "domain_config": about["domain_config"],
+        "domain_config": played_world(domain, about, config),
         **more,
         "setting": config.network,
     }

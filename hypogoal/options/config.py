@@ -13,9 +13,10 @@ class OptionConfig:
 
     network: str = setting(
         "light",
-        "Q-network: the paper's conv-GRU, or a small one on cells",
-        source="paper, appendix; light: ours",
-        choices=("light", "paper"),
+        "Q-network: the paper's conv-GRU, or a small one on cells; or planned: the shortest way, where an engine knows "
+        "what follows on each action",
+        source="paper, appendix; light, planned: ours",
+        choices=("light", "paper", "planned"),
     )
     experience: str = setting(
         "shared",

@@ -26,6 +26,9 @@ def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: 
             "termination=oracle",
             "Load options that were trained with learned members.",
         )
+    if config["network"] == "planned":
+        what = "planned options go by what follows in their domain's engine, which is not in the artefact"
+        raise UserError(what, "network=planned", "Load options that were learned.")
     shape = tuple(about["observation_shape"])
     options = len(config["sub_goals"]) * config["members"]
     last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"

@@ -56,7 +56,7 @@ def train_meta(
             loop.initiation.load(load_tensors(trained.path / "initiation.safetensors"))
         recorder.episodes[:] = read_episodes(trained.path / "episodes.csv")
         recorder.start_at(trained.config["steps"])
-    about = description(loop, source.config, config, options_steps=trained.config["steps"] if trained else 0)
+    about = description(loop, domain, source.config, config, options_steps=trained.config["steps"] if trained else 0)
     with create_artefact(
         out, kind="meta", config=about, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:

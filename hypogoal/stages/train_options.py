@@ -39,7 +39,7 @@ def train_options(
     loop = assemble(domain, source.path, source.config, config, seed, device)
     recorder = loop.recorder
     steps = config.steps * (loop.terminations.options if config.steps_for == "each" else 1)
-    about = description(loop, source.config, config, steps=steps)
+    about = description(loop, domain, source.config, config, steps=steps)
     with create_artefact(
         out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force, resume=resume
     ) as folder:

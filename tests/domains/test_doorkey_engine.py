@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,19 +65,20 @@ def count_events(seen: Counter[str], held: int, door: tuple[bool, bool], env: Do
     seen["in the doorway"] += env.grid.get(int(env.agent_pos[0]), int(env.agent_pos[1])) is env.door
 
 
-def play_side_by_side(layout_seed: int, keyring: bool, seen: Counter[str]) -> None:
+def play_side_by_side(layout_seed: int, keyring: bool, seen: Counter[str], wrong_key: str = "harmless") -> None:
     """One MiniGrid env and the engine (its other two envs doing something else), in step.
 
     Episodes begin on a shortest path: to the goal, then to the open door, in turn; they go on at random.
     """
     label = DOOR_LABELS[layout_seed % 2]
-    env = DoorKeyEnv(layout_seed=layout_seed, door_label=label, keyring=keyring, max_steps=MAX_STEPS)
-    engine = DoorKeyEngine(layout_seed, 3, door_label=label, keyring=keyring, max_steps=MAX_STEPS)
+    world: Any = {"door_label": label, "keyring": keyring, "wrong_key": wrong_key, "max_steps": MAX_STEPS}
+    env = DoorKeyEnv(layout_seed=layout_seed, **world)
+    engine = DoorKeyEngine(layout_seed, 3, **world)
     rng = np.random.default_rng(layout_seed)
     path: list[int] = []
     shortest = engine.shortest_path()
     if shortest is None:
-        assert not keyring
+        assert not keyring or wrong_key == "ends"
     else:
         path = shortest_actions(engine)
         assert len(path) == shortest
@@ -97,6 +99,7 @@ def play_side_by_side(layout_seed: int, keyring: bool, seen: Counter[str]) -> No
         assert engine.labels(step.next_ids)[0].tolist() == list(info["labels"].values())
         if terminated or truncated:
             seen["terminated"] += terminated
+            seen["a wrong key"] += terminated and not reward
             seen["truncated"] += truncated
             image, _ = env.reset()
             script = list(next(scripts))
@@ -125,6 +128,45 @@ def test_engines_are_exact_to_minigrid(keyring: bool) -> None:
     assert seen["hold 1"] >= 100
     assert (seen["hold 2"] >= 100 and seen["hold 3"] >= 50) is keyring
     assert seen["hold 2"] + seen["hold 3"] > 0 or not keyring
+
+
+@pytest.mark.parametrize("keyring", [True, False])
+def test_wrong_keys_end_episodes(keyring: bool) -> None:
+    """Spec H2: in the environment and in the engine, at every step; the goal and the limit still end some."""
+    seen: Counter[str] = Counter()
+    for layout_seed in LAYOUTS[:15]:
+        play_side_by_side(layout_seed, keyring, seen, "ends")
+    assert seen["a wrong key"] >= 5
+    assert seen["terminated"] - seen["a wrong key"] >= 5
+    assert seen["hold 2"] == seen["hold 3"] == 0 or keyring  # the red key first, then a wrong one
+
+
+def test_nothing_is_beyond_a_wrong_key() -> None:
+    """Spec H2: the shortest path holds the red key alone, and random play succeeds less often."""
+    for layout_seed in range(20):
+        plain, harsh = DoorKeyEngine(layout_seed, 1), DoorKeyEngine(layout_seed, 1, wrong_key="ends")
+        ids = harsh.distances()[0]
+        held = harsh.origins(ids[harsh.at_goal(ids)])["keys_held"]
+        assert (held == 4).all()
+        assert len(ids) < len(plain.distances()[0])
+        shortest, before = harsh.shortest_path(), plain.shortest_path()
+        assert shortest is None or (before is not None and shortest >= before)
+    rng = np.random.default_rng(0)
+    assert harsh.random_success(300, rng) < plain.random_success(300, rng)
+
+
+def test_the_plan_is_what_follows() -> None:
+    """Spec H3: every state and action of the plan, stepped; nothing follows where an episode ends."""
+    engine = DoorKeyEngine(5, 1, wrong_key="ends")
+    ids, actions, following, final, solved = engine.plan()
+    assert set(following.ravel().tolist()) <= set(ids.tolist())
+    for column, action in enumerate(actions.tolist()):
+        expected = engine.follow(ids[~final], np.full((~final).sum(), action))
+        assert np.array_equal(following[~final, column], expected)
+    assert (following[final] == ids[final][:, None]).all()
+    labels = engine.labels(ids)
+    assert np.array_equal(final, labels[:, 4] | labels[:, 0] | labels[:, 1])
+    assert np.array_equal(solved, labels[:, 4])
 
 
 def test_an_engine_of_many_is_many_engines_of_one() -> None:

@@ -1,12 +1,14 @@
 """Ways to play and learn options, each of them small: light and paper's, shared and own experience, every chooser."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import corridor_env
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.meta import training
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
@@ -39,6 +41,7 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
     "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
+    "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
     "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
 }
 

@@ -1,0 +1,302 @@
+"""What choosing is worth: how good options are, whether the better one is taken, and chance among the same (Spec H2).
+
+An option is good where its execution brings about the true sub-goal; how well its classifier matches the truth on all
+states says little of that. Choice is judged among the members of the sub-goal that was chosen, since which sub-goal is
+due is another matter. The control has the agent's own final options and picks one of those offered at random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import load_domain
+from hypogoal.evaluation import page
+from hypogoal.evaluation.curves import LEARNED, base_name
+from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of, rows_of_options
+from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.selection import rank_correlation
+
+if TYPE_CHECKING:
+    from hypogoal.evaluation.judging import Work
+    from hypogoal.options.loop import OptionLoop
+
+STEPS, ENVIRONMENTS = 8_000, 16  # played by the agent, and as many by chance
+LEAST = 20.0  # expected choices of a member, below which its preference is not told
+DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to choose
+NEAR = 1.5  # times the shortest path
+OF_PLAY = ("success", "near", "length")
+OF_CHOICE = ("within_rho", "pair", "score")
+TITLE = "What choosing is worth"
+
+
+@dataclass(frozen=True)
+class Choices:
+    """D decisions: the states int64 (D,), the options chosen int64 (D,), and those offered, bool (D, O)."""
+
+    states: NDArray[np.int64]
+    options: NDArray[np.int64]
+    offered: NDArray[np.bool_]
+
+
+def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choices]:
+    """Let an agent play; nothing is learned, options are greedy and choices are drawn as in training.
+
+    Returns:
+        Over whole episodes: ``success`` (share solved), ``near`` (share solved within 1.5 times the layout's shortest
+        path), ``length`` (mean steps); and the decisions.
+    """
+    from hypogoal.options.choosers import Chooser  # with PyTorch, which a report needs not
+
+    heard: list[tuple[NDArray[Any], ...]] = []
+    inner = loop.chooser
+
+    class Heard(Chooser):
+        def choose(
+            self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+        ) -> NDArray[np.int64]:
+            chosen = inner.choose(environments, ids, offered)
+            heard.append((ids.copy(), chosen.copy(), offered.copy()))
+            return chosen
+
+    loop.chooser = Heard()
+    first, end = len(loop.recorder.episodes), loop.recorder.steps + steps
+    while loop.recorder.steps < end:
+        loop.advance(explore=False)
+    loop.chooser = inner
+    episodes = loop.recorder.episodes[first:]
+    solved = np.array([terminated and reward > 0 for _, _, reward, terminated in episodes], dtype=np.bool_)
+    lengths, shortest = np.array([row[1] for row in episodes], dtype=np.float64), loop.engine.shortest_path()
+    near = solved & (lengths <= NEAR * shortest) if shortest else np.full(len(solved), np.nan)
+    played = {"success": mean_of(solved), "near": mean_of(near), "length": mean_of(lengths)}
+    return played, Choices(*(np.concatenate(column) for column in zip(*heard, strict=True)))
+
+
+def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How often each option's greedy execution brings about its true sub-goal, the episode not lost.
+
+    Args:
+        loop: an agent whose policies remember nothing, in an engine that knows what follows.
+        goals: int64 (O,), the column of the engine's labels that each option's true sub-goal is.
+        states: int64 (D,), in which executions begin, each as often as it is there: an option's where it is offered,
+            its sub-goal does not hold, and can be had within the timeout.
+
+    Returns:
+        float64 (O,); NaN for an option that begins nowhere.
+    """
+    from hypogoal.options.planned import distances
+
+    plan = loop.engine.plan()
+    assert plan is not None
+    place = np.full(loop.engine.n_states, -1, dtype=np.int64)
+    place[plan.ids] = np.arange(len(plan.ids))
+    truth = loop.engine.labels(plan.ids)
+    away = distances(truth, place[plan.following], plan.final)
+    column = np.full(loop.engine.n_actions, -1, dtype=np.int64)
+    column[plan.actions] = np.arange(len(plan.actions))
+    lost = plan.final & ~plan.solved
+    distinct, counts = np.unique(states, return_counts=True)
+    offered = ~loop.terminations.of(distinct)
+    found = np.full(len(goals), np.nan)
+    for option, goal in enumerate(goals.tolist()):
+        steps = away[place[distinct], goal]
+        begins = offered[:, option] & (steps > 0) & (steps <= loop.config.option_timeout)
+        if not begins.any():
+            continue
+        ids, going = distinct[begins], np.arange(begins.sum())
+        for age in range(loop.config.option_timeout):
+            options = np.full(len(going), option)
+            actions = loop.learner.act(ids[going], options, np.full(len(going), age), explore=False)
+            ids[going] = plan.following[place[ids[going]], column[actions]]
+            over = loop.terminations.of_running(ids[going], options) | plan.final[place[ids[going]]]
+            going = going[~over]
+            if not len(going):
+                break
+        rows = place[ids]
+        found[option] = np.average(truth[rows, goal] & ~lost[rows], weights=counts[begins])
+    return found
+
+
+def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
+    """Whether the better members are taken, where at least two members of the chosen sub-goal were offered.
+
+    Args:
+        choices: the decisions.
+        quality: float (G*K,), see :func:`qualities`; NaN where it is not known.
+        members: K.
+
+    Returns:
+        ``preference`` (G*K,): chosen / expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected;
+        ``within_rho``: Spearman's rho of the two, mean over sub-goals whose members' qualities differ by
+        ``DIFFERENCE``; ``pair``: of two members offered whose qualities differ by that, how often the better of those
+        taken (chance .5); ``score``: (quality taken - mean quality) / (best - mean), over decisions (chance 0).
+    """
+    options = np.arange(len(quality))
+    of_goal = choices.offered & (options // members == (choices.options // members)[:, None])
+    several = of_goal.sum(axis=1) > 1
+    taken, among = choices.options[several], of_goal[several]
+    expected = (among / among.sum(axis=1, keepdims=True)).sum(axis=0)
+    chosen = np.bincount(taken, minlength=len(quality))
+    preference = np.where(expected >= LEAST, chosen / np.maximum(expected, 1e-12), np.nan)
+    rhos, better, worse = [], 0, 0
+    for goal in range(len(quality) // members):
+        own = slice(goal * members, (goal + 1) * members)
+        known = ~np.isnan(quality[own]) & ~np.isnan(preference[own])
+        if known.sum() > 1 and np.ptp(quality[own][known]) >= DIFFERENCE:
+            rhos.append(rank_correlation(quality[own][known], preference[own][known]))
+        for one, other in combinations(options[own].tolist(), 2):
+            if abs(quality[one] - quality[other]) >= DIFFERENCE:
+                good, bad = (one, other) if quality[one] > quality[other] else (other, one)
+                both = among[:, one] & among[:, other]
+                better, worse = better + int((taken[both] == good).sum()), worse + int((taken[both] == bad).sum())
+    values = np.where(among & ~np.isnan(quality), quality, np.nan)
+    rows = (~np.isnan(values)).sum(axis=1) > 1
+    rows[rows] = ~np.isnan(quality[taken[rows]])
+    values, got = values[rows], quality[taken[rows]]
+    mean, best = (np.nanmean(values, axis=1), np.nanmax(values, axis=1)) if rows.any() else (got, got)
+    gain = float((best - mean).sum())
+    return {
+        "preference": preference,
+        "within_rho": mean_of([rho for rho in rhos if not math.isnan(rho)]),
+        "pair": better / (better + worse) if better + worse else math.nan,
+        "score": float((got - mean).sum()) / gain if gain > 0 else math.nan,
+    }
+
+
+def numbers(work: Work) -> dict[str, Any]:
+    """Every run of an agent that chooses by PPO among members' options, in a domain that knows what follows."""
+    from hypogoal.meta.episodes import agent_of  # with PyTorch, which a report needs not
+    from hypogoal.options.choosers import RandomChooser
+
+    artefacts = {work.contents.name(artefact): artefact for artefact in work.contents.agents}
+    metrics = []
+    for agent in work.metrics["agents"]:
+        rows = []
+        for about in agent["runs"]:
+            artefact = artefacts[about["path"]]
+            config = artefact.config
+            if base_name(artefact.kind, config) != LEARNED or config["network"] == "paper":
+                continue
+            domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)
+            if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(domain.sub_goals):
+                continue
+            goals = np.repeat([domain.sub_goals.index(goal) for goal in config["sub_goals"]], config["members"])
+            played, choices = play(loop)
+            quality = qualities(loop, goals, choices.states)
+            row = {name: about[name] for name in ("path", "seed", "layout_seed")} | played
+            judged = judge(choices, quality, config["members"])
+            row["members"] = [
+                {
+                    "sub_goal": config["sub_goals"][option // config["members"]],
+                    "member": option % config["members"],
+                    "quality": float(quality[option]),
+                    "conditional_preference": float(judged["preference"][option]),
+                }
+                for option in range(len(quality))
+            ]
+            row |= {name: judged[name] for name in OF_CHOICE}
+            loop.chooser = RandomChooser(rng_for(about["seed"], "uniform-choice"))
+            played, choices = play(loop)
+            judged = judge(choices, quality, config["members"])
+            row["uniform"] = played | {name: judged[name] for name in OF_CHOICE}
+            rows.append(row)
+        if rows:
+            metrics.append({"name": agent["name"], "runs": rows, **_over_runs(agent["name"], rows)})
+    return {"choosing": metrics}
+
+
+def _over_runs(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    units = {"length": "steps", "within_rho": "Spearman's rho", "score": "ratio"}
+    layouts = [row["layout_seed"] for row in rows]
+    found: dict[str, Any] = {"uniform": {}}
+    for quantity in (*OF_PLAY, *OF_CHOICE):
+        unit = units.get(quantity, "fraction")
+        found[quantity] = over([row[quantity] for row in rows], unit, name, quantity, strata=layouts)
+        values = [row["uniform"][quantity] for row in rows]
+        found["uniform"][quantity] = over(values, unit, name, "uniform", quantity, strata=layouts)
+    return found
+
+
+def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
+    """Of every run the agent's, chance's, and every member's."""
+    for agent in metrics["choosing"]:
+        for run in agent["runs"]:
+            about = {"layout": run["layout_seed"], "seed": run["seed"], "artefact": run["path"]}
+            values = {name: run[name] for name in (*OF_PLAY, *OF_CHOICE)}
+            yield from rows_of(values, method=agent["name"], scope=FROZEN, **about)
+            chance = {name: run["uniform"][name] for name in values}
+            yield from rows_of(chance, method=UNIFORM, scope=FROZEN, **about)
+            for member in run["members"]:
+                goal = {"sub_goal": member["sub_goal"]}
+                numbers = [{name: value for name, value in member.items() if name != "sub_goal"}]
+                yield from rows_of_options(numbers, method=agent["name"], scope=FROZEN, **about, **goal)
+
+
+FROZEN = "frozen"  # in numbers.csv: played after training
+UNIFORM = "uniform among its own options"
+COLUMNS = (
+    page.label("chooser", "chooser"),
+    page.number("solved", "success", page.spread, 2),
+    page.number("within 1.5 shortest paths", "near", page.spread, 2),
+    page.number("steps", "length", page.spread, 1),
+    page.number("within-rho", "within_rho", page.spread, 2),
+    page.number("better of two", "pair", page.spread, 2),
+    page.number("score", "score", page.spread, 2),
+    page.number("runs", "success.n"),
+)
+MEMBERS = (
+    page.label("sub-goal", "sub_goal", once=True),
+    page.number("member", "member"),
+    page.number("quality", "quality", page.fixed, 2),
+    page.number("preference among its sub-goal's", "conditional_preference", page.fixed, 2),
+)
+
+
+def sections(material: Material) -> list[Block]:
+    """The table, and the members of the first run."""
+    agents = material.metrics.get("choosing", [])
+    if not agents:
+        return []
+    table = [
+        entry
+        for agent in agents
+        for entry in ({**agent, "chooser": agent["name"]}, {**agent["uniform"], "chooser": UNIFORM})
+    ]
+    text = (
+        "The trained agent plays on, frozen, and so does chance with the agent's own final options. An option's "
+        "quality is the share of its executions that bring about the true sub-goal, begun where agents decide. Choice "
+        "is judged among the members of the sub-goal that was chosen: the rank correlation of preference with quality, "
+        "how often the better of two that differ by .2 is taken (chance .5), and how much of the way from the mean to "
+        "the best quality it goes (chance 0)."
+    )
+    blocks = [
+        page.table(COLUMNS, table, main=lambda entry: entry["chooser"] == LEARNED),
+        page.table(MEMBERS, agents[0]["runs"][0]["members"], folded=f"Members of {agents[0]['runs'][0]['path']}"),
+    ]
+    return [page.section("choosing", TITLE, [text], blocks)]
+
+
+QUESTION = Question(
+    numbers=numbers,
+    rows=rows,
+    sections=sections,
+    meanings={
+        "near": ("fraction", "share of episodes solved within 1.5 times the layout's shortest path"),
+        "quality": (
+            "fraction",
+            "share of an option's greedy executions that bring about the true sub-goal, the episode not lost; begun "
+            "where the agent decides, the option is offered and the sub-goal can be had within its timeout",
+        ),
+        "conditional_preference": ("ratio", "chosen / expected among the members offered of the chosen sub-goal"),
+        "within_rho": ("Spearman's rho, -1..1", "of quality and conditional preference, mean over sub-goals"),
+        "pair": ("fraction", "how often the better of two members is taken, whose qualities differ by .2; chance .5"),
+        "score": ("ratio", "(quality taken - mean quality offered) / (best - mean); chance 0"),
+    },
+)

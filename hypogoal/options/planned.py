@@ -1,0 +1,102 @@
+"""Options that are planned and not learned: the shortest way to where each member says yes, exactly (Spec H3).
+
+Where an engine knows what follows on each action, what an option does is a matter of its sub-goal alone. So an agent
+whose options are planned shows what its hypotheses are worth, whatever option learning makes of them.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.termination import Terminations
+
+FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
+
+
+class PlannedLearner(Learner):
+    """Every option goes the shortest way to its own sub-goal; of equally short ones it takes the first action.
+
+    Arguments as of :class:`Learner`. Where no way leads to its sub-goal it plays the first action.
+
+    Attributes:
+        steps: int32 (N, O), how many steps each option's sub-goal is away from each state of the plan.
+
+    Raises:
+        UserError: nobody knows what follows in this engine.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        terminations: Terminations,
+        config: OptionConfig,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ):
+        super().__init__(engine, terminations, config, seed, device)
+        plan = engine.plan()
+        if plan is None:
+            what = "nobody knows what follows on each action in this domain"
+            raise UserError(what, "network=planned", "Give --set network=light.")
+        self.actions = plan.actions
+        self._place = np.full(engine.n_states, -1, np.int64)
+        self._place[plan.ids] = np.arange(len(plan.ids))
+        self._after = self._place[plan.following]
+        self.steps = distances(terminations.of(plan.ids), self._after, plan.final)
+
+    @staticmethod
+    def reach(config: OptionConfig, options: int) -> int:
+        return 0
+
+    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+        ahead = self.steps[self._after[self._place[ids]], options[:, None]]
+        nearest: NDArray[np.int64] = ahead.argmin(axis=1)
+        return nearest
+
+    def act(
+        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+    ) -> NDArray[np.int64]:
+        """There is nothing to explore."""
+        return self.actions[self.greedy(ids, options, age)]
+
+    def observe(self, moved: Transitions) -> None:
+        """Only counted."""
+        reached = self.terminations.of_running(moved.next_ids, moved.options)
+        np.add.at(self.positives, moved.options[reached], 1)
+        self.count(moved.options)
+
+    def learn(self) -> dict[str, float]:
+        return {}
+
+    def weights(self) -> dict[str, Tensor]:
+        return {}
+
+    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """There are none."""
+
+
+def distances(reached: NDArray[np.bool_], after: NDArray[np.int64], final: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Breadth-first search from all sub-goals at once, against the direction of time.
+
+    Args:
+        reached: bool (N, O), each option's sub-goal holds in a state.
+        after: int64 (N, A), the state after each action.
+        final: bool (N,), nothing follows a state.
+
+    Returns:
+        int32 (N, O), steps to the sub-goal; 0 where it holds, ``FAR`` where no way leads there.
+    """
+    steps = np.where(reached, 0, FAR).astype(np.int32)
+    going = np.flatnonzero(~final)
+    while True:
+        nearer = np.minimum(steps[going], steps[after[going]].min(axis=1) + 1)
+        if (nearer >= steps[going]).all():
+            return np.minimum(steps, FAR)
+        steps[going] = nearer

@@ -1,0 +1,122 @@
+"""What choosing is worth, on planted members whose worth is known (Spec H2, H3)."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.evaluation.choosing import Choices, judge, play, qualities
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.choosers import Chooser, RandomChooser
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.planned import PlannedLearner
+from hypogoal.options.recording import Recorder
+from hypogoal.options.termination import Terminations
+
+MEMBERS, GOALS = 3, np.repeat(np.arange(5), 3)
+RIGHT = [0, 3, 6, 9, 12]  # the first member of every sub-goal knows it
+
+
+def planted(engine: DoorKeyEngine) -> Terminations:
+    """Fifteen hypotheses that agree where the agent holds one key at a time, in the order blue, green, red, on one
+    layout: keys by colour, by the cell that is empty, by how many are gone; wrong doors and wrong goals.
+    """
+    cells = np.array(engine.layout.keys)[[1, 2, 0]]  # each key's "own" cell is another's
+
+    def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        labels, origins = engine.labels(ids), engine.origins(ids)
+        empty = ~((engine.codes(ids)[:, cells] >= 3) & (engine.codes(ids)[:, cells] < 6))
+        gone = labels[:, :3].sum(axis=1)[:, None] > np.arange(3)
+        x, y = origins["agent_x"], origins["agent_y"]
+        near_door = np.abs(y * 8 + x - engine.layout.door) == 1
+        columns = [np.stack([labels[:, key], empty[:, key], gone[:, key]], axis=1) for key in range(3)]
+        columns.append(np.stack([labels[:, 3], near_door, labels[:, 2]], axis=1))
+        columns.append(np.stack([labels[:, 4], (x == 1) & (y == 1), (x == 1) & (y == 6)], axis=1))
+        return np.concatenate(columns, axis=1)
+
+    return Terminations(classify, 15)
+
+
+def agent(layout_seed: int, steps: int) -> OptionLoop:
+    """PPO over planned options of planted members, in a world where a wrong key ends the episode."""
+    engine = DoorKeyEngine(layout_seed, 16, wrong_key="ends")
+    shortest = engine.shortest_path()
+    assert shortest is not None
+    engine.max_steps = 3 * shortest
+    config = TrainMetaConfig(network="planned")
+    terminations = planted(engine)
+    learner = PlannedLearner(engine, terminations, config, seed=0)
+    loop = OptionLoop(
+        engine, terminations, learner, MetaPolicy(engine, 15, config, 0), Recorder(15, engine), config, config.gamma
+    )
+    while loop.recorder.steps < steps:
+        loop.step()
+    return loop
+
+
+def test_the_agent_finds_the_planted_truth() -> None:
+    """Spec H2: it solves the task, chance among its own options does not; of two members it takes the better."""
+    loop = agent(220, 40_000)
+    played, choices = play(loop, 4_000)
+    quality = qualities(loop, GOALS, choices.states)
+    judged = judge(choices, quality, MEMBERS)
+    loop.chooser = RandomChooser(rng_for(0, "uniform"))
+    chance, at_random = play(loop, 4_000)
+    assert played["success"] >= 0.95
+    assert chance["success"] <= 0.15
+    assert judged["pair"] >= 0.9
+    assert judged["score"] >= 0.65
+    by_chance = judge(at_random, qualities(loop, GOALS, at_random.states), MEMBERS)
+    assert abs(by_chance["pair"] - 0.5) < 0.15
+    assert abs(by_chance["score"]) < 0.15
+
+
+def test_right_members_have_quality_one() -> None:
+    """Where their sub-goal can be had within the timeout and no other key comes into their way."""
+    engine = DoorKeyEngine(220, 1)
+    terminations = planted(engine)
+    config = TrainMetaConfig(network="planned")
+    learner = PlannedLearner(engine, terminations, config, seed=0)
+    loop = OptionLoop(engine, terminations, learner, Silent(), Recorder(15, engine), config, config.gamma)
+    quality = qualities(loop, GOALS, engine.reachable())
+    assert (quality[RIGHT] == 1).all()
+    assert (np.delete(quality, RIGHT) < 1).all()
+
+
+class Silent(Chooser):
+    """Never asked."""
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        raise NotImplementedError
+
+
+def decisions(options: list[int], offered: list[list[int]], count: int) -> Choices:
+    allowed = np.zeros((len(options), count), np.bool_)
+    for row, some in enumerate(offered):
+        allowed[row, some] = True
+    return Choices(np.zeros(len(options), np.int64), np.array(options), allowed)
+
+
+def test_choices_by_hand() -> None:
+    """Two sub-goals of two members: 60 decisions for the first, 45 of them for the better; one choice is none."""
+    quality = np.array([0.9, 0.1, 0.5, 0.6])
+    judged = judge(decisions([0] * 45 + [1] * 15 + [2] * 9, [[0, 1, 2]] * 60 + [[2, 0]] * 9, 4), quality, 2)
+    assert judged["preference"][:2].tolist() == [1.5, 0.5]
+    assert np.isnan(judged["preference"][2:]).all()
+    assert judged["within_rho"] == pytest.approx(1.0)
+    assert judged["pair"] == 0.75
+    assert judged["score"] == pytest.approx((45 * 0.4 - 15 * 0.4) / (60 * 0.4))
+
+
+def test_what_nobody_knows_is_left_out() -> None:
+    """A member whose quality is not known is neither better nor worse than another."""
+    judged = judge(decisions([0] * 50, [[0, 1]] * 50, 2), np.array([0.9, math.nan]), 2)
+    assert math.isnan(judged["pair"])
+    assert math.isnan(judged["score"])
+    assert math.isnan(judged["within_rho"])
