@@ -20,7 +20,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, base_name
-from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of, rows_of_options
+from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.selection import rank_correlation
 
@@ -218,9 +218,9 @@ def _over_runs(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {"uniform": {}}
     for quantity in (*OF_PLAY, *OF_CHOICE):
         unit = units.get(quantity, "fraction")
-        found[quantity] = over([row[quantity] for row in rows], unit, name, quantity, strata=layouts)
+        found[quantity] = over([row[quantity] for row in rows], unit, name, quantity, layouts=layouts)
         values = [row["uniform"][quantity] for row in rows]
-        found["uniform"][quantity] = over(values, unit, name, "uniform", quantity, strata=layouts)
+        found["uniform"][quantity] = over(values, unit, name, "uniform", quantity, layouts=layouts)
     return found
 
 
@@ -234,9 +234,9 @@ def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
             chance = {name: run["uniform"][name] for name in values}
             yield from rows_of(chance, method=UNIFORM, scope=FROZEN, **about)
             for member in run["members"]:
-                goal = {"sub_goal": member["sub_goal"]}
-                numbers = [{name: value for name, value in member.items() if name != "sub_goal"}]
-                yield from rows_of_options(numbers, method=agent["name"], scope=FROZEN, **about, **goal)
+                place = {"sub_goal": member["sub_goal"], "member": member["member"]}
+                values = {name: member[name] for name in ("quality", "conditional_preference")}
+                yield from rows_of(values, method=agent["name"], scope=FROZEN, **place, **about)
 
 
 FROZEN = "frozen"  # in numbers.csv: played after training
