@@ -16,6 +16,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +31,11 @@ from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, member_scores
+from hypogoal.hypotheses.thresholds import unlabelled_split
 from hypogoal.hypotheses.training import fit
 
 Probabilities = NDArray[np.float64]  # of one member
-Rule = Callable[[Probabilities, Probabilities, Probabilities], float]  # labelled positives, negatives, unlabelled
+Rule = Callable[[Any, Any, Any], float | np.floating]  # labelled positives, negatives, unlabelled
 LOOKS = (150, 600)
 TRAINED = ("dbat", "none", "dbat-unpaired")
 KEYS = ("layouts", "method", "sub_goal", "seed", "step", "member")
@@ -56,16 +58,6 @@ def adjusted(positives: Probabilities, negatives: Probabilities, unlabelled: Pro
     return 1 - share
 
 
-def split(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> float:
-    """Otsu (1979): the cut of the unlabelled logits into two classes that leaves least variance within them."""
-    logits = np.sort(logit(unlabelled.clip(1e-12, 1 - 1e-12)))
-    below = np.arange(1, len(logits))
-    sums = logits.cumsum()[:-1]
-    between = (sums / below - (logits.sum() - sums) / (len(logits) - below)) ** 2 * below * (len(logits) - below)
-    cut = logits[between.argmax() : between.argmax() + 2].mean()
-    return float(expit(cut))
-
-
 def margin(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> float:
     """Half-way, in logits, between the median positive and the median unlabelled state."""
     middle = [np.median(logit(states.clip(1e-12, 1 - 1e-12))) for states in (positives, unlabelled)]
@@ -78,7 +70,7 @@ RULES: dict[str, Rule] = {
     "unlabelled-q80": lambda positives, negatives, unlabelled: float(np.quantile(unlabelled, 0.8, method="higher")),
     "base-rate": base_rate,
     "adjusted": adjusted,
-    "split": split,
+    "split": unlabelled_split,
     "margin": margin,
     "positives-median": lambda positives, negatives, unlabelled: float(np.median(positives)),
     "positives-q05": lambda positives, negatives, unlabelled: float(np.quantile(positives, 0.05, method="lower")),

@@ -99,10 +99,10 @@ class EnsembleConfig:
     )
     threshold: str = setting(
         "0.5",
-        "a member says yes above 0.5; where it does to 5 % of the unlabelled states; where it does to as large a share "
-        "of them as of the labelled states are positives",
-        source=BEYOND,
-        choices=("0.5", "unlabelled-q95", "base-rate"),
+        "a member says yes above 0.5; to 5 % of the unlabelled states; or above the cut that best parts the unlabelled "
+        "states in two",
+        source=f"{BEYOND}; unlabelled-split: Otsu 1979",
+        choices=("0.5", "unlabelled-q95", "unlabelled-split"),
     )
 
 

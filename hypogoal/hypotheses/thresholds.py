@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 PAPER = "0.5"
+CERTAIN = 1e-12  # probabilities nearer to 0 or 1 are taken as this near
 Probabilities = NDArray[np.float32]  # (states,), one member's
 Rule = Callable[[Probabilities, Probabilities, Probabilities], np.floating]
 
@@ -27,12 +28,20 @@ def _unlabelled_q95(positives: Probabilities, negatives: Probabilities, unlabell
     return np.quantile(unlabelled, 0.95, method="higher")
 
 
-def _base_rate(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Yes to as large a share of the unlabelled states as of the labelled ones are positives."""
-    return np.quantile(unlabelled, len(negatives) / (len(positives) + len(negatives)), method="higher")
+def unlabelled_split(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
+    """Otsu (1979): the cut of the unlabelled states' logits into two classes that leaves least variance within them."""
+    probabilities = np.sort(unlabelled.astype(np.float64).clip(CERTAIN, 1 - CERTAIN))
+    logits = np.log(probabilities) - np.log1p(-probabilities)
+    if len(logits) < 2:
+        return np.float64(0.5)
+    below = np.arange(1, len(logits))
+    sums = logits.cumsum()[:-1]
+    apart = sums / below - (logits.sum() - sums) / (len(logits) - below)
+    cut = (apart**2 * below * (len(logits) - below)).argmax()
+    return np.float64(1 / (1 + np.exp(-logits[cut : cut + 2].mean())))
 
 
-RULES: dict[str, Rule] = {PAPER: _half, "unlabelled-q95": _unlabelled_q95, "base-rate": _base_rate}
+RULES: dict[str, Rule] = {PAPER: _half, "unlabelled-q95": _unlabelled_q95, "unlabelled-split": unlabelled_split}
 
 
 def thresholds(

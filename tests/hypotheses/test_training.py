@@ -300,11 +300,9 @@ def test_thresholds_are_the_unlabelled_quantile() -> None:
     says_yes = ensemble.verdicts(unlabelled).mean(axis=0)
     assert (says_yes <= 0.05).all()
     assert (says_yes > 0).all()
-    rate = fit(observations, labels, unlabelled, dataclasses.replace(config, threshold="base-rate"), seed=0)
-    above = rate.verdicts(unlabelled).mean(axis=0)
-    at_least = (rate.predict(unlabelled) >= rate.thresholds.numpy()).mean(axis=0)  # with those at the edge
-    assert (above <= labels.mean()).all()
-    assert (at_least >= labels.mean()).all()
+    split = fit(observations, labels, unlabelled, dataclasses.replace(config, threshold="unlabelled-split"), seed=0)
+    says_yes = split.verdicts(unlabelled).mean(axis=0)
+    assert ((says_yes > 0) & (says_yes < 1)).all()
     half = fit(observations, labels, unlabelled, dataclasses.replace(config, threshold="0.5"), seed=0)
     np.testing.assert_array_equal(half.verdicts(unlabelled), half.predict(unlabelled) > 0.5)
     np.testing.assert_array_equal(half.predict(unlabelled), ensemble.predict(unlabelled))
@@ -321,12 +319,23 @@ def test_quantiles_by_hand() -> None:
     assert (probabilities > found).sum(axis=0).tolist() == [4, 0, 100]
 
 
-def test_base_rate_by_hand() -> None:
-    """One of four labelled states is positive, so a quarter of the unlabelled ones gets a yes, but for the edge."""
-    elsewhere = np.random.default_rng(0).permutation((np.arange(100) / 100).astype(np.float32))[:, None]
-    found = thresholds("base-rate", np.zeros((4, 1), np.float32), np.array([False, True, False, False]), elsewhere)
-    np.testing.assert_allclose(found, [0.75])
-    assert (elsewhere > found).sum() == 24
+def test_the_split_by_hand() -> None:
+    """Ten states about -4 and thirty about 3, in logits: the cut is half-way between the nearest two of them."""
+    rng = np.random.default_rng(0)
+    logits = np.concatenate([np.linspace(-5, -3, 10), np.linspace(2, 4, 30)])
+    elsewhere = (1 / (1 + np.exp(-rng.permutation(logits)))).astype(np.float32)[:, None]
+    found = thresholds("unlabelled-split", elsewhere[:2], np.array([True, False]), elsewhere)
+    np.testing.assert_allclose(np.log(found / (1 - found)), [-0.5], atol=1e-4)
+    assert (elsewhere > found).sum() == 30
+
+
+def test_a_split_of_states_that_are_all_alike() -> None:
+    """No warning and no NaN: certain members, equal ones, a single state."""
+    certain = np.ones((5, 1), np.float32)
+    with np.errstate(all="raise"):
+        for elsewhere in (certain, certain * 0, certain * 0.3, certain[:1]):
+            found = thresholds("unlabelled-split", certain[:2], np.array([True, False]), elsewhere)
+            assert 0 <= found[0] < 1
 
 
 def test_every_rule_is_a_setting() -> None:
