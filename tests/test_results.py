@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import hypotheses, labels, ladders, thresholds
+from benchmarks import choosing, hypotheses, labels, ladders, thresholds
 from benchmarks.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
+    "choosing-doorkey": choosing.tables,
     "hypotheses-doorkey": hypotheses.tables,
     "hypotheses-ladders": ladders.tables,
     "labels-doorkey": labels.tables,

@@ -1,0 +1,117 @@
+"""What choosing is worth, from the numbers of a sweep: the rows behind the result, and its tables.
+
+hypogoal sweep examples/choosing.toml --out runs/choosing
+python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
+python -m benchmarks.choosing --tables docs/results/choosing-doorkey.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cells import interval, table
+from hypogoal.evaluation.choosing import FROZEN, OF_CHOICE, OF_PLAY, UNIFORM
+
+METHODS = {"dbat": "D-BAT, K = 6", "none": "no diversity, K = 6", "one": "one classifier, K = 1"}
+COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
+SHOWN = {
+    "success": "solved",
+    "near": "within 1.5 shortest paths",
+    "within_rho": "within-rho",
+    "pair": "better of two",
+    "score": "score",
+}
+
+
+def collect(run: Path, path: Path) -> None:
+    """Take what the evaluation says of frozen agents and of chance: a row per layout and number."""
+    with (run / "evaluation" / "numbers.csv").open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["scope"] == FROZEN and not row["sub_goal"]]
+    kept = []
+    for row in rows:
+        method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
+        chooser = "uniform" if row["method"] == UNIFORM else "agent"
+        value = f"{float(row['value']):.4f}"
+        kept.append((method, row["layout"], row["seed"], chooser, row["quantity"], value))
+    order = {name: place for place, name in enumerate((*METHODS, "agent", "uniform", *OF_PLAY, *OF_CHOICE))}
+    kept.sort(key=lambda row: (order[row[0]], int(row[1]), order[row[3]], order[row[4]]))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(kept)
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the rows say, as lines of Markdown."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    layouts = list(dict.fromkeys(row["layout"] for row in rows))
+
+    def of(method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
+        found = {
+            row["layout"]: float(row["value"])
+            for row in rows
+            if (row["method"], row["chooser"], row["quantity"]) == (method, chooser, quantity)
+        }
+        return np.array([found.get(layout, np.nan) for layout in layouts])
+
+    yield f"Mean over {len(layouts)} layouts and Student's 95 % interval; of choices, where they are defined."
+    yield ""
+    yield from table(
+        ["", "chooser", *SHOWN.values(), "layouts with 95 % solved"],
+        (
+            [
+                title,
+                "agent" if chooser == "agent" else UNIFORM,
+                *(_mean(of(method, chooser, quantity)) for quantity in SHOWN),
+                f"{(of(method, chooser, 'success') >= 0.95).sum()} of {len(layouts)}",
+            ]
+            for method, title in METHODS.items()
+            for chooser in ("agent", "uniform")
+        ),
+    )
+    yield "Share of episodes solved, layout by layout: the agent / chance among its own options."
+    yield ""
+    yield from table(
+        ["", *layouts],
+        (
+            [
+                title,
+                *(
+                    f"{agent:.2f} / {chance:.2f}"
+                    for agent, chance in zip(
+                        of(method, "agent", "success"), of(method, "uniform", "success"), strict=True
+                    )
+                ),
+            ]
+            for method, title in METHODS.items()
+        ),
+    )
+
+
+def _mean(values: NDArray[np.float64]) -> str:
+    known = values[~np.isnan(values)]
+    few = f" (n = {len(known)})" if len(known) < len(values) else ""
+    return f"{interval(known, 2)}{few}"
+
+
+def main() -> None:
+    """Take the numbers of a run, or draw the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
+    parser.add_argument("csv", type=Path, help="the file of rows")
+    parser.add_argument("--tables", action="store_true", help="print the tables only")
+    arguments = parser.parse_args()
+    if not arguments.tables:
+        collect(arguments.run, arguments.csv)
+    print("\n".join(tables(arguments.csv)))
+
+
+if __name__ == "__main__":
+    main()
