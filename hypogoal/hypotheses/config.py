@@ -35,7 +35,7 @@ class EnsembleConfig:
         150,
         "gradient steps (of each member, where sequential)",
         unit="batches",
-        source="own choice, the paper says none: docs/results/ensembles-doorkey.md",
+        source="own choice, the paper says none: docs/results/hypotheses-doorkey.md",
         low=1,
         high=10_000_000,
     )
