@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 STEPS, ENVIRONMENTS = 8_000, 16  # played by the agent, and as many by chance
 LEAST = 20.0  # expected choices of a member, below which its preference is not told
 DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to choose
+MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
 NEAR = 1.5  # times the shortest path
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
@@ -182,7 +183,8 @@ def numbers(work: Work) -> dict[str, Any]:
         for about in agent["runs"]:
             artefact = artefacts[about["path"]]
             config = artefact.config
-            if base_name(artefact.kind, config) != LEARNED or config["network"] == "paper":
+            known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
+            if base_name(artefact.kind, config) != LEARNED or not known:
                 continue
             domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)
             if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(domain.sub_goals):

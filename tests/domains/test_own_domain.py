@@ -122,7 +122,8 @@ def test_baselines_play_in_the_world_of_the_data(tmp_path: Path) -> None:
     assert main(["collect", "doorkey", "--out", str(data), *few, "-q"]) == 0
     steps = ["--set", "steps=64", "--set", "environments=2", "--layout-seed", "1", "-q"]
     assert main(["train-baseline", "doorkey", "--data", str(data), "--out", str(tmp_path / "ppo"), *steps]) == 0
-    assert open_artefact(tmp_path / "ppo").config["domain_config"] == {"keyring": False, "door_label": "open"}
+    world = {"keyring": False, "door_label": "open", "wrong_key": "harmless"}
+    assert open_artefact(tmp_path / "ppo").config["domain_config"] == world
     # On layout 1 nobody gets to the goal without the ring unless keys are dropped.
     assert json.loads((tmp_path / "ppo" / "layout.json").read_text())["shortest_path"] is None
     assert main(["train-baseline", "montezuma", "--data", str(data), "--out", str(tmp_path / "other"), *steps]) == 2
