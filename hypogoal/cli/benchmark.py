@@ -1,0 +1,67 @@
+"""Benchmarks of hypothesis learning: what an objective finds where the answer is known (Spec H1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hypogoal.cli.common import Quiet, Set, app, values_of
+from hypogoal.core.terminal import draw, give
+
+benchmark = typer.Typer(help="Score diversity objectives where the answer is known.", no_args_is_help=True)
+app.add_typer(benchmark, name="benchmark")
+
+
+@benchmark.callback()
+def _group() -> None:
+    """Score diversity objectives where the answer is known."""
+
+
+@benchmark.command("which-feature")
+def which_feature(
+    out: Annotated[Path, typer.Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
+    diversity: Annotated[
+        str,
+        typer.Option(
+            help="Entries, with commas between: dbat, none, another objective (docs/concepts.md) or module:function, "
+            "each also with a weight (dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
+        ),
+    ] = "dbat,none,oracle",
+    mix: Annotated[
+        str, typer.Option(help="Shares of unlabelled states whose features are drawn each for itself: 0.1,0.5.")
+    ] = "0.5",
+    members: Annotated[int | None, typer.Option(help="Hypotheses (K) of an entry.  [default: 4]")] = None,
+    seeds: Annotated[str, typer.Option(help="0-4, or 0,3,7.")] = "0-4",
+    moved: Annotated[bool, typer.Option("--moved", help="Two frames, and a fifth feature: the object moved.")] = False,
+    high: Annotated[float, typer.Option(min=0.5, max=1, help="Ranking of a feature from which on a member owns it.")] = 0.95,
+    low: Annotated[float, typer.Option(min=0, max=1, help="Its ranking of every other is at most this.")] = 0.6,
+    set_: Set = None,
+    quiet: Quiet = False,
+) -> None:
+    """Which features do members find, of several that fit the labels equally well?
+
+    Small scenes have four planted features (colour, shape and place of an object, how many boxes there are). In the
+    labelled ones all four say the same; in a share of the unlabelled ones (--mix) each is drawn for itself. Members
+    are trained as by train-ensemble (--set takes its settings) and scored where all features are crossed:
+
+    coverage, the share of features that some member ranks by (the area under its ROC curve is at least --high) while
+    it ranks by no other (at most --low); best, the highest ranking of a feature, mean over features; same, the share
+    of pairs of members with the same best feature; gap, what the threshold of 0.5 costs in balanced accuracy; labels,
+    how many are needed until the right member is known, for the features that are covered.
+
+    Writes results.csv (a line for each entry, mix, seed, member and feature) and page.html.
+    """
+    from hypogoal.core import own_code
+    from hypogoal.core.compute import prepare
+    from hypogoal.core.config import parse_integers
+    from hypogoal.which_feature import page, run
+
+    prepare()
+    with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
+        protocol, entries = run.protocol_of(members, set_ or (), moved), run.parse_entries(diversity)
+        cells = run.run(entries, run.parse_mixes(mix), parse_integers(seeds), protocol, out, quiet)
+    draw(page.table_of(cells, high, low), 79)
+    page.write(out / "page.html", cells, protocol, high, low)
+    give(out / "page.html")
