@@ -35,33 +35,44 @@ def which_feature(
     members: Annotated[int | None, typer.Option(help="Hypotheses (K) of an entry.  [default: 4]")] = None,
     seeds: Annotated[str, typer.Option(help="0-4, or 0,3,7.")] = "0-4",
     moved: Annotated[bool, typer.Option("--moved", help="Two frames, and a fifth feature: the object moved.")] = False,
-    high: Annotated[float, typer.Option(min=0.5, max=1, help="Ranking of a feature from which on a member owns it.")] = 0.95,
+    high: Annotated[
+        float, typer.Option(min=0.5, max=1, help="Ranking of a feature from which on a member owns it.")
+    ] = 0.95,
     low: Annotated[float, typer.Option(min=0, max=1, help="Its ranking of every other is at most this.")] = 0.6,
     set_: Set = None,
     quiet: Quiet = False,
 ) -> None:
     """Which features do members find, of several that fit the labels equally well?
 
-    Small scenes have four planted features (colour, shape and place of an object, how many boxes there are). In the
-    labelled ones all four say the same; in a share of the unlabelled ones (--mix) each is drawn for itself. Members
-    are trained as by train-ensemble (--set takes its settings) and scored where all features are crossed:
+    Small scenes have four planted features: colour, shape and place of an
+    object, and how many boxes there are. In the labelled ones all four say the
+    same; in a share of the unlabelled ones (--mix) each is drawn for itself.
+    Members are trained as by train-ensemble (--set takes its settings) and
+    scored on scenes in which all features are crossed:
 
-    coverage, the share of features that some member ranks by (the area under its ROC curve is at least --high) while
-    it ranks by no other (at most --low); best, the highest ranking of a feature, mean over features; same, the share
-    of pairs of members with the same best feature; gap, what the threshold of 0.5 costs in balanced accuracy; labels,
-    how many are needed until the right member is known, for the features that are covered.
+    - coverage: the share of features that some member ranks by (area under the
+    ROC curve of at least --high) while it ranks by no other (at most --low)
 
-    Writes results.csv (a line for each entry, mix, seed, member and feature) and page.html.
+    - best: the highest ranking of a feature by a member, mean over features
+
+    - same: the share of pairs of members with the same best feature
+
+    - gap: what the threshold of 0.5 costs in balanced accuracy
+
+    - labels: how many it takes until the right member is known, for those
+    features that are covered
+
+    Writes results.csv (a line for each entry, mix, seed, member and feature)
+    and page.html.
     """
     from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
-    from hypogoal.core.config import parse_integers
     from hypogoal.which_feature import page, run
 
     prepare()
     with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
-        protocol, entries = run.protocol_of(members, set_ or (), moved), run.parse_entries(diversity)
-        cells = run.run(entries, run.parse_mixes(mix), parse_integers(seeds), protocol, out, quiet)
+        protocol, entries = run.protocol_of(members, set_ or (), moved), run.parse_entries(diversity, protocol)
+        cells = run.run(entries, run.parse_mixes(mix), run.parse_seeds(seeds), protocol, out, quiet)
     draw(page.table_of(cells, high, low), 79)
     page.write(out / "page.html", cells, protocol, high, low)
     give(out / "page.html")

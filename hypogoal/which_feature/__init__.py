@@ -1,1 +1,1 @@
-"""WhichFeature (Spec H1): a benchmark of hypothesis learning whose answer is known, because its features are planted."""
+"""WhichFeature (Spec H1): a benchmark of hypothesis learning with a known answer: its features are planted."""

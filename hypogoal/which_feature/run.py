@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hypogoal.core import own_code
-from hypogoal.core.config import as_dict, from_values, parse_assignments, resolve
+from hypogoal.core.config import as_dict, from_values, parse_assignments, parse_integers, resolve
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, replace_text, write_table
+from hypogoal.core.files import MOST_INTEGER, read_json, replace_text, write_table
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.diversity import load_objective
@@ -109,9 +109,12 @@ def parse_entry(text: str) -> Entry:
     return entry
 
 
-def parse_entries(text: str) -> list[Entry]:
-    """Entries with commas between, each once; see :func:`parse_entry`."""
-    return [parse_entry(name.strip()) for name in dict.fromkeys(text.split(","))]
+def parse_entries(text: str, protocol: Protocol) -> list[Entry]:
+    """Entries with commas between, each once; see :func:`parse_entry`. Weights are checked, too."""
+    entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in text.split(","))]
+    for entry in entries:
+        config_of(entry, protocol)
+    return entries
 
 
 def objectives_in(text: str) -> list[str]:
@@ -133,6 +136,18 @@ def parse_mixes(text: str) -> list[float]:
     if not mixes or not all(0 <= mix <= 1 for mix in mixes):
         raise UserError("these are no shares of states", repr(text[:200]), "Write them as 0,0.5,1.")
     return list(dict.fromkeys(mixes))
+
+
+def parse_seeds(text: str) -> list[int]:
+    """``0-4`` or ``0,3,7``.
+
+    Raises:
+        UserError: they are no seeds.
+    """
+    seeds = parse_integers(text)
+    if not all(0 <= seed <= MOST_INTEGER for seed in seeds):
+        raise UserError("these are no seeds", repr(text[:200]), f"They go from 0 to {MOST_INTEGER}.")
+    return list(dict.fromkeys(seeds))
 
 
 def protocol_of(members: int | None, assignments: Iterable[str], moved: bool) -> Protocol:
@@ -188,9 +203,7 @@ def _trained(entry: Entry, mix: float, seed: int, protocol: Protocol, test: Stat
             return np.concatenate([member.predict(test.observations) for member in members], axis=1)
         labelled = labelled_states(LABELLED, seed, moved)
         unlabelled = unlabelled_states(UNLABELLED, mix, seed, moved).observations
-        ensemble = fit(
-            labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble")
-        )
+        ensemble = fit(labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble"))
         return ensemble.predict(test.observations)
 
 
@@ -244,19 +257,17 @@ def _text(cell: Cell) -> str:
 
 def _read(path: Path, moved: bool) -> Cell:
     """A cell from its file, which may be anyone's."""
-    what, factors = "the cell is", len(names_of(moved))
-    data = read_json(path, what, AGAIN)
+    data = read_json(path, "the cell is", AGAIN)
     try:
-        tables = [np.array(data[name], dtype=np.float64) for name in ("ranking", "balanced_accuracy", "at_best")]
+        ranked, at_half, at_best = (np.array(data[name], dtype=np.float64) for name in COLUMNS[5:8])
         labels, surest = (np.array(data[name], dtype=np.int64) for name in ("labels", "surest"))
-        cell = Cell(str(data["entry"]), float(data["mix"]), int(data["seed"]), *tables, labels, surest)
+        named = str(data["entry"]), float(data["mix"]), int(data["seed"])
     except (TypeError, ValueError, KeyError, OverflowError):
-        raise UserError(f"{what} damaged", path, AGAIN) from None
-    members = len(cell.ranking)
-    shapes = [table.shape for table in (*tables, labels, surest)]
-    states = COPIES * 2**factors
-    if shapes != [(members, factors)] * 3 + [(factors,), (members, 2, SHOWN)] or not (0 <= surest).all() or not (
-        (surest < states).all() and all(((0 <= table) & (table <= 1)).all() for table in tables)
-    ):
-        raise UserError(f"{what} damaged", path, AGAIN)
-    return cell
+        raise UserError("the cell is damaged", path, AGAIN) from None
+    shape = (len(ranked) if ranked.ndim else 0, len(names_of(moved)))
+    shapes = [array.shape for array in (ranked, at_half, at_best, labels, surest)]
+    fitting = shapes == [shape, shape, shape, shape[1:], (shape[0], 2, SHOWN)] and shape[0] > 0
+    within = all(((table >= 0) & (table <= 1)).all() for table in (ranked, at_half, at_best))
+    if not (fitting and within and surest.min() >= 0 and surest.max() < COPIES * 2 ** shape[1]):
+        raise UserError("the cell is damaged", path, AGAIN)
+    return Cell(*named, ranked, at_half, at_best, labels, surest)
