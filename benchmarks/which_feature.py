@@ -27,7 +27,7 @@ OBJECTIVES = (  # in the order in which they are run
     "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "say-no", "input-gradients",
 )  # fmt: skip
 UNWEIGHTED = ("none", "cnn", "oracle")
-CHOICE_SEEDS, CHOICE_MIX = (100, 101), 0.5
+CHOICE_SEEDS, CHOICE_MIX = (100,), 0.5
 HIGH, LOW = 0.95, 0.6
 SCORES = ("ranking", "balanced_accuracy", "at_best")
 NONE = np.empty((0, 2, 0), dtype=np.int64)  # states that members are surest of: not in the CSV

@@ -71,7 +71,8 @@ def which_feature(
 
     prepare()
     with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
-        protocol, entries = run.protocol_of(members, set_ or (), moved), run.parse_entries(diversity, protocol)
+        protocol = run.protocol_of(members, set_ or (), moved)
+        entries = run.parse_entries(diversity, protocol)
         cells = run.run(entries, run.parse_mixes(mix), run.parse_seeds(seeds), protocol, out, quiet)
     draw(page.table_of(cells, high, low), 79)
     page.write(out / "page.html", cells, protocol, high, low)
