@@ -32,13 +32,11 @@ def which_feature(
     mix: Annotated[
         str, typer.Option(help="Shares of unlabelled states whose features are drawn each for itself: 0.1,0.5.")
     ] = "0.5",
-    members: Annotated[int | None, typer.Option(help="Hypotheses (K) of an entry.  [default: 4]")] = None,
+    members: Annotated[int, typer.Option(help="Hypotheses (K) of an entry.")] = 4,
     seeds: Annotated[str, typer.Option(help="0-4, or 0,3,7.")] = "0-4",
     moved: Annotated[bool, typer.Option("--moved", help="Two frames, and a fifth feature: the object moved.")] = False,
-    high: Annotated[
-        float, typer.Option(min=0.5, max=1, help="Ranking of a feature from which on a member owns it.")
-    ] = 0.95,
-    low: Annotated[float, typer.Option(min=0, max=1, help="Its ranking of every other is at most this.")] = 0.6,
+    high: Annotated[float, typer.Option(help="Ranking of a feature from which on a member owns it.")] = 0.95,
+    low: Annotated[float, typer.Option(help="Its ranking of every other feature is at most this.")] = 0.6,
     set_: Set = None,
     quiet: Quiet = False,
 ) -> None:
@@ -70,10 +68,10 @@ def which_feature(
     from hypogoal.which_feature import page, run
 
     prepare()
+    options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds}
+    config = run.resolved({**options, "moved": moved, "high": high, "low": low}, set_ or ())
     with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
-        protocol = run.protocol_of(members, set_ or (), moved)
-        entries = run.parse_entries(diversity, protocol)
-        cells = run.run(entries, run.parse_mixes(mix), run.parse_seeds(seeds), protocol, out, quiet)
-    draw(page.table_of(cells, high, low), 79)
-    page.write(out / "page.html", cells, protocol, high, low)
+        cells = run.run(config, out, quiet)
+    draw(page.table_of(cells, config), 79)
+    page.write(out / "page.html", cells, config)
     give(out / "page.html")

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import versions
-from hypogoal.core.config import as_dict
 from hypogoal.core.files import replace_text
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.evaluation.plots import INK, drawing, slug
 from hypogoal.which_feature import scores
-from hypogoal.which_feature.run import COPIES, Cell, Protocol
+from hypogoal.which_feature.run import COPIES, Cell, WhichFeatureConfig, shared
 from hypogoal.which_feature.states import crossed_states, names_of
 
 if TYPE_CHECKING:
@@ -95,28 +94,28 @@ COLUMNS = (
 )
 
 
-def table_of(cells: Iterable[Cell], high: float, low: float) -> Table:
+def table_of(cells: Iterable[Cell], config: WhichFeatureConfig) -> Table:
     """The table for a terminal."""
-    return page.terminal(TITLE, COLUMNS, summary(cells, high, low))
+    return page.terminal(TITLE, COLUMNS, summary(cells, config.high, config.low))
 
 
-def write(path: Path, cells: Sequence[Cell], protocol: Protocol, high: float, low: float) -> None:
+def write(path: Path, cells: Sequence[Cell], config: WhichFeatureConfig) -> None:
     """The page: the table, and of each entry what its members own, in the cell whose mix is nearest to 0.5."""
     material = page.Material({}, {})
     caption = (
-        f"Coverage: the share of features that some member ranks by (at least {high:g}) while it ranks by no other (at "
-        f"most {low:g}); mean and Student's 95 % interval over seeds, fewer than three one by one. Best: the highest "
-        "ranking of a feature, mean over features. Same: the share of pairs of members with the same best feature. "
-        "Gap: what the threshold of 0.5 costs in balanced accuracy. Labels: needed until the right member is known, "
-        "for the features that are covered."
+        f"Coverage: the share of features that some member ranks by (at least {config.high:g}) while it ranks by no "
+        f"other (at most {config.low:g}); mean and Student's 95 % interval over seeds, fewer than three one by one. "
+        "Best: the highest ranking of a feature, mean over features. Same: the share of pairs of members with the same "
+        "best feature. Gap: what the threshold of 0.5 costs in balanced accuracy. Labels: needed until the right "
+        "member is known, mean over the features that are covered."
     )
-    table = page.table(COLUMNS, summary(cells, high, low), caption=caption)
+    table = page.table(COLUMNS, summary(cells, config.high, config.low), caption=caption)
     sections = [page.section("summary", "What is covered", [], [table])]
     for entry, some in grouped(cells, lambda cell: cell.entry).items():
         cell = min(some, key=lambda cell: (abs(cell.mix - 0.5), cell.seed))
         paragraphs = [f"Mix {cell.mix:g}, seed {cell.seed}."]
-        sections.append(page.section(slug(entry), entry, paragraphs, _members(material, cell, protocol.moved)))
-    settings = [(name, str(value)) for name, value in as_dict(protocol.config).items() if name != "diversity"]
+        sections.append(page.section(slug(entry), entry, paragraphs, _members(material, cell, config.moved)))
+    settings = [(name, str(value)) for name, value in shared(config).items()]
     sections.append(page.section("settings", "Settings", [], [page.facts("What all entries share", settings)]))
     version = versions().get("hypogoal", "unknown")
     replace_text(path, page.draw_page(TITLE, "Features planted, found or not", sections, version))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hypogoal.core import own_code
-from hypogoal.core.config import as_dict, from_values, parse_assignments, parse_integers, resolve
+from hypogoal.core.config import as_dict, from_values, resolve, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, read_json, replace_text, write_table
+from hypogoal.core.files import read_json, replace_text, write_table
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.diversity import load_objective
@@ -35,9 +35,14 @@ from hypogoal.which_feature.states import (
 
 CNN, ORACLE = "cnn", "oracle"  # entries that are no objectives: one member, and one taught by each factor's truth
 NETWORK = f"{__name__}:tiles"
-DEFAULTS: Mapping[str, Any] = {
-    "members": 4, "network": NETWORK, "steps": 150, "learning_rate": 2e-3, "batch_size": 32, "diversity_weight": 0.01
-}  # fmt: skip
+DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other ones of
+    "members": 4,
+    "diversity_weight": 0.01,
+    "network": NETWORK,
+    "steps": 150,
+    "learning_rate": 2e-3,
+    "batch_size": 32,
+}
 LABELLED, UNLABELLED, COPIES = 256, 512, 20  # states; copies of each combination in the test, as many for the oracle
 SHOWN = 4  # test states of each kind that a member is surest of
 COLUMNS = ("entry", "mix", "seed", "member", "factor", "ranking", "balanced_accuracy", "at_best", "labels")
@@ -53,11 +58,20 @@ def tiles(channels: int) -> Parts:
 
 
 @dataclass(frozen=True)
-class Protocol:
-    """What all entries have in common: the settings of training, and whether scenes are of two frames."""
+class WhichFeatureConfig(EnsembleConfig):
+    """What is run; settings of ensembles are those of training, but for ``diversity``, which names all entries."""
 
-    config: EnsembleConfig
-    moved: bool = False
+    mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states whose factors are crossed", low=0.0, high=1.0)
+    seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
+    moved: bool = setting(False, "two frames, and whether the object moved between them as a fifth factor")
+    high: float = setting(0.95, "ranking of a factor from which on a member owns it", low=0.5, high=1.0)
+    low: float = setting(0.6, "its ranking of every other factor is at most this", low=0.0, high=1.0)
+
+
+def resolved(options: Mapping[str, Any], assignments: Iterable[str] = ()) -> WhichFeatureConfig:
+    """The settings with the benchmark's defaults; see :func:`hypogoal.core.config.resolve`."""
+    stage = "train-ensemble"
+    return resolve(WhichFeatureConfig, stage=stage, options=options, assignments=assignments, defaults=DEFAULTS)
 
 
 class Entry(NamedTuple):
@@ -109,78 +123,27 @@ def parse_entry(text: str) -> Entry:
     return entry
 
 
-def parse_entries(text: str, protocol: Protocol) -> list[Entry]:
-    """Entries with commas between, each once; see :func:`parse_entry`. Weights are checked, too."""
-    entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in text.split(","))]
-    for entry in entries:
-        config_of(entry, protocol)
-    return entries
-
-
 def objectives_in(text: str) -> list[str]:
-    """What stands for an objective in a user's entries, as :func:`hypogoal.core.own_code.given` wants it."""
+    """What may stand for an objective in entries that a user gave, for :func:`hypogoal.core.own_code.given`."""
     names = [name.strip() for name in text.split(",")]
     return [*names, *(name.rpartition(":")[0] for name in names)]
 
 
-def parse_mixes(text: str) -> list[float]:
-    """``0.1,0.5``, each from 0 to 1.
-
-    Raises:
-        UserError: they are not.
-    """
-    try:
-        mixes = [float(mix) for mix in text.split(",")]
-    except ValueError:
-        mixes = []
-    if not mixes or not all(0 <= mix <= 1 for mix in mixes):
-        raise UserError("these are no shares of states", repr(text[:200]), "Write them as 0,0.5,1.")
-    return list(dict.fromkeys(mixes))
-
-
-def parse_seeds(text: str) -> list[int]:
-    """``0-4`` or ``0,3,7``.
-
-    Raises:
-        UserError: they are no seeds.
-    """
-    seeds = parse_integers(text)
-    if not all(0 <= seed <= MOST_INTEGER for seed in seeds):
-        raise UserError("these are no seeds", repr(text[:200]), f"They go from 0 to {MOST_INTEGER}.")
-    return list(dict.fromkeys(seeds))
-
-
-def protocol_of(members: int | None, assignments: Iterable[str], moved: bool) -> Protocol:
-    """The benchmark's defaults with what was given.
-
-    Raises:
-        UserError: a setting that there is not, or that is an entry's own.
-    """
-    given = list(assignments)
-    if "diversity" in parse_assignments(given):
-        raise UserError("objectives are entries here", "--set diversity", "Give --diversity NAME,NAME:WEIGHT.")
-    options = {"members": members}
-    stage = "train-ensemble"
-    config = resolve(EnsembleConfig, stage=stage, defaults=DEFAULTS, options=options, assignments=given)
-    return Protocol(config, moved)
-
-
-def config_of(entry: Entry, protocol: Protocol) -> EnsembleConfig:
+def config_of(entry: Entry, config: WhichFeatureConfig) -> WhichFeatureConfig:
     """The settings that the entry's members are trained with."""
     if entry.objective in (CNN, ORACLE):
-        return replace(protocol.config, members=1, diversity="none")
+        return replace(config, members=1, diversity="none")
     weight = {} if entry.weight is None else {"diversity_weight": entry.weight}
-    values = {**as_dict(protocol.config), "diversity": entry.objective, **weight}
-    return from_values(EnsembleConfig, values, "train-ensemble")
+    return from_values(WhichFeatureConfig, {**as_dict(config), "diversity": entry.objective, **weight}, entry.name)
 
 
-def run_cell(entry: Entry, mix: float, seed: int, protocol: Protocol) -> Cell:
+def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) -> Cell:
     """Train an entry's members with the product's own ``fit`` and score them on crossed states.
 
     Entries of one seed have the same states, initial weights and batches.
     """
-    test = crossed_states(COPIES, seed, protocol.moved)
-    probabilities = _trained(entry, mix, seed, protocol, test)
+    test = crossed_states(COPIES, seed, config.moved)
+    probabilities = _trained(entry, mix, seed, config_of(entry, config), test)
     ranked = rankings(probabilities, test.factors)
     at_half, at_best = balanced_accuracies(probabilities, test.factors)
     labels = labels_needed(probabilities, test.factors, ranked, rng_for(seed, "which-feature", "labels"))
@@ -189,9 +152,9 @@ def run_cell(entry: Entry, mix: float, seed: int, protocol: Protocol) -> Cell:
     return Cell(entry.name, mix, seed, ranked, at_half, at_best, labels, surest)
 
 
-def _trained(entry: Entry, mix: float, seed: int, protocol: Protocol, test: States) -> NDArray[np.float32]:
+def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: States) -> NDArray[np.float32]:
     """Probabilities (N, K) of the trained members on the test states."""
-    config, moved = config_of(entry, protocol), protocol.moved
+    moved = config.moved
     with own_code.vouched(NETWORK):
         if entry.objective == ORACLE:
             told = crossed_states(COPIES, seed, moved, split=ORACLE)
@@ -207,25 +170,28 @@ def _trained(entry: Entry, mix: float, seed: int, protocol: Protocol, test: Stat
         return ensemble.predict(test.observations)
 
 
-def run(
-    entries: Sequence[Entry], mixes: Sequence[float], seeds: Sequence[int], protocol: Protocol, out: Path, quiet: bool
-) -> list[Cell]:
+def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
     """Every cell that is not in ``out`` yet, seed by seed; then all that are there, ``results.csv`` with them.
 
     Raises:
         UserError: ``out`` is something else, was begun with other settings, or a cell in it is damaged.
     """
-    _begin(out, protocol)
-    wanted = [(entry, mix, seed) for seed in seeds for mix in mixes for entry in entries]
+    entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in config.diversity.split(","))]
+    for entry in entries:
+        config_of(entry, config)  # whose weight may be none
+    wanted = [(entry, mix, seed) for seed in config.seeds for mix in config.mix for entry in entries]
+    if not wanted:
+        raise UserError("there is nothing to run", f"seeds {config.seeds}, mixes {config.mix}", "Give one of each.")
+    _begin(out, config)
     paths = [out / "cells" / f"{slug(entry.name)}_{mix}_{seed}.json" for entry, mix, seed in wanted]
     with Progress("which-feature", len(wanted), quiet) as progress:
         progress.resume(sum(path.exists() for path in paths))
         for cell, path in zip(wanted, paths, strict=True):
             if not path.exists():
-                replace_text(path, _text(run_cell(*cell, protocol)))
+                replace_text(path, _text(run_cell(*cell, config)))
                 progress.advance()
-    cells = [_read(path, protocol.moved) for path in sorted((out / "cells").glob("*.json"))]
-    write_table(out / "results.csv", COLUMNS, rows_of(cells, protocol.moved))
+    cells = [_read(path, config.moved) for path in sorted((out / "cells").glob("*.json"))]
+    write_table(out / "results.csv", COLUMNS, rows_of(cells, config.moved))
     return cells
 
 
@@ -238,16 +204,23 @@ def rows_of(cells: Iterable[Cell], moved: bool) -> Iterator[tuple[Any, ...]]:
             yield (cell.entry, cell.mix, cell.seed, member, names_of(moved)[factor], *numbers)
 
 
-def _begin(out: Path, protocol: Protocol) -> None:
-    """The folder, with the settings that all of its cells share."""
-    path, settings = out / "settings.json", {**as_dict(protocol.config), "moved": protocol.moved}
+def shared(config: WhichFeatureConfig) -> dict[str, Any]:
+    """The settings that all cells of a folder have in common, as JSON."""
+    own = ("diversity", "mix", "seeds", "high", "low")
+    return {name: value for name, value in as_dict(config).items() if name not in own}
+
+
+def _begin(out: Path, config: WhichFeatureConfig) -> None:
+    """The folder, with the settings of its cells."""
+    path = out / "settings.json"
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise UserError("this is no folder of the benchmark", out, "Choose another --out.")
-        (out / "cells").mkdir(parents=True)
-        replace_text(path, json.dumps(settings, indent=1) + "\n")
-    elif read_json(path, "the benchmark's settings are", "Choose another --out.") != settings:
+        out.mkdir(parents=True, exist_ok=True)
+        replace_text(path, json.dumps(shared(config), indent=1) + "\n")
+    elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):
         raise UserError("this benchmark was begun with other settings", out, "Give those, or choose another --out.")
+    (out / "cells").mkdir(exist_ok=True)
 
 
 def _text(cell: Cell) -> str:

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from hypogoal.cli import main
-from hypogoal.core.config import resolve
 from hypogoal.core.errors import UserError
-from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.which_feature.page import summary, told
-from hypogoal.which_feature.run import DEFAULTS, Protocol, parse_entry, run_cell
+from hypogoal.which_feature.run import parse_entry, resolved, run_cell
 from hypogoal.which_feature.scores import coverage
 
 COMMAND = ["benchmark", "which-feature", "--quiet", "--set", "steps=2", "--members", "2"]
@@ -25,10 +23,6 @@ def apart(first, second):
 """
 
 
-def protocol(**settings: object) -> Protocol:
-    return Protocol(resolve(EnsembleConfig, stage="train-ensemble", defaults={**DEFAULTS, **settings}))
-
-
 def rows(out: Path) -> list[dict[str, str]]:
     with (out / "results.csv").open(newline="") as file:
         return list(csv.DictReader(file))
@@ -37,7 +31,7 @@ def rows(out: Path) -> list[dict[str, str]]:
 @pytest.mark.parametrize("moved", [False, True])
 def test_the_oracle_covers_everything(moved: bool) -> None:
     """So each factor can be learned by itself: what an objective falls short of is its own."""
-    cell = run_cell(parse_entry("oracle"), 0.5, 0, Protocol(protocol().config, moved))
+    cell = run_cell(parse_entry("oracle"), 0.5, 0, resolved({"moved": moved}))
     assert np.diag(cell.ranking).min() >= 0.99
     assert coverage(cell.ranking) == 1.0
     assert cell.labels.max() < 10
@@ -45,7 +39,7 @@ def test_the_oracle_covers_everything(moved: bool) -> None:
 
 def test_one_member_covers_one_factor_at_most_and_the_same_seed_gives_the_same() -> None:
     """Of ``cnn`` there is one, whatever --members says."""
-    first, again = (run_cell(parse_entry("cnn"), 0.5, 0, protocol(steps=20)) for _ in range(2))
+    first, again = (run_cell(parse_entry("cnn"), 0.5, 0, resolved({"steps": 20})) for _ in range(2))
     assert first.ranking.shape == (1, 4)
     assert coverage(first.ranking) <= 0.25
     assert (first.ranking == again.ranking).all()
@@ -98,14 +92,14 @@ def test_the_page_is_of_two_frames_too(tmp_path: Path) -> None:
         ("--diversity oracle:1", "oracle has no weight"),
         ("--diversity dbat:nan", "not finite"),
         ("--diversity nosuchmodule:loss", "cannot be loaded"),
-        ("--mix 2", "no shares of states"),
-        ("--mix half", "no shares of states"),
-        ("--seeds x", "no integers"),
-        ("--seeds -1", "no seeds"),
+        ("--mix 2", "out of range"),
+        ("--mix half", "wrong kind of value"),
+        ("--seeds x", "wrong kind of value"),
+        ("--seeds -1", "out of range"),
         ("--members 0", "out of range"),
         ("--set stepz=3", "Did you mean 'steps'"),
-        ("--set diversity=none", "objectives are entries here"),
-        ("--high 2", "--high"),
+        ("--seeds ,", "nothing to run"),
+        ("--high 2", "out of range"),
         ("--out {made}", "no folder of the benchmark"),
     ],
 )
@@ -156,7 +150,7 @@ def test_seeds_are_told_by_their_number() -> None:
     assert told(np.array([0.5, 0.25])) == "0.50, 0.25"
     assert told(np.array([0.0, 0.5, 1.0])) == "0.50 ± 1.24"
     assert told(np.array([np.nan])) == "–"
-    cells = [run_cell(parse_entry(name), 0.5, 0, protocol(steps=30)) for name in ("cnn", "oracle")]
+    cells = [run_cell(parse_entry(name), 0.5, 0, resolved({"steps": 30})) for name in ("cnn", "oracle")]
     lines = summary(cells, 0.5, 1.0)
     assert [line.entry for line in lines] == ["oracle", "cnn"]
     assert np.isnan(lines[1].same).all()
