@@ -1,9 +1,11 @@
 """The leaderboard of WhichFeature: each objective's weight by one rule, and the tables of its page.
 
-python -m benchmarks.which_feature --grid     every objective at every weight, for hypogoal benchmark --diversity
-python -m benchmarks.which_feature --gather runs/which-choice/results.csv ...   what the benchmark wrote, in the CSV
-python -m benchmarks.which_feature --chosen   the entries at the weights that the rule chose
-python -m benchmarks.which_feature            the tables of docs/results/which-feature.md
+    python -m benchmarks.which_feature --grid     every objective at every weight, for hypogoal benchmark --diversity
+    python -m benchmarks.which_feature --gather docs/results/which-feature.csv runs/which-choice/results.csv ...
+    python -m benchmarks.which_feature --chosen   the entries at the weights that the rule chose
+    python -m benchmarks.which_feature            the tables of docs/results/which-feature.md
+
+``--gather`` makes the first file of the others, which the benchmark wrote.
 """
 
 from __future__ import annotations
@@ -32,16 +34,17 @@ HIGH, LOW = 0.95, 0.6
 SCORES = ("ranking", "balanced_accuracy", "at_best")
 NONE = np.empty((0, 2, 0), dtype=np.int64)  # states that members are surest of: not in the CSV
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
+LONG = CSV.with_name("which-feature-long.csv")  # cells of 600 steps instead of 150
 
 
-def gather(paths: Iterable[Path]) -> None:
+def gather(target: Path, paths: Iterable[Path]) -> None:
     """Lines of several ``results.csv`` as one file; a cell that is in more than one, from the first."""
     lines: dict[tuple[str, ...], list[str]] = {}
     for path in paths:
         with path.open(encoding="utf-8", newline="") as file:
             for row in csv.reader(file):
                 lines.setdefault(tuple(row[:5]), row)
-    with CSV.open("w", encoding="utf-8", newline="") as file:
+    with target.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(lines.values())
 
 
@@ -79,7 +82,7 @@ def tables(path: Path) -> Iterator[str]:
     winners = chosen(cells)
     choice = [cell for cell in cells if cell.seed in CHOICE_SEEDS]
     by_entry = {line.entry: line for line in summary(choice, HIGH, LOW)}
-    yield "Coverage (best) by weight, seeds 100 and 101 at mix .5; in bold what the rule chose."
+    yield "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose."
     yield ""
     yield from table(
         ["", *(f"{weight:g}" for weight in WEIGHTS)],
@@ -88,17 +91,22 @@ def tables(path: Path) -> Iterator[str]:
             for name in OBJECTIVES
         ),
     )
-    test = summary([cell for cell in cells if cell.seed not in CHOICE_SEEDS], HIGH, LOW)
-    for mix, lines in grouped(test, lambda line: line.mix).items():
-        yield f"Test at mix {mix:g}, mean and Student's 95 % interval over seeds."
+    test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS]
+    yield from _board("Test", test)
+    yield "Test at mix .5: the share of seeds in which some member owns the feature, and the highest ranking of it."
+    yield ""
+    yield from table(["", *FACTORS], _by_factor([cell for cell in test if cell.mix == CHOICE_MIX]))
+    if LONG.exists():
+        yield from _board("600 steps", read(LONG))
+
+
+def _board(title: str, cells: Iterable[Cell]) -> Iterator[str]:
+    """The scores of entries, a table for each mix."""
+    shown = [column for column in COLUMNS if column.title != "mix"]
+    for mix, lines in grouped(summary(cells, HIGH, LOW), lambda line: line.mix).items():
+        yield f"{title} at mix {mix:g}, mean and Student's 95 % interval over seeds."
         yield ""
-        shown = [column for column in COLUMNS if column.title != "mix"]
         yield from table([column.title for column in shown], ([str(c.of(line)) for c in shown] for line in lines))
-    tested = [cell for cell in cells if cell.seed not in CHOICE_SEEDS and cell.mix == CHOICE_MIX]
-    if tested:
-        yield "Test at mix .5: the share of seeds in which some member owns the feature, and the highest ranking of it."
-        yield ""
-        yield from table(["", *FACTORS], _by_factor(tested))
 
 
 def _entries(objective: str) -> list[str]:
@@ -124,12 +132,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--grid", action="store_true", help="print every objective at every weight")
     parser.add_argument("--chosen", action="store_true", help="print the entries that the rule chose, and the others")
-    parser.add_argument("--gather", nargs="+", type=Path, metavar="CSV", help="make the CSV of these")
+    parser.add_argument("--gather", nargs="+", type=Path, metavar="CSV", help="make the first of the others")
     arguments = parser.parse_args()
     if arguments.grid:
         print(",".join(entry for objective in OBJECTIVES for entry in _entries(objective)))
     elif arguments.gather:
-        gather(arguments.gather)
+        gather(*arguments.gather[:1], arguments.gather[1:])
     elif arguments.chosen:
         print(",".join([*chosen(read(CSV)).values(), *UNWEIGHTED]))
     else:

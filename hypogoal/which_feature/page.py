@@ -139,13 +139,14 @@ def _members(material: page.Material, cell: Cell, moved: bool) -> list[page.Bloc
     drawn = page.Drawn(f"owned-{cell.entry}", label, figure, caption)
     states = crossed_states(COPIES, cell.seed, moved).observations[..., -3:]
 
-    def strip(member: int, side: int) -> dict[str, str]:
-        picture = np.concatenate(list(states[cell.surest[member, side]]), axis=1)
+    def square(member: int, side: int) -> dict[str, str]:
+        upper, lower = states[cell.surest[member, side]].reshape(2, 2, *states.shape[1:])
+        picture = np.vstack([np.hstack(list(upper)), np.hstack(list(lower))])
         return {"png": page.encoded(image_png(picture)), "alt": f"states that member {member} is surest of"}
 
     columns = (
         page.label("member", str),
-        page.label("surest yes", lambda member: strip(member, 0)),
-        page.label("surest no", lambda member: strip(member, 1)),
+        page.label("surest yes", lambda member: square(member, 0)),
+        page.label("surest no", lambda member: square(member, 1)),
     )
     return [page.shown(material, drawn), page.table(columns, range(members))]
