@@ -19,7 +19,8 @@ import numpy as np
 
 from benchmarks.cells import table
 from hypogoal.evaluation.numbers import grouped
-from hypogoal.which_feature.page import COLUMNS, Line, summary
+from hypogoal.evaluation.page import number
+from hypogoal.which_feature.page import COLUMNS, Line, summary, told
 from hypogoal.which_feature.run import Cell
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS
@@ -102,8 +103,11 @@ def tables(path: Path) -> Iterator[str]:
 
 def _board(title: str, cells: Iterable[Cell]) -> Iterator[str]:
     """The scores of entries, a table for each mix."""
-    shown = [column for column in COLUMNS if column.title != "mix"]
     for mix, lines in grouped(summary(cells, HIGH, LOW), lambda line: line.mix).items():
+        plain = next(line.best for line in lines if line.entry == "none")  # of the same seeds as the others
+        best = number("best", lambda line: line.best, told)
+        gain = number("best, minus none", lambda line, plain=plain: line.best - plain, told)
+        shown = [*(best if column.title == "best" else column for column in COLUMNS if column.title != "mix"), gain]
         yield f"{title} at mix {mix:g}, mean and Student's 95 % interval over seeds."
         yield ""
         yield from table([column.title for column in shown], ([str(c.of(line)) for c in shown] for line in lines))
