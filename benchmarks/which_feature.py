@@ -141,7 +141,7 @@ def main() -> None:
     if arguments.grid:
         print(",".join(entry for objective in OBJECTIVES for entry in _entries(objective)))
     elif arguments.gather:
-        gather(*arguments.gather[:1], arguments.gather[1:])
+        gather(arguments.gather[0], arguments.gather[1:])
     elif arguments.chosen:
         print(",".join([*chosen(read(CSV)).values(), *UNWEIGHTED]))
     else:
