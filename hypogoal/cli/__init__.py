@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hypogoal.cli import stages, sweep, inspect, own_data  # isort: skip  # so --help has the stages first
+from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has the stages first
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
@@ -25,7 +25,7 @@ NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller setting
 # What torch, and whoever loads a library, raises in place of a MemoryError.
 MEMORY_TEXTS = ("can't allocate memory", "Cannot allocate memory", "failed to map segment")
 
-__all__ = ["app", "inspect", "main", "own_data", "stages", "sweep"]
+__all__ = ["app", "benchmark", "inspect", "main", "own_data", "stages", "sweep"]
 
 
 def _version(value: bool) -> None:

@@ -1,0 +1,152 @@
+"""The leaderboard of WhichFeature: each objective's weight by one rule, and the tables of its page.
+
+    python -m benchmarks.which_feature --grid     every objective at every weight, for hypogoal benchmark --diversity
+    python -m benchmarks.which_feature --gather docs/results/which-feature.csv runs/which-choice/results.csv ...
+    python -m benchmarks.which_feature --chosen   the entries at the weights that the rule chose
+    python -m benchmarks.which_feature            the tables of docs/results/which-feature.md
+
+``--gather`` makes the first file of the others, which the benchmark wrote.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.cells import table
+from hypogoal.evaluation.numbers import grouped
+from hypogoal.evaluation.page import number
+from hypogoal.which_feature.page import COLUMNS, Line, summary, told
+from hypogoal.which_feature.run import Cell
+from hypogoal.which_feature.scores import owned
+from hypogoal.which_feature.states import FACTORS
+
+WEIGHTS = (1.0, 0.1, 0.01, 0.001, 0.0001)
+OBJECTIVES = (  # in the order in which they are run
+    "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "say-no", "input-gradients",
+)  # fmt: skip
+UNWEIGHTED = ("none", "cnn", "oracle")
+CHOICE_SEEDS, CHOICE_MIX = (100,), 0.5
+HIGH, LOW = 0.95, 0.6
+SCORES = ("ranking", "balanced_accuracy", "at_best")
+NONE = np.empty((0, 2, 0), dtype=np.int64)  # states that members are surest of: not in the CSV
+CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
+LONG = CSV.with_name("which-feature-long.csv")  # cells of 600 steps instead of 150
+
+
+def gather(target: Path, paths: Iterable[Path]) -> None:
+    """Lines of several ``results.csv`` as one file; a cell that is in more than one, from the first."""
+    lines: dict[tuple[str, ...], list[str]] = {}
+    for path in paths:
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.reader(file):
+                lines.setdefault(tuple(row[:5]), row)
+    with target.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(lines.values())
+
+
+def read(path: Path) -> list[Cell]:
+    """The cells of a ``results.csv``, without the states that members are surest of."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    cells = []
+    for (entry, mix, seed), of in grouped(rows, lambda row: (row["entry"], row["mix"], row["seed"])).items():
+        shape = (-1, len(FACTORS))
+        ranked, at_half, at_best = (np.array([float(row[name]) for row in of]).reshape(shape) for name in SCORES)
+        labels = np.array([int(row["labels"]) for row in of[: len(FACTORS)]])
+        cells.append(Cell(entry, float(mix), int(seed), ranked, at_half, at_best, labels, NONE))
+    return cells
+
+
+def chosen(cells: Sequence[Cell]) -> dict[str, str]:
+    """The rule: of each objective's weights the one with the highest coverage, ties by best; by objective its entry.
+
+    Objectives of which a weight or a seed is still missing are left out.
+    """
+    lines = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS and cell.mix == CHOICE_MIX], HIGH, LOW)
+    found = {}
+    for objective in OBJECTIVES:
+        entries = _entries(objective)
+        own = [line for line in lines if line.entry in entries and len(line.coverage) == len(CHOICE_SEEDS)]
+        if len(own) == len(entries):
+            found[objective] = max(own, key=lambda line: (line.coverage.mean(), line.best.mean())).entry
+    return found
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    cells = read(path)
+    winners = chosen(cells)
+    choice = [cell for cell in cells if cell.seed in CHOICE_SEEDS]
+    by_entry = {line.entry: line for line in summary(choice, HIGH, LOW)}
+    yield "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose."
+    yield ""
+    yield from table(
+        ["", *(f"{weight:g}" for weight in WEIGHTS)],
+        (
+            [name, *(_choice(by_entry.get(entry), entry in winners.values()) for entry in _entries(name))]
+            for name in OBJECTIVES
+        ),
+    )
+    test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS]
+    yield from _board("Test", test)
+    yield "Test at mix .5: the share of seeds in which some member owns the feature, and the highest ranking of it."
+    yield ""
+    yield from table(["", *FACTORS], _by_factor([cell for cell in test if cell.mix == CHOICE_MIX]))
+    if LONG.exists():
+        yield from _board("600 steps", read(LONG))
+
+
+def _board(title: str, cells: Iterable[Cell]) -> Iterator[str]:
+    """The scores of entries, a table for each mix."""
+    for mix, lines in grouped(summary(cells, HIGH, LOW), lambda line: line.mix).items():
+        plain = next(line.best for line in lines if line.entry == "none")  # of the same seeds as the others
+        best = number("best", lambda line: line.best, told)
+        gain = number("best, minus none", lambda line, plain=plain: line.best - plain, told)
+        shown = [*(best if column.title == "best" else column for column in COLUMNS if column.title != "mix"), gain]
+        yield f"{title} at mix {mix:g}, mean and Student's 95 % interval over seeds."
+        yield ""
+        yield from table([column.title for column in shown], ([str(c.of(line)) for c in shown] for line in lines))
+
+
+def _entries(objective: str) -> list[str]:
+    return [f"{objective}:{weight:g}" for weight in WEIGHTS]
+
+
+def _choice(line: Line | None, best: bool) -> str:
+    if line is None:
+        return ""
+    text = f"{line.coverage.mean():.2f} ({line.best.mean():.2f})"
+    return f"**{text}**" if best else text
+
+
+def _by_factor(cells: Sequence[Cell]) -> Iterator[list[str]]:
+    for entry, of in grouped(cells, lambda cell: cell.entry).items():
+        share = np.mean([owned(cell.ranking, HIGH, LOW).any(axis=0) for cell in of], axis=0)
+        best = np.mean([cell.ranking.max(axis=0) for cell in of], axis=0)
+        yield [entry, *(f"{one:.1f} ({two:.2f})" for one, two in zip(share, best, strict=True))]
+
+
+def main() -> None:
+    """Print, or gather."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--grid", action="store_true", help="print every objective at every weight")
+    parser.add_argument("--chosen", action="store_true", help="print the entries that the rule chose, and the others")
+    parser.add_argument("--gather", nargs="+", type=Path, metavar="CSV", help="make the first of the others")
+    arguments = parser.parse_args()
+    if arguments.grid:
+        print(",".join(entry for objective in OBJECTIVES for entry in _entries(objective)))
+    elif arguments.gather:
+        gather(arguments.gather[0], arguments.gather[1:])
+    elif arguments.chosen:
+        print(",".join([*chosen(read(CSV)).values(), *UNWEIGHTED]))
+    else:
+        print("\n".join(tables(CSV)))
+
+
+if __name__ == "__main__":
+    main()

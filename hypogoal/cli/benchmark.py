@@ -1,0 +1,77 @@
+"""Benchmarks of hypothesis learning: what an objective finds where the answer is known (Spec H1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hypogoal.cli.common import Quiet, Set, app, values_of
+from hypogoal.core.terminal import draw, give
+
+benchmark = typer.Typer(help="Score diversity objectives where the answer is known.", no_args_is_help=True)
+app.add_typer(benchmark, name="benchmark")
+
+
+@benchmark.callback()
+def _group() -> None:
+    """Score diversity objectives where the answer is known."""
+
+
+@benchmark.command("which-feature")
+def which_feature(
+    out: Annotated[Path, typer.Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
+    diversity: Annotated[
+        str,
+        typer.Option(
+            help="Entries, with commas between: dbat, none, another objective (docs/concepts.md) or module:function, "
+            "each also with a weight (dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
+        ),
+    ] = "dbat,none,oracle",
+    mix: Annotated[
+        str, typer.Option(help="Shares of unlabelled states whose features are drawn each for itself: 0.1,0.5.")
+    ] = "0.5",
+    members: Annotated[int, typer.Option(help="Hypotheses (K) of an entry.")] = 4,
+    seeds: Annotated[str, typer.Option(help="0-4, or 0,3,7.")] = "0-4",
+    moved: Annotated[bool, typer.Option("--moved", help="Two frames, and a fifth feature: the object moved.")] = False,
+    high: Annotated[float, typer.Option(help="Ranking of a feature from which on a member owns it.")] = 0.95,
+    low: Annotated[float, typer.Option(help="Its ranking of every other feature is at most this.")] = 0.6,
+    set_: Set = None,
+    quiet: Quiet = False,
+) -> None:
+    """Which features do members find, of several that fit the labels equally well?
+
+    Small scenes have four planted features: colour, shape and place of an
+    object, and how many boxes there are. In the labelled ones all four say the
+    same; in a share of the unlabelled ones (--mix) each is drawn for itself.
+    Members are trained as by train-ensemble (--set takes its settings) and
+    scored on scenes in which all features are crossed:
+
+    - coverage: the share of features that some member ranks by (area under the
+    ROC curve of at least --high) while it ranks by no other (at most --low)
+
+    - best: the highest ranking of a feature by a member, mean over features
+
+    - same: the share of pairs of members with the same best feature
+
+    - gap: what the threshold of 0.5 costs in balanced accuracy
+
+    - labels: how many it takes until the right member is known, for those
+    features that are covered
+
+    Writes results.csv (a line for each entry, mix, seed, member and feature)
+    and page.html.
+    """
+    from hypogoal.core import own_code
+    from hypogoal.core.compute import prepare
+    from hypogoal.which_feature import page, run
+
+    prepare()
+    options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds}
+    config = run.resolved({**options, "moved": moved, "high": high, "low": low}, set_ or ())
+    with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
+        cells = run.run(config, out, quiet)
+    draw(page.table_of(cells, config), 79)
+    page.write(out / "page.html", cells, config)
+    give(out / "page.html")

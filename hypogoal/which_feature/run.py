@@ -1,0 +1,246 @@
+"""Spec H1: entries of the benchmark, the cells they are scored in, and the folder that keeps cell by cell."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from hypogoal.core import own_code
+from hypogoal.core.config import as_dict, from_values, resolve, setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_json, replace_text, write_table
+from hypogoal.core.progress import Progress
+from hypogoal.core.seeding import rng_for, seed_for
+from hypogoal.diversity import load_objective
+from hypogoal.evaluation.plots import slug
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.networks import Parts
+from hypogoal.hypotheses.training import fit
+from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
+from hypogoal.which_feature.states import (
+    TILE,
+    States,
+    crossed_states,
+    labelled_states,
+    names_of,
+    unlabelled_states,
+)
+
+CNN, ORACLE = "cnn", "oracle"  # entries that are no objectives: one member, and one taught by each factor's truth
+NETWORK = f"{__name__}:tiles"
+DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other ones of
+    "members": 4,
+    "diversity_weight": 0.01,
+    "network": NETWORK,
+    "steps": 150,
+    "learning_rate": 2e-3,
+    "batch_size": 32,
+}
+LABELLED, UNLABELLED, COPIES = 256, 512, 20  # states; copies of each combination in the test, as many for the oracle
+SHOWN = 4  # test states of each kind that a member is surest of
+COLUMNS = ("entry", "mix", "seed", "member", "factor", "ranking", "balanced_accuracy", "at_best", "labels")
+AGAIN = "Remove it and give the same command again, or choose another --out."
+
+
+def tiles(channels: int) -> Parts:
+    """The benchmark's member network: a layer that reads tiles, one of 3x3 tiles, one hidden dense layer."""
+    layers: list[nn.Module] = []
+    for inputs, kernel, stride in ((channels, TILE, TILE), (16, 3, 1)):
+        layers += [nn.Conv2d(inputs, 16, kernel, stride, bias=False), nn.BatchNorm2d(16), nn.ReLU()]
+    return layers, (64,)
+
+
+@dataclass(frozen=True)
+class WhichFeatureConfig(EnsembleConfig):
+    """What is run; settings of ensembles are those of training, but for ``diversity``, which names all entries."""
+
+    mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states whose factors are crossed", low=0.0, high=1.0)
+    seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
+    moved: bool = setting(False, "two frames, and whether the object moved between them as a fifth factor")
+    high: float = setting(0.95, "ranking of a factor from which on a member owns it", low=0.5, high=1.0)
+    low: float = setting(0.6, "its ranking of every other factor is at most this", low=0.0, high=1.0)
+
+
+def resolved(options: Mapping[str, Any], assignments: Iterable[str] = ()) -> WhichFeatureConfig:
+    """The settings with the benchmark's defaults; see :func:`hypogoal.core.config.resolve`."""
+    stage = "train-ensemble"
+    return resolve(WhichFeatureConfig, stage=stage, options=options, assignments=assignments, defaults=DEFAULTS)
+
+
+class Entry(NamedTuple):
+    """A method under test: its name as given, its objective (or ``cnn``, ``oracle``), its weight (None: setting's)."""
+
+    name: str
+    objective: str
+    weight: float | None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training of one entry, scored on crossed states; F factors, K members.
+
+    Attributes:
+        entry, mix, seed: which.
+        ranking: float (K, F), see ``scores.rankings``.
+        balanced_accuracy, at_best: float (K, F), at 0.5 and at the best threshold.
+        labels: int (F,), see ``scores.labels_needed``.
+        surest: int (K, 2, 4), the test states with the highest and with the lowest probability; empty where unknown.
+    """
+
+    entry: str
+    mix: float
+    seed: int
+    ranking: NDArray[np.float64]
+    balanced_accuracy: NDArray[np.float64]
+    at_best: NDArray[np.float64]
+    labels: NDArray[np.int64]
+    surest: NDArray[np.int64]
+
+
+def parse_entry(text: str) -> Entry:
+    """``dbat``, ``module:object``, ``cnn`` or ``oracle``; of objectives also with a weight, ``dbat:0.01``.
+
+    Raises:
+        UserError: no such objective, code that was not allowed, or no weight.
+    """
+    objective, _, last = text.rpartition(":")
+    try:
+        entry = Entry(text, objective, float(last)) if objective else Entry(text, text, None)
+    except ValueError:
+        entry = Entry(text, text, None)
+    if entry.objective in (CNN, ORACLE):
+        if entry.weight is not None:
+            raise UserError(f"{entry.objective} has no weight", text, f"Give {entry.objective}.")
+    else:
+        load_objective(entry.objective)
+    return entry
+
+
+def objectives_in(text: str) -> list[str]:
+    """What may stand for an objective in entries that a user gave, for :func:`hypogoal.core.own_code.given`."""
+    names = [name.strip() for name in text.split(",")]
+    return [*names, *(name.rpartition(":")[0] for name in names)]
+
+
+def config_of(entry: Entry, config: WhichFeatureConfig) -> WhichFeatureConfig:
+    """The settings that the entry's members are trained with."""
+    if entry.objective in (CNN, ORACLE):
+        return replace(config, members=1, diversity="none")
+    weight = {} if entry.weight is None else {"diversity_weight": entry.weight}
+    return from_values(WhichFeatureConfig, {**as_dict(config), "diversity": entry.objective, **weight}, entry.name)
+
+
+def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) -> Cell:
+    """Train an entry's members with the product's own ``fit`` and score them on crossed states.
+
+    Entries of one seed have the same states, initial weights and batches.
+    """
+    test = crossed_states(COPIES, seed, config.moved)
+    probabilities = _trained(entry, mix, seed, config_of(entry, config), test)
+    ranked = rankings(probabilities, test.factors)
+    at_half, at_best = balanced_accuracies(probabilities, test.factors)
+    labels = labels_needed(probabilities, test.factors, ranked, rng_for(seed, "which-feature", "labels"))
+    order = probabilities.argsort(axis=0, kind="stable").T
+    surest = np.stack([order[:, : -SHOWN - 1 : -1], order[:, :SHOWN]], axis=1)
+    return Cell(entry.name, mix, seed, ranked, at_half, at_best, labels, surest)
+
+
+def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: States) -> NDArray[np.float32]:
+    """Probabilities (N, K) of the trained members on the test states."""
+    moved = config.moved
+    with own_code.vouched(NETWORK):
+        if entry.objective == ORACLE:
+            told = crossed_states(COPIES, seed, moved, split=ORACLE)
+            seeds = [seed_for(seed, ORACLE, factor) for factor in range(told.factors.shape[1])]
+            members = [
+                fit(told.observations, truth, told.observations[:0], config, own)
+                for truth, own in zip(told.factors.T, seeds, strict=True)
+            ]
+            return np.concatenate([member.predict(test.observations) for member in members], axis=1)
+        labelled = labelled_states(LABELLED, seed, moved)
+        unlabelled = unlabelled_states(UNLABELLED, mix, seed, moved).observations
+        ensemble = fit(labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble"))
+        return ensemble.predict(test.observations)
+
+
+def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
+    """Every cell that is not in ``out`` yet, seed by seed; then all that are there, ``results.csv`` with them.
+
+    Raises:
+        UserError: ``out`` is something else, was begun with other settings, or a cell in it is damaged.
+    """
+    entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in config.diversity.split(","))]
+    for entry in entries:
+        config_of(entry, config)  # whose weight may be none
+    wanted = [(entry, mix, seed) for seed in config.seeds for mix in config.mix for entry in entries]
+    if not wanted:
+        raise UserError("there is nothing to run", f"seeds {config.seeds}, mixes {config.mix}", "Give one of each.")
+    _begin(out, config)
+    paths = [out / "cells" / f"{slug(entry.name)}_{mix}_{seed}.json" for entry, mix, seed in wanted]
+    with Progress("which-feature", len(wanted), quiet) as progress:
+        progress.resume(sum(path.exists() for path in paths))
+        for cell, path in zip(wanted, paths, strict=True):
+            if not path.exists():
+                replace_text(path, _text(run_cell(*cell, config)))
+                progress.advance()
+    cells = [_read(path, config.moved) for path in sorted((out / "cells").glob("*.json"))]
+    write_table(out / "results.csv", COLUMNS, rows_of(cells, config.moved))
+    return cells
+
+
+def rows_of(cells: Iterable[Cell], moved: bool) -> Iterator[tuple[Any, ...]]:
+    """The lines of ``results.csv``: one for each cell, member and factor, in ``COLUMNS``."""
+    for cell in cells:
+        for member, factor in np.ndindex(*cell.ranking.shape):
+            scores = (table[member, factor] for table in (cell.ranking, cell.balanced_accuracy, cell.at_best))
+            numbers = (*(f"{score:.4f}" for score in scores), int(cell.labels[factor]))
+            yield (cell.entry, cell.mix, cell.seed, member, names_of(moved)[factor], *numbers)
+
+
+def shared(config: WhichFeatureConfig) -> dict[str, Any]:
+    """The settings that all cells of a folder have in common, as JSON."""
+    own = ("diversity", "mix", "seeds", "high", "low")
+    return {name: value for name, value in as_dict(config).items() if name not in own}
+
+
+def _begin(out: Path, config: WhichFeatureConfig) -> None:
+    """The folder, with the settings of its cells."""
+    path = out / "settings.json"
+    if not path.exists():
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise UserError("this is no folder of the benchmark", out, "Choose another --out.")
+        out.mkdir(parents=True, exist_ok=True)
+        replace_text(path, json.dumps(shared(config), indent=1) + "\n")
+    elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):
+        raise UserError("this benchmark was begun with other settings", out, "Give those, or choose another --out.")
+    (out / "cells").mkdir(exist_ok=True)
+
+
+def _text(cell: Cell) -> str:
+    """A cell as JSON."""
+    return json.dumps(vars(cell), default=lambda array: array.tolist()) + "\n"
+
+
+def _read(path: Path, moved: bool) -> Cell:
+    """A cell from its file, which may be anyone's."""
+    data = read_json(path, "the cell is", AGAIN)
+    try:
+        ranked, at_half, at_best = (np.array(data[name], dtype=np.float64) for name in COLUMNS[5:8])
+        labels, surest = (np.array(data[name], dtype=np.int64) for name in ("labels", "surest"))
+        named = str(data["entry"]), float(data["mix"]), int(data["seed"])
+    except (TypeError, ValueError, KeyError, OverflowError):
+        raise UserError("the cell is damaged", path, AGAIN) from None
+    shape = (len(ranked) if ranked.ndim else 0, len(names_of(moved)))
+    shapes = [array.shape for array in (ranked, at_half, at_best, labels, surest)]
+    fitting = shapes == [shape, shape, shape, shape[1:], (shape[0], 2, SHOWN)] and shape[0] > 0
+    within = all(((table >= 0) & (table <= 1)).all() for table in (ranked, at_half, at_best))
+    if not (fitting and within and surest.min() >= 0 and surest.max() < COPIES * 2 ** shape[1]):
+        raise UserError("the cell is damaged", path, AGAIN)
+    return Cell(*named, ranked, at_half, at_best, labels, surest)

@@ -1,0 +1,110 @@
+"""Spec H1: what members know of planted factors. Pure functions of their probabilities on crossed states."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t
+
+from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
+
+THRESHOLD = 0.5  # of the probability, above which a member says yes
+ORDERS = 200  # in which states are labelled
+MOST_LABELS = 100
+SURE = 0.9  # probability with which the right member is to be the one picked
+NEAR = 0.01  # in ranking: members so near to the best one are right, too
+
+Table = NDArray[np.float64]  # (K, F)
+
+
+def rankings(probabilities: NDArray[np.float32], factors: NDArray[np.bool_]) -> Table:
+    """Area under the ROC curve of every member on every factor.
+
+    Args:
+        probabilities: float32 (N, K).
+        factors: bool (N, F), the truth; every combination equally often.
+
+    Returns:
+        float64 (K, F), .5 where a member knows nothing of a factor.
+    """
+    return np.stack([ranking(probabilities, truth) for truth in factors.T], axis=1)
+
+
+def balanced_accuracies(probabilities: NDArray[np.float32], factors: NDArray[np.bool_]) -> tuple[Table, Table]:
+    """Balanced accuracy of every member on every factor, (K, F): at 0.5, and at the best threshold there is."""
+    verdicts = probabilities > THRESHOLD
+    plain = [member_scores(verdicts, truth)["balanced_accuracy"] for truth in factors.T]
+    best = [best_threshold(probabilities, truth)[1] for truth in factors.T]
+    return np.stack(plain, axis=1), np.stack(best, axis=1)
+
+
+def owned(ranked: Table, high: float = 0.95, low: float = 0.6) -> NDArray[np.bool_]:
+    """Which member owns which factor, bool (K, F): it ranks by it, at least ``high``, and by no other, at most ``low``.
+
+    Args:
+        ranked: see :func:`rankings`.
+        high, low: areas under the ROC curve.
+    """
+    known, unknown = ranked >= high, ranked <= low
+    return known & (unknown.sum(axis=1, keepdims=True) == ranked.shape[1] - 1)
+
+
+def coverage(ranked: Table, high: float = 0.95, low: float = 0.6) -> float:
+    """The share of factors that some member owns, see :func:`owned`."""
+    return float(owned(ranked, high, low).any(axis=0).mean())
+
+
+def redundancy(ranked: Table) -> float:
+    """The share of pairs of members whose best factor is the same; NaN for one member. Chance: 1 / F."""
+    best = ranked.argmax(axis=1)
+    same = [best[a] == best[b] for a, b in combinations(range(len(best)), 2)]
+    return float(np.mean(same)) if same else float("nan")
+
+
+def calibration_gap(ranked: Table, at_half: Table, at_best: Table) -> float:
+    """Balanced accuracy at the best threshold minus that at 0.5, on each member's best factor; mean over members."""
+    rows, best = np.arange(len(ranked)), ranked.argmax(axis=1)
+    return float((at_best - at_half)[rows, best].mean())
+
+
+def labels_needed(
+    probabilities: NDArray[np.float32], factors: NDArray[np.bool_], ranked: Table, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """How many labels it takes until the right member is known, where each factor in turn is the true one.
+
+    States are labelled one by one in random order, and the member with the highest hit rate so far (its verdict at 0.5
+    is the label) is picked, one of several at random. Right is whoever ranks the true factor best, up to ``NEAR``.
+
+    Args:
+        probabilities: float32 (N, K).
+        factors: bool (N, F).
+        ranked: float64 (K, F), see :func:`rankings`.
+        rng: draws ``ORDERS`` orders.
+
+    Returns:
+        int64 (F,): the least number of labels from which on, up to ``MOST_LABELS`` (or N), the pick is right with a
+        probability of ``SURE``; 0 where no label is needed, one more than the most where they do not suffice.
+    """
+    verdicts = probabilities > THRESHOLD
+    most = min(MOST_LABELS, len(verdicts))
+    orders = np.stack([rng.permutation(len(verdicts))[:most] for _ in range(ORDERS)])  # (R, n)
+    right = ranked >= ranked.max(axis=0) - NEAR  # (K, F)
+    needed = []
+    for factor, truth in enumerate(factors.T):
+        hits = (verdicts == truth[:, None])[orders].cumsum(axis=1)  # (R, n, K)
+        picked = hits == hits.max(axis=2, keepdims=True)
+        sure = (picked & right[:, factor]).sum(axis=2) / picked.sum(axis=2)
+        chances = np.concatenate([[right[:, factor].mean()], sure.mean(axis=0)])
+        failing = np.flatnonzero(chances < SURE)
+        needed.append(failing[-1] + 1 if len(failing) else 0)
+    return np.array(needed, dtype=np.int64)
+
+
+def student(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean, and half the width of Student's 95 % interval over seeds; NaN where there are fewer than three."""
+    if len(values) < 3:
+        return float(np.mean(values)) if len(values) else float("nan"), float("nan")
+    half = t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
+    return float(np.mean(values)), float(half)

@@ -1,0 +1,118 @@
+"""Spec H1: scenes with planted factors, drawn with MiniGrid's own tiles, the truth of each factor beside its image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from minigrid.core.grid import Grid
+from minigrid.core.world_object import Ball, Box, Goal, Key, Wall
+from numpy.typing import NDArray
+
+from hypogoal.core.seeding import rng_for
+
+FACTORS = ("colour", "shape", "place", "count")
+MOVED = "moved"  # the fifth, of two frames
+INNER, TILE = 4, 8  # free cells a side within the walls; pixels of a cell
+SIDE = (INNER + 2) * TILE  # pixels of an image
+CELLS = INNER * INNER
+BOX_COLOURS = ("yellow", "purple", "grey")
+MOST_BOXES = 4  # few are one or two, many are three or four
+FLOOR, WALL, AGENT, OBJECT, BOX, GOAL = 0, 1, 2, 6, 10, 13  # where in the tiles each kind begins
+
+
+@dataclass(frozen=True)
+class States:
+    """Scenes and what is true of them.
+
+    Attributes:
+        observations: uint8 (N, 48, 48, 3); with ``moved`` (N, 48, 48, 6), the frame before and the frame now.
+        factors: bool (N, F), whether each factor holds, in the order of ``FACTORS``: the object is blue, it is a ball,
+            it is in the right half, there are three or four boxes; with ``moved`` also: it was in another cell in the
+            frame before.
+    """
+
+    observations: NDArray[np.uint8]
+    factors: NDArray[np.bool_]
+
+
+def names_of(moved: bool) -> tuple[str, ...]:
+    """The factors by name."""
+    return (*FACTORS, MOVED) if moved else FACTORS
+
+
+def labelled_states(count: int, seed: int, moved: bool = False) -> States:
+    """The labelled context: half of the states are positives, in which every factor holds; in the others none does."""
+    rng = rng_for(seed, "which-feature", "labelled")
+    holds = rng.permutation(np.arange(count) % 2 == 0)
+    return _drawn(np.repeat(holds[:, None], len(names_of(moved)), axis=1), rng)
+
+
+def unlabelled_states(count: int, mix: float, seed: int, moved: bool = False) -> States:
+    """States of which members are told nothing.
+
+    Args:
+        count: how many.
+        mix: the probability with which a state's factors are drawn each for itself, evenly; else all are one even bit.
+        seed: of all that is random.
+        moved: two frames, and the factor that needs them.
+    """
+    rng = rng_for(seed, "which-feature", "unlabelled")
+    own, one = rng.random((count, len(names_of(moved)))) < 0.5, rng.random((count, 1)) < 0.5
+    return _drawn(np.where(rng.random((count, 1)) < mix, own, one), rng)
+
+
+def crossed_states(copies: int, seed: int, moved: bool = False, *, split: str = "test") -> States:
+    """Every combination of factors ``copies`` times, in random order; each ``split`` has random numbers of its own."""
+    rng = rng_for(seed, "which-feature", split)
+    every = np.array(list(product((False, True), repeat=len(names_of(moved)))))
+    return _drawn(rng.permutation(np.repeat(every, copies, axis=0)), rng)
+
+
+def _drawn(factors: NDArray[np.bool_], rng: np.random.Generator) -> States:
+    """Scenes of these factors; all else is drawn at random, in the same way whatever the factors are."""
+    count = len(factors)
+    colour, shape, place, many = factors[:, : len(FACTORS)].T.astype(np.int64)
+    rows = np.arange(count)
+    x, y = rng.integers(INNER // 2, size=count) + place * (INNER // 2), rng.integers(INNER, size=count)
+    up = np.where(y == 0, False, (y == INNER - 1) | (rng.random(count) < 0.5))
+    now, before = y * INNER + x, np.where(up, y - 1, y + 1) * INNER + x
+    order = rng.random((count, CELLS))
+    order[rows, now], order[rows, before] = -1.0, 2.0  # nothing else is where the object was or may have been
+    cells = order.argsort(axis=1)
+    things = np.full((count, CELLS), FLOOR)
+    things[:, 0] = OBJECT + 2 * shape + colour
+    things[:, 1] = AGENT + rng.integers(4, size=count)
+    boxes = BOX + rng.integers(len(BOX_COLOURS), size=(count, MOST_BOXES))
+    number = 1 + rng.integers(2, size=count) + 2 * many
+    things[:, 2 : 2 + MOST_BOXES] = np.where(np.arange(MOST_BOXES) < number[:, None], boxes, FLOOR)
+    things[:, 2 + MOST_BOXES] = np.where(rng.random(count) < 0.5, GOAL, FLOOR)
+    ids = np.empty((count, CELLS), dtype=np.int64)
+    np.put_along_axis(ids, cells, things, axis=1)
+    frames = [_image(ids)]
+    if factors.shape[1] > len(FACTORS):
+        earlier = ids.copy()
+        earlier[rows, cells[:, 1]] = AGENT + rng.integers(4, size=count)
+        moved = rows[factors[:, -1]]
+        earlier[moved, now[moved]], earlier[moved, before[moved]] = FLOOR, things[moved, 0]
+        frames.insert(0, _image(earlier))
+    return States(np.concatenate(frames, axis=-1), factors)
+
+
+def _image(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Kinds of tiles (N, 16), row by row -> uint8 (N, 48, 48, 3) with walls around."""
+    grid = np.full((len(ids), INNER + 2, INNER + 2), WALL)
+    grid[:, 1:-1, 1:-1] = ids.reshape(-1, INNER, INNER)
+    return tiles()[grid].swapaxes(2, 3).reshape(len(ids), SIDE, SIDE, 3)
+
+
+@lru_cache(maxsize=1)
+def tiles() -> NDArray[np.uint8]:
+    """Every kind of tile as MiniGrid draws it, uint8 (kinds, 8, 8, 3)."""
+    objects = [shape(colour) for shape in (Key, Ball) for colour in ("red", "blue")]
+    things = [None, Wall(), None, None, None, None, *objects, *map(Box, BOX_COLOURS), Goal()]
+    directions = {AGENT + direction: direction for direction in range(4)}
+    drawn = [Grid.render_tile(thing, directions.get(kind), tile_size=TILE) for kind, thing in enumerate(things)]
+    return np.stack(drawn).astype(np.uint8)  # MiniGrid draws in floats, and cuts them when it fills a picture

@@ -1,0 +1,99 @@
+"""What the scores say of members whose knowledge is known."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hypogoal.which_feature import scores
+
+FACTORS = np.array(list(product((False, True), repeat=4)) * 20)  # (320, 4), crossed
+SURE: NDArray[np.float32] = np.where(FACTORS, 0.9, 0.1).astype(np.float32)  # a member for each factor
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_members_that_know_a_factor_each_cover_all() -> None:
+    """By hand: .9 where it holds and .1 where not."""
+    ranked = scores.rankings(SURE, FACTORS)
+    assert (ranked == np.where(np.eye(4) == 1, 1.0, 0.5)).all()
+    assert (scores.owned(ranked) == np.eye(4, dtype=bool)).all()
+    assert scores.coverage(ranked) == 1.0
+    assert scores.redundancy(ranked) == 0.0
+
+
+@pytest.mark.parametrize("factor", range(4))
+def test_copies_of_one_member_cover_one_factor(factor: int) -> None:
+    """However many there are."""
+    ranked = scores.rankings(np.repeat(SURE[:, [factor]], 6, axis=1), FACTORS)
+    assert scores.coverage(ranked) == 0.25
+    assert scores.redundancy(ranked) == 1.0
+
+
+def test_members_that_guess_cover_nothing() -> None:
+    """And neither do members that always say the same."""
+    for seed in range(20):
+        guesses = np.random.default_rng(seed).random((320, 4)).astype(np.float32)
+        assert scores.coverage(scores.rankings(guesses, FACTORS)) == 0.0
+    assert scores.coverage(scores.rankings(np.full((320, 4), 0.3, np.float32), FACTORS)) == 0.0
+
+
+def test_a_member_that_uses_two_factors_owns_neither() -> None:
+    """A member of both at once ranks .75 on each; one of the first, with a hint of the second, 1 and .75."""
+    both = (FACTORS[:, :1] & FACTORS[:, 1:2]).astype(np.float32)
+    assert scores.rankings(both, FACTORS)[0].tolist() == [0.75, 0.75, 0.5, 0.5]
+    hint = (0.6 * FACTORS[:, :1] + 0.2 * FACTORS[:, 1:2]).astype(np.float32)
+    ranked = scores.rankings(hint, FACTORS)
+    assert ranked[0].tolist() == [1.0, 0.75, 0.5, 0.5]
+    assert scores.coverage(ranked) == 0.0
+    assert scores.coverage(ranked, low=0.8) == 0.25
+
+
+def test_redundancy_counts_pairs() -> None:
+    """Best factors 0, 0, 1: one pair of three. One member has no pairs."""
+    ranked = scores.rankings(SURE[:, [0, 0, 1]], FACTORS)
+    assert scores.redundancy(ranked) == pytest.approx(1 / 3)
+    assert np.isnan(scores.redundancy(ranked[:1]))
+
+
+def test_the_gap_is_what_the_threshold_costs() -> None:
+    """A member that ranks perfectly and never says yes loses a half; one at the right threshold nothing."""
+    shy = SURE[:, :2] * np.array([1.0, 0.5], np.float32)
+    ranked = scores.rankings(shy, FACTORS)
+    at_half, at_best = scores.balanced_accuracies(shy, FACTORS)
+    assert at_half[[0, 1], [0, 1]].tolist() == [1.0, 0.5]
+    assert at_best[[0, 1], [0, 1]].tolist() == [1.0, 1.0]
+    assert scores.calibration_gap(ranked, at_half, at_best) == 0.25
+
+
+def test_labels_until_the_right_member_is_known() -> None:
+    """Two members, each perfect on a factor of its own: the wrong one is right half of the time, by chance.
+
+    After n labels it is level with a probability of .5^n, and then taken every other time: the pick is right with
+    1 - .5^(n + 1), .875 at 2 labels and .9375 at 3, up to the chance of 200 orders.
+    """
+    ranked = scores.rankings(SURE[:, :2], FACTORS)
+    needed = scores.labels_needed(SURE[:, :2], FACTORS, ranked, rng())
+    assert needed[:2].tolist() == [3, 3]
+    assert needed[2:].tolist() == [0, 0]  # of which both know nothing: neither is wrong
+    assert (scores.labels_needed(np.repeat(SURE[:, :1], 3, 1), FACTORS, ranked[[0, 0, 0]], rng()) == 0).all()
+
+
+def test_labels_do_not_tell_members_that_say_the_same() -> None:
+    """One ranks perfectly but never says yes, as another does: all labels there are do not suffice."""
+    members = np.concatenate([0.5 * SURE[:, :1], np.full((320, 1), 0.2, np.float32)], axis=1)
+    needed = scores.labels_needed(members, FACTORS, scores.rankings(members, FACTORS), rng())
+    assert needed[0] == scores.MOST_LABELS + 1
+
+
+def test_intervals_are_students() -> None:
+    """By hand: of 0, .5, 1 the mean is .5, half of the interval 4.303 * .5 / sqrt(3). Two points have none."""
+    mean, half = scores.student(np.array([0.0, 0.5, 1.0]))
+    assert mean == 0.5
+    assert half == pytest.approx(1.2421, abs=1e-4)
+    assert np.isnan(scores.student(np.array([0.0, 1.0]))[1])
