@@ -82,10 +82,14 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
 def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.float64]:
     """How often each option's greedy execution brings about its true sub-goal, the episode not lost.
 
-    The agent's policies remember nothing, and its engine knows what follows. ``goals`` (O,) are the columns of the
-    engine's labels that the options' true sub-goals are. Executions begin in ``states`` (D,), each as often as it is
-    there: an option's where it is offered, its sub-goal does not hold, and can be had within the timeout. Float64 (O,);
-    NaN for an option that begins nowhere.
+    Args:
+        loop: an agent whose policies remember nothing, in an engine that knows what follows.
+        goals: int64 (O,), the column of the engine's labels that each option's true sub-goal is.
+        states: int64 (D,), in which executions begin, each as often as it is there: an option's where it is offered,
+            its sub-goal does not hold, and can be had within the timeout.
+
+    Returns:
+        float64 (O,); NaN for an option that begins nowhere.
     """
     from hypogoal.options.planned import distances
 
@@ -121,13 +125,18 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
 
 
 def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
-    """Whether the better of K members are taken, where at least two members of the chosen sub-goal were offered.
+    """Whether the better members are taken, where at least two members of the chosen sub-goal were offered.
 
-    Of :func:`qualities` (G*K,), NaN where not known: ``preference`` (G*K,): chosen / expected among the members of the
-    chosen sub-goal, NaN below ``LEAST`` expected; ``within_rho``: Spearman's rho of the two, mean over sub-goals whose
-    members' qualities differ by ``DIFFERENCE``; ``pair``: of two members offered whose qualities differ by that, how
-    often the better of those taken (chance .5); ``score``: (quality taken - mean quality) / (best - mean), over
-    decisions (chance 0).
+    Args:
+        choices: the decisions.
+        quality: float (G*K,), see :func:`qualities`; NaN where it is not known.
+        members: K.
+
+    Returns:
+        ``preference`` (G*K,): chosen / expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected;
+        ``within_rho``: Spearman's rho of the two, mean over sub-goals whose members' qualities differ by
+        ``DIFFERENCE``; ``pair``: of two members offered whose qualities differ by that, how often the better of those
+        taken (chance .5); ``score``: (quality taken - mean quality) / (best - mean), over decisions (chance 0).
     """
     options = np.arange(len(quality))
     of_goal = choices.offered & (options // members == (choices.options // members)[:, None])

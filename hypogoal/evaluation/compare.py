@@ -42,7 +42,7 @@ class Part:
     name: str  # the key of measured entries that says of what agent or method they are
     measured: Callable[[Metrics], Sequence[Entry]]  # what ``against`` takes
     against: Callable[[Sequence[Entry]], Rows]  # pairs of runs, see ``numbers.pairs``
-    # drawn beside the table, above it where ``above``
+    # Drawn beside the table, above it where ``above``.
     figures: Callable[[Runs, Curves], Iterable[Drawn]] = lambda runs, arrays: ()
     above: bool = False
 

@@ -70,7 +70,7 @@ class Judgement:
     unlabelled: Unlabelled  # M states
     kinds: Sequence[str]  # names of the values of the origin ``kind``
     judged: Judged  # what K members say
-    # filled by the questions: what is said of this sub-goal's members in ``ensembles``
+    # Filled by the questions: what is said of this sub-goal's members in ``ensembles``.
     row: dict[str, Any] = field(default_factory=dict)
 
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, NDArray[np.uint8], NDArray[np.uint8]]:
@@ -118,9 +118,9 @@ class Work:
     progress: Progress  # is told of each artefact
     shown: int | None = None  # the ensemble whose states are shown; None where there is none
     browsed: int | None = None  # the ensemble whose states are browsed; None where there is none
-    # what questions keep of the states that they were shown, by their own names
+    # What questions keep of the states that they were shown, by their own names.
     looked: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
-    # what is said of each; its ``sub_goals`` are the rows of ``Judgement``
+    # What is said of each; its ``sub_goals`` are the rows of ``Judgement``.
     ensembles: list[dict[str, Any]] = field(default_factory=list)
     metrics: dict[str, Any] = field(default_factory=dict)  # the numbers so far
 

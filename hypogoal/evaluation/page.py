@@ -56,7 +56,7 @@ class Material:
 
     metrics: Mapping[str, Any]  # what ``metrics.json`` holds
     arrays: Mapping[str, NDArray[Any]]  # what ``arrays.h5`` holds, by name
-    # filled while the page is made, to be written as files too
+    # Filled while the page is made, to be written as files too.
     figures: dict[str, Figure] = field(default_factory=dict)
     drawings: dict[str, str] = field(default_factory=dict)  # the figures' SVG
 
@@ -109,8 +109,7 @@ class Column(NamedTuple):
 def label(title: str, key: Any, *, once: Any = None) -> Column:
     """A column of text; ``key`` is the entry's key, several with dots between, or a function of the entry.
 
-    ``once``: the cell is left empty where this, a key too, or True for the cell itself, is what it was in the row
-    above.
+    A cell is left empty where ``once`` of the entry, or with True the cell itself, is what it was in the row above.
     """
     of = key if callable(key) else partial(at, key=key)
     return Column(title, of, once=of if once is True else once)
@@ -389,15 +388,15 @@ def _digest(text: str) -> str:
 class Question:
     """One question of the paper, whole: its numbers, figures, sections. What one has not, it leaves as it is here."""
 
-    # is shown every ensemble on every sub-goal's states as it is judged; fills ``row`` and ``work.looked``
+    # Is shown every ensemble on every sub-goal's states as it is judged; fills ``row`` and ``work.looked``.
     look: Callable[[Work, Judgement], None] = lambda work, judgement: None
-    # by their key in ``metrics.json``; what was found before is in ``work.metrics``
+    # By their key in ``metrics.json``; what was found before is in ``work.metrics``.
     numbers: Callable[[Work], dict[str, Any]] = lambda work: {}
     missing: Callable[[Work], list[str]] = lambda work: []  # a line for everything that the run has no artefacts for
     rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()  # of ``numbers.csv``
-    # methods against each other, by their key in ``comparisons``
+    # Methods against each other, by their key in ``comparisons``.
     pairs: Callable[[Entry], dict[str, Rows]] = lambda metrics: {}
-    # unit and meaning of its quantities, those that ``numbers.QUANTITIES`` does not have
+    # Unit and meaning of its quantities, those that ``numbers.QUANTITIES`` does not have.
     meanings: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     summary: Callable[[Entry], list[Table]] = lambda metrics: []  # tables for a terminal
     sections: Callable[[Material], list[Block]] = lambda material: []  # those that the run has anything for

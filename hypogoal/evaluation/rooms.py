@@ -77,12 +77,19 @@ def room_metrics(
     origins: Mapping[str, NDArray[np.int64]],
     kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Spec F1: one ensemble's members by whether training saw the room, from what they say of held-out states (N, K).
+    """Spec F1: one ensemble's members by whether training saw the room.
 
-    Of ``origins`` (N,) it takes ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``, whose values
-    ``kinds`` names. ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated,
-    mean and worst of accuracy, balanced accuracy and ``ranking`` (see ``accuracy.ranking``); ``validated``: which
-    member the rooms of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
+    Args:
+        probabilities: float (N, K), that held-out states are reached.
+        verdicts: bool (N, K), what was made of them.
+        labels: bool (N,), the truth.
+        origins: int (N,) each: ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``.
+        kinds: names of the values of ``kind``.
+
+    Returns:
+        ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
+        of accuracy, balanced accuracy and ``ranking`` (see ``accuracy.ranking``); ``validated``: which member the rooms
+        of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
     """
     seen, rooms = origins["seen"], origins.get("room")
     validated = choose(verdicts, labels, seen)

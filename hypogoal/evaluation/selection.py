@@ -117,10 +117,17 @@ def selection_of_run(
 ) -> dict[str, Any]:
     """Spec F6: how often each member was offered and chosen, beside how well it matches the true sub-goal here.
 
-    ``match`` (G*K,) is balanced accuracy on the layout's reachable states. ``sub_goals``: a row per member (option,
-    offered, chosen, expected, preference, late_preference, share, reached, mean duration in steps, match), the most and
-    the least preferred member; ``rank_correlation`` of preference, late preference (the last quarter of training) and
-    raw share with the match, each over all options and within sub-goals. NaN where not defined.
+    Args:
+        choices: the run's table of choices.
+        match: float (G*K,), each member's balanced accuracy on the layout's reachable states.
+        sub_goals: G names.
+        members: K.
+
+    Returns:
+        ``sub_goals``: a row per member (option, offered, chosen, expected, preference, late_preference, share, reached,
+        mean duration in steps, match), the most and the least preferred member; ``rank_correlation`` of preference,
+        late preference (the last quarter of training) and raw share with the match, each over all options and within
+        sub-goals. NaN where not defined.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
