@@ -50,9 +50,8 @@ class Choices:
 def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choices]:
     """Let an agent play; nothing is learned, options are greedy and choices are drawn as in training.
 
-    Returns:
-        Over whole episodes: ``success`` (share solved), ``near`` (share solved within 1.5 times the layout's shortest
-        path), ``length`` (mean steps); and the decisions.
+    Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (share solved within 1.5 times the
+    layout's shortest path) and ``length`` (mean steps).
     """
     from hypogoal.options.choosers import Chooser  # with PyTorch, which a report needs not
 

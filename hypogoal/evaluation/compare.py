@@ -31,28 +31,18 @@ LADDERS = [rooms.METHOD._replace(once=None), rooms.N]
 
 @dataclass(frozen=True)
 class Part:
-    """A kind of result, as it stands beside other runs'.
+    """A kind of result, as it stands beside other runs'."""
 
-    Attributes:
-        title: its section's.
-        entries: the rows of its table in a run's metrics.
-        alike: keys; rows alike in all of them stand next to each other.
-        first, then: columns before that of the run, shown once for rows alike, and those behind it.
-        caption: the table's.
-        measured: what ``against`` takes: entries whose key ``name`` says of what agent or method they are.
-        against: pairs of runs, see ``numbers.pairs``.
-        figures: drawn beside the table, above it where ``above``.
-    """
-
-    title: str
-    entries: Callable[[Metrics], Sequence[Entry]]
-    alike: tuple[str, ...]
-    first: Sequence[Column]
-    then: Sequence[Column]
-    caption: str
-    name: str
-    measured: Callable[[Metrics], Sequence[Entry]]
-    against: Callable[[Sequence[Entry]], Rows]
+    title: str  # of its section
+    entries: Callable[[Metrics], Sequence[Entry]]  # the rows of its table in a run's metrics
+    alike: tuple[str, ...]  # keys; rows alike in all of them stand next to each other
+    first: Sequence[Column]  # columns before that of the run, shown once for rows alike
+    then: Sequence[Column]  # columns behind it
+    caption: str  # of the table
+    name: str  # the key of measured entries that says of what agent or method they are
+    measured: Callable[[Metrics], Sequence[Entry]]  # what ``against`` takes
+    against: Callable[[Sequence[Entry]], Rows]  # pairs of runs, see ``numbers.pairs``
+    # Drawn beside the table, above it where ``above``.
     figures: Callable[[Runs, Curves], Iterable[Drawn]] = lambda runs, arrays: ()
     above: bool = False
 
@@ -100,8 +90,7 @@ def shared(runs: Mapping[str, Metrics]) -> list[str]:
 def differences(runs: Mapping[str, Metrics]) -> list[dict[str, Any]]:
     """What was not the same: settings by the kind of artefact, seeds, layouts, data and versions.
 
-    Returns:
-        Rows with ``of`` (an artefact's kind, ``data`` or ``versions``), ``setting`` and ``values``, one text per run.
+    Rows have ``of`` (an artefact's kind, ``data`` or ``versions``), ``setting`` and ``values``, one text per run.
     """
     told = {label: grouped(_settings(metrics), itemgetter(0)) for label, metrics in runs.items()}
     rows = []

@@ -81,23 +81,14 @@ OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True), (BLUE, True), 
 
 @dataclass(frozen=True)
 class Run:
-    """One trained agent.
+    """One trained agent."""
 
-    Attributes:
-        kind: options, meta or baseline.
-        path: of its artefact, relative to the run's folder.
-        seed: of the training.
-        config: its resolved settings, with those of its ensemble that matter.
-        episodes: its training episodes.
-        layout: layout_seed, shortest_path, random_success, random_episodes.
-    """
-
-    kind: str
-    path: str
-    seed: int
-    config: Mapping[str, Any]
-    episodes: Episodes
-    layout: Mapping[str, Any]
+    kind: str  # options, meta or baseline
+    path: str  # of its artefact, relative to the run's folder
+    seed: int  # of the training
+    config: Mapping[str, Any]  # its resolved settings, with those of its ensemble that matter
+    episodes: Episodes  # of its training
+    layout: Mapping[str, Any]  # layout_seed, shortest_path, random_success, random_episodes
 
     @property
     def budget(self) -> int:
@@ -117,17 +108,10 @@ def read_run(artefact: Artefact, path: str) -> Run:
 def trailing_mean(
     steps: NDArray[np.int64], values: NDArray[np.float64], grid: NDArray[np.int64], window: int = WINDOW, least: int = 1
 ) -> NDArray[np.float64]:
-    """Spec F5: at each grid point the mean of the last ``window`` values that were known by then.
+    """Spec F5: at each point of ``grid`` (G,) the mean of the last ``window`` values known by then, float64 (G,).
 
-    Args:
-        steps: int (n,), when each value came, ascending.
-        values: (n,).
-        grid: int (G,).
-        window: values; fewer are averaged at the beginning.
-        least: values below which there is no mean.
-
-    Returns:
-        float64 (G,), NaN where fewer than ``least`` values are known.
+    ``steps`` (n,), ascending, say when each of the values (n,) came. Fewer than ``window`` are averaged at the
+    beginning; the mean is NaN where fewer than ``least`` are known.
     """
     sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
     end = np.searchsorted(steps, grid, side="right")
@@ -163,16 +147,11 @@ def discounted_return(episodes: Episodes, gamma: float = GAMMA) -> float:
 
 
 def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WINDOW) -> dict[str, float | int | None]:
-    """Spec F5: what is said of one run.
+    """Spec F5: what is said of one run, from all of its training episodes.
 
-    Args:
-        episodes: all of its training episodes.
-        shortest_path: primitive steps from the start to the goal at least; None where not known.
-        window: episodes that the numbers at the end are taken over.
-
-    Returns:
-        episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio),
-        discounted_return over the last episodes, and steps_to_95; NaN where there is no episode.
+    episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio) and
+    discounted_return over the last episodes, ``window`` of them at most, and steps_to_95; NaN where there is no
+    episode. ``shortest_path`` is primitive steps from the start to the goal at least.
     """
     last = episodes.last(window)
     length = mean_of(last.length)
@@ -215,9 +194,8 @@ def group_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
 def agent_metrics(name: str, runs: Sequence[Run]) -> dict[str, Any]:
     """Spec F5: each run's numbers and, for each number, what is said of it over runs.
 
-    Returns:
-        name, kind, runs (rows of numbers), one entry per key of ``UNITS`` (see ``numbers.over``), and
-        ``steps_to_95``: how many of the runs reached it, and the median over all runs, None where half did not.
+    name, kind, runs (rows of numbers), one entry per key of ``UNITS`` (see ``numbers.over``), and ``steps_to_95``: how
+    many of the runs reached it, and the median over all runs, None where half did not.
     """
     rows = [
         {
@@ -563,15 +541,11 @@ def learning_curves(
     references: Sequence[tuple[str, float]] = (),
     bounds: Bounds = (0.0, None),
 ) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps; the mean, and of few layouts or runs each, of more a
-    band of one standard error.
+    """Figure 6: a quantity of episodes against environment steps, ``grid`` (G,), a line per agent; the mean, and of few
+    layouts or runs each, of more a band of one standard error.
 
-    Args:
-        grid: int (G,), environment steps.
-        lines: one per agent.
-        quantity: the y axis's label, with its unit.
-        references: horizontal lines with their names.
-        bounds: of the y axis, None for what fits the values.
+    ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
+    of the y axis that is None is what fits the values.
     """
     with drawing(3.1, 2, handlelength=2.4) as (figure, axes):
         for line in lines:
@@ -613,10 +587,7 @@ def control_of(material: Material, agent: Entry, entries: Sequence[Entry]) -> En
     Settings that most runs of a name share are not added to it, so a name can leave open which options were chosen
     among. Then it is the only chooser with an ensemble of this variant, if no other variant has that ensemble.
 
-    Args:
-        material: its ``selection`` tells the runs' ensembles.
-        agent: one of the entries.
-        entries: agents, or agents of the selection.
+    ``material.selection`` tells the runs' ensembles; entries are agents, or agents of the selection.
     """
     agents, controls = variants(entries), variants(entries, RANDOM)
     if len(agents) == len(controls) == 1:

@@ -105,18 +105,11 @@ def _of_member(
 
 
 def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
-    """The log-odds of a member as a chain of modules that Captum's rules are right for.
+    """The log-odds (n, 1) of a member on (n, C, H, W), as a chain of modules that Captum's rules are right for.
 
     Its rule for max pooling gives a pixel to the last of the windows that it is the maximum of, and loses what it gave
     to the others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum
-    is taken over windows that do not overlap.
-
-    Args:
-        network: an ``nn.Sequential``, (n, C, H, W) -> logits (n, 2).
-        example: an input, for the shapes inside.
-
-    Returns:
-        (n, C, H, W) -> (n, 1).
+    is taken over windows that do not overlap. ``example`` is an input, for the shapes inside.
     """
     layers: list[nn.Module] = []
     values = example

@@ -84,14 +84,10 @@ def fates(executions: Executions) -> NDArray[np.int64]:
 def option_numbers(executions: Executions, *, never_offered: bool = False) -> dict[str, float | int]:
     """Spec F3: what is said of one option's last executions.
 
-    Args:
-        executions: its own.
-        never_offered: it has none because it would always have begun inside its own termination set: that counts 300.
-
-    Returns:
-        executions (how many), distance (mean as counted), executions_deviation (of it, n - 1), duration (mean steps),
-        and shares of executions: reached_base, inside_at_start, timed_out (neither its classifier nor a death ended
-        it), died. NaN without executions, the deviation also of one.
+    executions (how many), distance (mean as counted), executions_deviation (of it, n - 1), duration (mean steps), and
+    shares of executions: reached_base, inside_at_start, timed_out (neither its classifier nor a death ended it), died.
+    NaN without executions, the deviation also of one. An option ``never_offered`` has none because it would always have
+    begun inside its own termination set: that counts 300.
     """
     distance, count = counted(executions), len(executions.step)
     shares = {
@@ -112,18 +108,11 @@ def option_numbers(executions: Executions, *, never_offered: bool = False) -> di
 def ladder_numbers(
     executions: Executions, sub_goals: Sequence[str], members: int, validated: Mapping[str, int | None], *, masked: bool
 ) -> list[dict[str, Any]]:
-    """Spec F3: one options artefact, which was trained from one start (a ladder).
+    """Spec F3: one options artefact, which was trained from one start (a ladder), on G sub-goals with K members each.
 
-    Args:
-        executions: its executions.
-        sub_goals: G names.
-        members: K.
-        validated: per sub-goal the member that validation rooms pick, where that is known.
-        masked: options that would begin inside their own termination set were not offered (Spec D6).
-
-    Returns:
-        Per sub-goal ``options`` (a row per member) and which member is ``best`` (the least mean distance), ``worst``
-        and ``validated``; None where there is none.
+    Per sub-goal ``options`` (a row per member) and which member is ``best`` (the least mean distance), ``worst`` and
+    ``validated`` (the one that validation rooms pick); None where there is none. ``masked``: options that would begin
+    inside their own termination set were not offered (Spec D6).
     """
     rows = []
     masked = masked and len(executions.step) > 0
@@ -139,17 +128,13 @@ def ladder_numbers(
 
 
 def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Spec F3, Figure 4: distances over seeds, on each ladder and over all ladders.
+    """Spec F3, Figure 4: distances over seeds, on each of the run's ladders and over all of them.
 
-    Args:
-        rows: what was computed of each artefact: method, groups, ladder, seed and a row of :func:`ladder_numbers`.
-        ladders: all ladders of the run, in their order.
-
-    Returns:
-        ``by_ladder``: per method, N, ladder: the distance of the best, validated, mean and worst member and the best
-        member's shares, over seeds. ``over_ladders``: per method and N: the same, each seed's mean over ladders first.
-        A seed that lacks one of the ladders is left out there, so that nothing is compared over unlike ladders.
-        Artefacts alike in all of this count each for itself.
+    Of each artefact it takes method, groups, ladder, seed and a row of :func:`ladder_numbers`. ``by_ladder``: per
+    method, N, ladder: the distance of the best, validated, mean and worst member and the best member's shares, over
+    seeds. ``over_ladders``: per method and N: the same, each seed's mean over ladders first. A seed that lacks one of
+    the ladders is left out there, so that nothing is compared over unlike ladders. Artefacts alike in all of this count
+    each for itself.
     """
     by_ladder, over_ladders = [], []
     cells = grouped(rows, itemgetter(*CELL))
@@ -210,11 +195,8 @@ def ladder_names(
 
 
 def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = ()) -> list[int]:
-    """Figure 5: the rooms that are drawn: the ladder's own, then those in which the most executions stopped.
-
-    Args:
-        where: per option the rooms of its stops, (n,).
-        of_ladder: the ladder's rooms, from the top down.
+    """Figure 5: the rooms that are drawn: the ladder's own, from the top down, then those in which the most executions
+    stopped; ``where`` are per option the rooms of its stops, (n,).
     """
     rooms, counts = np.unique(np.concatenate([np.zeros(0, np.int64), *where]), return_counts=True)
     often = rooms[np.argsort(-counts, kind="stable")]
@@ -224,9 +206,8 @@ def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = (
 def numbers(work: Work) -> dict[str, Any]:
     """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
 
-    Returns:
-        ``options``: a row per artefact and sub-goal; ``by_ladder`` and ``over_ladders``: over seeds; ``shown``: what
-        Figure 5 is drawn of, for each ladder and N the best members of the first seed, whose stops are in the arrays.
+    ``options``: a row per artefact and sub-goal; ``by_ladder`` and ``over_ladders``: over seeds; ``shown``: what Figure
+    5 is drawn of, for each ladder and N the best members of the first seed, whose stops are in the arrays.
     """
     found, executions, options = work.contents, {}, []
     for artefact, (validated, about) in zip(found.ladders, _named(work), strict=True):
@@ -283,13 +264,9 @@ def show_stops(
 ) -> list[dict[str, Any]]:
     """Figure 5's material: for each ladder and N the best members' stops of the first seed, and pictures of the rooms.
 
-    Args:
-        rows: of :func:`ladder_numbers`, with path (by which ``executions`` are), method, groups, ladder and seed.
-        ladders, executions, domain: what is drawn, and by whom.
-        arrays: ``stops/<path>/<option>`` and ``pictures/<room>`` are written into it.
-
-    Returns:
-        Per figure ladder, groups, seed, rooms and columns; none where the domain has no pictures.
+    Rows are those of :func:`ladder_numbers` with path (by which ``executions`` are), method, groups, ladder and seed.
+    ``stops/<path>/<option>`` and ``pictures/<room>`` are written into ``arrays``. Per figure: ladder, groups, seed,
+    rooms and columns; none where the domain has no pictures.
     """
     if domain is None or not domain.pictures:
         return []
@@ -364,12 +341,11 @@ def missing(work: Work) -> list[str]:
 def against(options: Sequence[Entry]) -> Rows:
     """Spec F3: the first method against each other by how near options stop, at each N, paired by ladder and seed.
 
-    The best member is the best on the executions that are compared, of more members the better: beside it stand the
-    one that validation on the labelled rooms chooses, and the mean over members.
+    The best member is the best on the executions that are compared, of more members the better: beside it stand the one
+    that validation on the labelled rooms chooses, and the mean over members.
 
-    Args:
-        options: rows of :func:`ladder_numbers` with path, method, groups, ladder and seed. Oracle terminations
-            have no N and no members to choose among; they are left out.
+    Options are rows of :func:`ladder_numbers` with path, method, groups, ladder and seed. Oracle terminations, which
+    have no N and no members to choose among, are left out.
     """
     learned = [row for row in options if not row["method"].startswith(ORACLE) and row["best"] is not None]
 
@@ -608,11 +584,9 @@ def distance_bars(
 ) -> Figure:
     """Figure 4: the best member's distance; lower is better.
 
-    Args:
-        bars: method, group, mean, standard deviation (NaN for one seed) and the seeds' own values; groups are put side
-            by side in the order in which they come.
-        names: all methods, in the order of their colours; any other name is drawn grey.
-        inside: what an execution counts that begins inside its own termination set, drawn as a line if it is near.
+    A bar is method, group, mean, standard deviation (NaN for one seed) and the seeds' own values; groups stand side by
+    side in the order in which they come. Methods are coloured in the order of ``names``, others grey. A line marks
+    ``inside``, what an execution counts that begins inside its own termination set, if it is near.
     """
     with drawing(3.1, 2, handlelength=2.6) as (figure, axes):
         groups = grouped(bars, itemgetter(1))
@@ -645,11 +619,8 @@ def stops_over_rooms(
 ) -> Figure:
     """Figure 5: a row per option, its rooms side by side; with one room two options in a row.
 
-    What became of an execution is told by shape and by colour.
-
-    Args:
-        pictures: (room, uint8 (H, W, 3)).
-        options: title, and of the stops their rooms (n,), pixels (n, 2) in the pictures and :func:`fates` (n,).
+    What became of an execution is told by shape and by colour. A picture is (room, uint8 (H, W, 3)), an option its
+    title and of the stops their rooms (n,), pixels (n, 2) in the pictures and :func:`fates` (n,).
     """
     with styled():
         columns = max(2, len(pictures))

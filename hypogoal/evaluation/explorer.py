@@ -64,12 +64,8 @@ def pick_to_browse(
 ) -> NDArray[np.int64]:
     """Which states are shown, int64 (n,) with n at most ``most``, no state twice.
 
-    Args:
-        verdicts: bool (N, K).
-        labels: bool (N,).
-        places: int (N,) each; states alike in all of them are from the same place.
-        most: states.
-        rng: draws among states alike.
+    Of verdicts (N, K), labels (N,) and ``places`` (N,) each; states alike in all of the last are from the same place,
+    and ``rng`` draws among states alike.
     """
     errors = (verdicts != labels[:, None]).sum(1)
     outcome = np.where(errors == 0, 0, np.where(errors == verdicts.shape[1], 2, 1)) * 2 + labels
@@ -81,11 +77,8 @@ def pick_to_browse(
 
 
 def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The same states (n,), reordered so that groups take turns: the first of each, then the second of each, ...
-
-    Args:
-        order: indices, the better first.
-        groups: int (N,), each state's.
+    """The states of ``order``, indices (n,) with the better first, reordered so that groups take turns: the first of
+    each, then the second of each, ... ``groups`` (N,) says each state's.
     """
     groups = groups[order]
     turn = np.zeros(len(order), dtype=np.int64)

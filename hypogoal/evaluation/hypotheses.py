@@ -42,18 +42,10 @@ def sub_goal_metrics(
     layout_seeds: NDArray[np.int64] | None,
     unlabelled: NDArray[np.bool_],
 ) -> dict[str, Any]:
-    """Spec F1, F2: one sub-goal's members.
+    """Spec F1, F2: one sub-goal's K members by their verdicts on N held-out states and on M unlabelled ones.
 
-    Args:
-        sub_goal: its name.
-        heldout: verdicts bool (N, K) on held-out states.
-        labels: bool (N,), theirs.
-        layout_seeds: int (N,), where known.
-        unlabelled: verdicts bool (M, K) on unlabelled states.
-
-    Returns:
-        Scores of every member, pooled over layouts and per layout; best, mean and worst balanced accuracy; the mean
-        disagreement of two members on either set of states, and that of every pair.
+    Scores of every member, pooled over layouts and, where these (N,) are known, per layout; best, mean and worst
+    balanced accuracy; the mean disagreement of two members on either set of states, and that of every pair.
     """
     scores, members = member_scores(heldout, labels), heldout.shape[1]
     says_yes = unlabelled.mean(0) if len(unlabelled) else np.full(members, math.nan)
@@ -100,9 +92,8 @@ def of_layouts(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
 def hypotheses_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     """Spec F1: per kind of ensemble and sub-goal: best, mean and worst member's balanced accuracy, over seeds.
 
-    Args:
-        ensembles: what was computed of each, with ``name`` and ``sub_goals`` (see :func:`sub_goal_metrics`). Those
-            judged room by room are left out: their table is ``rooms.rooms_table``.
+    Ensembles have ``name`` and ``sub_goals`` (see :func:`sub_goal_metrics`). Those judged room by room are left out:
+    their table is ``rooms.rooms_table``.
     """
     table = []
     cells = grouped(of_layouts(ensembles), lambda judged: (judged[0]["name"], judged[1]["sub_goal"]))
@@ -135,11 +126,8 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
 def against(ensembles: Sequence[Entry]) -> Rows:
     """Spec F1: the first kind of ensembles against each other by balanced accuracy on held-out layouts, paired by seed.
 
-    Args:
-        ensembles: what was computed of each; those judged by room are left out.
-
-    Returns:
-        Rows over all sub-goals that both have, and for each sub-goal by itself; units are seeds.
+    Rows over all sub-goals that both have, and for each by itself; units are seeds. Ensembles judged by room are left
+    out.
     """
     found: Rows = []
     for which in COMPARED:
@@ -267,8 +255,7 @@ def figures(material: Material) -> list[Drawn]:
 def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
     """Figure 3's quantity for one labelled layout: balanced accuracy on held-out layouts, by kind of ensemble.
 
-    Args:
-        entries: of :func:`hypotheses_table`; where no mean in them is a number there is no figure.
+    Entries are of :func:`hypotheses_table`; where no mean in them is a number there is no figure.
     """
     means = [entry[which]["mean"] for entry in entries for which in WHICH]
     lowest = min((mean for mean in means if mean is not None), default=None)

@@ -53,39 +53,24 @@ class Case(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What K members say of N held-out and M unlabelled states.
+    """What K members say of N held-out and M unlabelled states."""
 
-    Attributes:
-        probabilities: float32 (N, K), that the sub-goal is reached.
-        verdicts: bool (N, K), each at its member's own threshold.
-        told: bool (M, K), the verdicts on unlabelled states.
-    """
-
-    probabilities: NDArray[np.float32]
-    verdicts: NDArray[np.bool_]
-    told: NDArray[np.bool_]
+    probabilities: NDArray[np.float32]  # (N, K), that the sub-goal is reached
+    verdicts: NDArray[np.bool_]  # (N, K), each at its member's own threshold
+    told: NDArray[np.bool_]  # (M, K), the verdicts on unlabelled states
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A case with its states and what the members say of them.
+    """A case with its states and what the members say of them."""
 
-    Attributes:
-        number: the ensemble's, among those of the run.
-        case: the sub-goal's ensemble and its data.
-        split: N held-out states.
-        unlabelled: M states.
-        kinds: names of the values of the origin ``kind``.
-        judged: what K members say.
-        row: filled by the questions: what is said of this sub-goal's members in ``ensembles``.
-    """
-
-    number: int
-    case: Case
-    split: Split
-    unlabelled: Unlabelled
-    kinds: Sequence[str]
-    judged: Judged
+    number: int  # the ensemble's, among those of the run
+    case: Case  # the sub-goal's ensemble and its data
+    split: Split  # N held-out states
+    unlabelled: Unlabelled  # M states
+    kinds: Sequence[str]  # names of the values of the origin ``kind``
+    judged: Judged  # what K members say
+    # Filled by the questions: what is said of this sub-goal's members in ``ensembles``.
     row: dict[str, Any] = field(default_factory=dict)
 
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, NDArray[np.uint8], NDArray[np.uint8]]:
@@ -99,10 +84,9 @@ class Judgement:
     def write_states(self, group: Any, picked: Sequence[tuple[int, str]]) -> None:
         """Held-out states, what members say of them, and where they are from.
 
-        Args:
-            group: gets ``observations``, ``labels`` and ``layout_seeds`` (-1: none) (n,), ``probabilities`` and
-                ``verdicts`` (n, K), and as JSON lists of n texts ``kinds`` and ``places``.
-            picked: n times (index in the split, kind).
+        ``picked`` is n times (index in the split, kind). ``group`` gets ``observations``, ``labels`` and
+        ``layout_seeds`` (-1: none) (n,), ``probabilities`` and ``verdicts`` (n, K), and as JSON lists of n texts
+        ``kinds`` and ``places``.
         """
         split, index = self.split, np.array([index for index, _ in picked], dtype=np.int64)
         group["observations"] = split.observations[index]
@@ -127,26 +111,18 @@ def place_of(origins: Mapping[str, NDArray[np.int64]], state: int) -> str:
 
 @dataclass
 class Work:
-    """What the questions' numbers are made from.
+    """What the questions' numbers are made from."""
 
-    Attributes:
-        contents: the run's artefacts.
-        arrays: ``arrays.h5``, to be written into.
-        progress: is told of each artefact.
-        shown, browsed: the ensembles whose states are shown, and browsed; None where there is none.
-        looked: what questions keep of the states that they were shown, by their own names.
-        ensembles: what is said of each ensemble; its ``sub_goals`` are the rows of :class:`Judgement`.
-        metrics: the numbers so far.
-    """
-
-    contents: Contents
-    arrays: Any
-    progress: Progress
-    shown: int | None = None
-    browsed: int | None = None
+    contents: Contents  # the run's artefacts
+    arrays: Any  # ``arrays.h5``, to be written into
+    progress: Progress  # is told of each artefact
+    shown: int | None = None  # the ensemble whose states are shown; None where there is none
+    browsed: int | None = None  # the ensemble whose states are browsed; None where there is none
+    # What questions keep of the states that they were shown, by their own names.
     looked: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
+    # What is said of each; its ``sub_goals`` are the rows of ``Judgement``.
     ensembles: list[dict[str, Any]] = field(default_factory=list)
-    metrics: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)  # the numbers so far
 
     def kept(self, question: str, ensemble: int | None) -> dict[str, Any] | None:
         """What a question keeps of the one ensemble whose states it looked at; None where there is none."""
@@ -182,11 +158,9 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
 def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[int], None]) -> Iterator[Judgement]:
     """Every case judged, ``workers`` processes at once, one after another with its states: the same for any number.
 
-    Args:
-        cases: with their ensembles' numbers; those on the same states one after another, since each process keeps the
-            last ones that it read.
-        workers: processes.
-        done: told an ensemble's number as soon as one of its cases is judged, in any order.
+    Cases, each with its ensemble's number, come with those on the same states one after another, since each process
+    keeps the last ones that it read. ``done`` is told an ensemble's number as soon as one of its cases is judged, in
+    any order.
     """
     judged: dict[int, Judged] = {}
 

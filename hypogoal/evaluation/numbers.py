@@ -149,31 +149,20 @@ QUANTITIES: dict[str, tuple[str, str]] = {
 
 
 class Row(NamedTuple):
-    """One number of ``numbers.csv`` and what it is of; empty where that is not said of it.
+    """One number of ``numbers.csv`` and what it is of; empty where that is not said of it."""
 
-    Attributes:
-        quantity, value: see ``QUANTITIES``.
-        method: the ensemble's, or the agent's name.
-        sub_goal, member: of which.
-        scope: the states that it is over.
-        N: labelled ladder groups.
-        ladder, layout, seed: of the training.
-        step: environment steps after which it was so.
-        artefact: its path within the run.
-    """
-
-    quantity: str
+    quantity: str  # see ``QUANTITIES``
     value: float | int
-    method: str = ""
+    method: str = ""  # the ensemble's, or the agent's name
     sub_goal: str = ""
     member: int | str = ""
-    scope: str = ""
-    N: int | None = None
+    scope: str = ""  # the states that it is over
+    N: int | None = None  # labelled ladder groups
     ladder: str = ""
     layout: int | str = ""
-    seed: int | str = ""
-    step: int | str = ""
-    artefact: str = ""
+    seed: int | str = ""  # of the training; ladder and layout too
+    step: int | str = ""  # environment steps after which it was so
+    artefact: str = ""  # its path within the run
 
 
 def rows_of(numbers: Mapping[str, Any], **place: Any) -> Iterable[Row]:
@@ -364,10 +353,8 @@ def pairs_by_groups(
 ) -> Rows:
     """The first method against each other at each N, by their best, their validated and their mean member.
 
-    Args:
-        entries: with ``method`` and ``groups``.
-        measured: of an entry what is alike and the numbers by member, see :func:`pairs`.
-        quantity, higher: what the numbers are, and whether the higher is the better one.
+    Entries have ``method`` and ``groups``; of each ``measured`` gives what is alike and the numbers by member, see
+    :func:`pairs`.
     """
     rows: Rows = []
     for groups in by_groups(entries):

@@ -52,18 +52,13 @@ INTERVALS = (
 
 @dataclass(frozen=True)
 class Material:
-    """What a page is made from.
+    """What a page is made from."""
 
-    Attributes:
-        metrics: what ``metrics.json`` holds.
-        arrays: what ``arrays.h5`` holds, by name.
-        figures: filled while the page is made, to be written as files too; ``drawings`` with their SVG.
-    """
-
-    metrics: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]]
+    metrics: Mapping[str, Any]  # what ``metrics.json`` holds
+    arrays: Mapping[str, NDArray[Any]]  # what ``arrays.h5`` holds, by name
+    # Filled while the page is made, to be written as files too.
     figures: dict[str, Figure] = field(default_factory=dict)
-    drawings: dict[str, str] = field(default_factory=dict)
+    drawings: dict[str, str] = field(default_factory=dict)  # the figures' SVG
 
     def comparisons(self, of: str) -> list[Entry]:
         """One method against the others; none in evaluations from before there were any."""
@@ -85,27 +80,16 @@ class Material:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure, or what it would have needed.
+    """A figure, or what it would have needed."""
 
-    Attributes:
-        name: the file's name in a report, and the id on the page.
-        label: what it shows.
-        figure: None where it cannot be drawn.
-        caption: with seeds and intervals.
-        missing: which artefact would be needed.
-        folded: what is shown of it on the page until asked for.
-        file: the file's name among the paper's figures, where that is another.
-        heading: above it on the page.
-    """
-
-    name: str
-    label: str
-    figure: Figure | None
-    caption: str = ""
-    missing: str = ""
-    folded: str = ""
-    file: str = ""
-    heading: str = ""
+    name: str  # the file's name in a report, and the id on the page
+    label: str  # what it shows
+    figure: Figure | None  # None where it cannot be drawn
+    caption: str = ""  # with seeds and intervals
+    missing: str = ""  # which artefact would be needed
+    folded: str = ""  # what is shown of it on the page until asked for
+    file: str = ""  # the file's name among the paper's figures, where that is another
+    heading: str = ""  # above it on the page
 
     @property
     def stem(self) -> str:
@@ -123,12 +107,9 @@ class Column(NamedTuple):
 
 
 def label(title: str, key: Any, *, once: Any = None) -> Column:
-    """A column of text.
+    """A column of text; ``key`` is the entry's key, several with dots between, or a function of the entry.
 
-    Args:
-        title: its heading.
-        key: the entry's key, several with dots between, or a function of the entry.
-        once: leave the cell empty where this is what it was in the row above: True, the cell itself.
+    A cell is left empty where ``once`` of the entry, or with True the cell itself, is what it was in the row above.
     """
     of = key if callable(key) else partial(at, key=key)
     return Column(title, of, once=of if once is True else once)
@@ -231,11 +212,7 @@ def shown(material: Material, drawn: Drawn) -> Block:
 
 
 def pick(rows: Iterable[Entry], key: str, value: Any) -> Entry:
-    """The first of the rows with this value.
-
-    Raises:
-        LookupError: none has it.
-    """
+    """The first of the rows with this value; a ``LookupError`` where none has it."""
     for row in rows:
         if row[key] == value:
             return row
@@ -337,10 +314,8 @@ def comparison_tables(
 ) -> list[Block]:
     """The table of one method against the others, pair by pair, where there are pairs (Spec F5).
 
-    Args:
-        rows: what ``numbers.pairs`` found.
-        shared, units: what pairs share, and what is independent of each other.
-        digits: decimals of a quantity's difference, 3 where it is not named.
+    Rows are what ``numbers.pairs`` found. ``shared`` is what pairs share, ``units`` what is independent of each other,
+    ``digits`` the decimals of a quantity's difference, 3 where it is not named.
     """
     found = [entry for entry in rows if entry["n"]]
     if not found:
@@ -411,27 +386,19 @@ def _digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class Question:
-    """One question of the paper, whole: its numbers, figures, sections. What one has not, it leaves as it is here.
+    """One question of the paper, whole: its numbers, figures, sections. What one has not, it leaves as it is here."""
 
-    Attributes:
-        look: is shown every ensemble on every sub-goal's states as it is judged; fills ``row`` and ``work.looked``.
-        numbers: by their key in ``metrics.json``; what was found before is in ``work.metrics``.
-        missing: a line for everything that the run has no artefacts for.
-        rows: what stands in ``numbers.csv``, of the metrics and the arrays.
-        pairs: methods against each other, by their key in ``comparisons``.
-        meanings: unit and meaning of its quantities, those that ``numbers.QUANTITIES`` does not have.
-        summary: tables for a terminal.
-        sections: of the page, those that the run has anything for.
-        figures: for a paper; ``needed`` says of each by name what it needs.
-    """
-
+    # Is shown every ensemble on every sub-goal's states as it is judged; fills ``row`` and ``work.looked``.
     look: Callable[[Work, Judgement], None] = lambda work, judgement: None
+    # By their key in ``metrics.json``; what was found before is in ``work.metrics``.
     numbers: Callable[[Work], dict[str, Any]] = lambda work: {}
-    missing: Callable[[Work], list[str]] = lambda work: []
-    rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()
+    missing: Callable[[Work], list[str]] = lambda work: []  # a line for everything that the run has no artefacts for
+    rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()  # of ``numbers.csv``
+    # Methods against each other, by their key in ``comparisons``.
     pairs: Callable[[Entry], dict[str, Rows]] = lambda metrics: {}
+    # Unit and meaning of its quantities, those that ``numbers.QUANTITIES`` does not have.
     meanings: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    summary: Callable[[Entry], list[Table]] = lambda metrics: []
-    sections: Callable[[Material], list[Block]] = lambda material: []
-    figures: Callable[[Material], Iterable[Drawn]] = lambda material: ()
-    needed: Mapping[str, str] = field(default_factory=dict)
+    summary: Callable[[Entry], list[Table]] = lambda metrics: []  # tables for a terminal
+    sections: Callable[[Material], list[Block]] = lambda material: []  # those that the run has anything for
+    figures: Callable[[Material], Iterable[Drawn]] = lambda material: ()  # for a paper
+    needed: Mapping[str, str] = field(default_factory=dict)  # what each figure needs, by its name

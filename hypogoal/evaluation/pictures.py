@@ -68,14 +68,11 @@ def attribution_png(values: NDArray[np.floating], grey: NDArray[np.floating]) ->
 
 
 def attribution_image(values: NDArray[np.floating], grey: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Figures 2 and 9: signed attributions as a picture, uint8 (H, W, 3).
+    """Figures 2 and 9: signed attributions (H, W) as a picture, uint8 (H, W, 3).
 
     Orange where positive, blue where negative, white where none; full colour at the 99.5th percentile of the absolute
-    values. The state shows through as a light shade. In steps, which keeps the file small.
-
-    Args:
-        values: float (H, W).
-        grey: the state's brightness, float (H, W) in 0..1.
+    values. The state shows through, by its brightness ``grey`` (H, W) in 0..1, as a light shade. In steps, which keeps
+    the file small.
     """
     size = float(np.quantile(np.abs(values), 0.995)) or 1.0
     strength = (LEVELS * np.clip(np.abs(values) / size, 0, 1)).round()[..., None] / LEVELS
@@ -118,17 +115,10 @@ def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def contact_sheets(split: Split, kinds: Sequence[str] = ()) -> dict[str, NDArray[np.uint8]]:
-    """Sheets of a split's states, for each room and label one: name -> uint8 (height, width, 3).
+    """Sheets of a split's states, one for each room and label, by names like ``room-01-positives``.
 
-    Each shows ``MOST_STATES`` states at most, spread evenly over those of the room and label in the order of their
-    kinds, with kind and position under each.
-
-    Args:
-        split: N states of one sub-goal.
-        kinds: the names of the values of the origin ``kind``.
-
-    Returns:
-        Named like ``room-01-positives``.
+    Each, uint8 (height, width, 3), shows ``MOST_STATES`` states at most, spread evenly over those of the room and label
+    in the order of their kinds (``kinds`` names the values of that origin), with kind and position under each.
     """
     place = next((name for name in PLACES if name in split.origins), None)
     places = np.zeros(len(split.labels), np.int64) if place is None else split.origins[place]
@@ -194,10 +184,7 @@ def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[st
 def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> NDArray[np.uint8]:
     """A frame as a picture, uint8 (H, W, 3); a bar shows the time left, in the sub-goal's colour.
 
-    Args:
-        frame: see ``meta.episodes.Frame``.
-        sub_goals, members: G names and K; option g*K + k is member k of sub-goal g.
-        timeout: an option's steps at most.
+    Option g*K + k is member k of sub-goal g; ``timeout`` is an option's steps at most.
     """
     from PIL import Image, ImageDraw, ImageFont
 

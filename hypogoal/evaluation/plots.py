@@ -82,11 +82,8 @@ def style_of(index: int) -> tuple[str, str]:
 def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any) -> None:
     """A legend under the plots, for which the figure becomes higher: each label once, whichever of the plots has it.
 
-    Args:
-        figure: as wide as it is to be.
-        places: its plots.
-        most: columns; fewer where labels are too long for so many, and very long labels are broken.
-        more: matplotlib's settings of a legend.
+    The figure is as wide as it is to be. There are ``most`` columns, fewer where labels are too long for so many, and
+    very long labels are broken; ``more`` are matplotlib's settings of a legend.
     """
     handles: dict[str, Any] = {}
     drawn: list[Any] = [artist for place in places for artist in (*place.lines, *place.containers)]
@@ -137,9 +134,7 @@ def slug(text: str) -> str:
 def to_svg(figure: Figure, name: str) -> str:
     """The figure as an SVG document, the same bytes each time.
 
-    Args:
-        figure: any figure.
-        name: its :func:`slug` makes the ids inside unique among several on one page.
+    The :func:`slug` of ``name`` makes the ids inside unique among several on one page.
     """
     name = slug(name)
     buffer = io.StringIO()

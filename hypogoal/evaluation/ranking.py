@@ -28,18 +28,12 @@ def known(
     labels: NDArray[np.bool_],
     contexts: NDArray[np.int64] | None,
 ) -> dict[str, Any]:
-    """What K members know of N states.
+    """What K members know of N states, by their probabilities and by their verdicts at their own thresholds, (N, K).
 
-    Args:
-        probabilities: float32 (N, K), that the sub-goal is reached.
-        verdicts: bool (N, K), at the members' own thresholds.
-        labels: bool (N,), it is.
-        contexts: int64 (N,), the layout or room that each state is of; None where that is not known.
-
-    Returns:
-        ``members``: a row each, with ``ranking``, ``at_best_threshold`` (balanced accuracy) and ``calibration_gap``
-        (how much of that the member's own threshold loses); of the best member as half of the contexts picks it for
-        the other, ``cross_fitted_ranking`` and ``cross_fitted_accuracy``, NaN for fewer than two contexts.
+    ``contexts`` are the layouts or rooms that states are of, None where not known. ``members``: a row each, with
+    ``ranking``, ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that the member's own
+    threshold loses); of the best member as half of the contexts picks it for the other, ``cross_fitted_ranking`` and
+    ``cross_fitted_accuracy``, NaN for fewer than two contexts.
     """
 
     def scores(inside: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:

@@ -119,9 +119,7 @@ def choose(
     """Spec F1: the member with the highest balanced accuracy on held-out states in rooms of labelled groups.
 
     Members' order is chance, so of several equally good ones the first is taken; ``tied`` says how many there are.
-
-    Returns:
-        member (None where the rooms of labelled groups lack a class), validation (its balanced accuracy there), tied.
+    ``validation`` is its balanced accuracy there; ``member`` is None where those rooms lack a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
     scores = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
@@ -182,13 +180,10 @@ def cell_of(judged: tuple[Entry, Entry]) -> tuple[str, int | None, str]:
 def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
-    Args:
-        ensembles: what was computed of each, with ``method``, ``groups`` and ``sub_goals``, those with ``rooms``.
-
-    Returns:
-        Rows with ``scores``: scope -> score -> best, validated, mean, worst (see ``numbers.over``); ``positives`` and
-        ``always_no`` (the accuracy of never saying yes) per scope; ``tied``: mean number of members among which the
-        validation rooms could not tell; disagreement on unlabelled and held-out states.
+    Ensembles have ``method``, ``groups`` and ``sub_goals``, those with ``rooms``. Rows have ``scores``: scope -> score
+    -> best, validated, mean, worst (see ``numbers.over``); ``positives`` and ``always_no`` (the accuracy of never
+    saying yes) per scope; ``tied``: mean number of members among which the validation rooms could not tell;
+    disagreement on unlabelled and held-out states.
     """
     table = []
     for key, judged in sorted(grouped(of_rooms(ensembles), cell_of).items(), key=lambda item: by_method(item[0])):
@@ -541,10 +536,9 @@ def scores_over_groups(
     A method with one N has an error bar instead of a band, a little beside the other methods'. Dotted is what it takes
     no seeing to score.
 
-    Args:
-        rows: of :func:`rooms_table`; those without N are left out, and where all are there is no figure.
-        panels: two in a row: title, and of which scope, score and member.
-        names: all methods, in the order of their colours; those of the rows where none are given.
+    Rows are of :func:`rooms_table`; those without N are left out, and where all are there is no figure. A panel is a
+    title, and of which scope, score and member; two are in a row. Methods are coloured in the order of ``names``, by
+    default that of the rows.
     """
     names, rows = names or list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
     if not rows:

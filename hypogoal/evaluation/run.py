@@ -33,23 +33,14 @@ Table = TypeVar("Table")
 
 @dataclass(frozen=True)
 class Contents:
-    """The artefacts of a run that are evaluated.
+    """The artefacts of a run that are evaluated."""
 
-    Attributes:
-        run: its folder.
-        ensembles: every one.
-        agents: what plays a layout: metas, options that no meta continues, baselines.
-        ladders: options learned from a named start each, with a table of where they stopped.
-        silent: options learned from a named start without that table; they are not evaluated.
-        continued: options that a meta artefact continues, and so is judged by.
-    """
-
-    run: Path
-    ensembles: list[Artefact]
-    agents: list[Artefact]
-    ladders: list[Artefact]
-    silent: list[Artefact]
-    continued: list[Artefact]
+    run: Path  # its folder
+    ensembles: list[Artefact]  # every one
+    agents: list[Artefact]  # what plays a layout: metas, options that no meta continues, baselines
+    ladders: list[Artefact]  # options learned from a named start each, with a table of where they stopped
+    silent: list[Artefact]  # options learned from a named start without that table; they are not evaluated
+    continued: list[Artefact]  # options that a meta artefact continues, and so is judged by
 
     def everything(self) -> list[Artefact]:
         """All of them."""
@@ -63,8 +54,7 @@ class Contents:
 def find(run: Path) -> Contents:
     """The artefacts to evaluate: options that a meta artefact continues are part of that one.
 
-    Raises:
-        UserError: there is none, or one is damaged.
+    None, or a damaged one, is a ``UserError``.
     """
     metas, learned = find_artefacts(run, "meta"), find_artefacts(run, "options")
     inputs = [
@@ -114,19 +104,12 @@ class Columns:
 
 @dataclass(frozen=True)
 class Episodes(Columns):
-    """A run's training episodes in the order in which they ended; arrays (n,).
+    """A run's training episodes in the order in which they ended; arrays (n,)."""
 
-    Attributes:
-        step: environment steps when it ended, summed over parallel environments and stages.
-        length: steps.
-        reward: undiscounted.
-        terminated: it reached a terminal state; else it was cut at the cap.
-    """
-
-    step: NDArray[np.int64]
-    length: NDArray[np.int64]
-    reward: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
+    step: NDArray[np.int64]  # environment steps when it ended, summed over parallel environments and stages
+    length: NDArray[np.int64]  # steps
+    reward: NDArray[np.float64]  # undiscounted
+    terminated: NDArray[np.bool_]  # it reached a terminal state; else it was cut at the cap
 
     @property
     def succeeded(self) -> NDArray[np.bool_]:
@@ -161,29 +144,18 @@ class Choices(Columns):
 
 @dataclass(frozen=True)
 class Executions(Columns):
-    """Executions of options in the order in which they ended, arrays (n,): the rows of ``executions.csv``.
+    """Executions of options in the order in which they ended, arrays (n,): the rows of ``executions.csv``."""
 
-    Attributes:
-        step: environment steps when it ended.
-        option: g*K + k.
-        duration: steps.
-        reached: its own termination classifier said yes.
-        inside_at_start: that classifier said yes where it began.
-        terminated: the episode ended in a terminal state: the agent died.
-        room, x, y: where it stopped.
-        distance: from there to the nearest true sub-goal, in the domain's units.
-    """
-
-    step: NDArray[np.int64]
-    option: NDArray[np.int64]
-    duration: NDArray[np.int64]
-    reached: NDArray[np.bool_]
-    inside_at_start: NDArray[np.bool_]
-    terminated: NDArray[np.bool_]
-    room: NDArray[np.int64]
+    step: NDArray[np.int64]  # environment steps when it ended
+    option: NDArray[np.int64]  # g*K + k
+    duration: NDArray[np.int64]  # steps
+    reached: NDArray[np.bool_]  # its own termination classifier said yes
+    inside_at_start: NDArray[np.bool_]  # that classifier said yes where it began
+    terminated: NDArray[np.bool_]  # the episode ended in a terminal state: the agent died
+    room: NDArray[np.int64]  # where it stopped; x and y too
     x: NDArray[np.int64]
     y: NDArray[np.int64]
-    distance: NDArray[np.int64]
+    distance: NDArray[np.int64]  # from there to the nearest true sub-goal, in the domain's units
 
     def of(self, option: int, last: int = LAST) -> Executions:
         """The last executions of one option."""
@@ -236,14 +208,10 @@ def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, NDArray[np.float64]]:
-    """Columns of a table of numbers, float (n,) each.
+    """Columns of a table of numbers, a CSV file with a header; float (n,) each.
 
-    Args:
-        path: a CSV file with a header.
-        columns: those that must be there; all that are where None.
-
-    Raises:
-        UserError: missing, too large, no table, or what stands in it is no finite number of at most 2^53.
+    ``columns`` are those that must be there; all that are where None. A file that is missing, too large, no table, or
+    holds anything but finite numbers of at most 2^53 is a ``UserError``.
     """
     text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
     try:
@@ -286,14 +254,8 @@ def fitting(where: object) -> Iterator[None]:
 def read_evaluation(run: Path, start: str = "") -> Evaluated:
     """The evaluation of a run: that in ``run/evaluation`` where there are several.
 
-    Args:
-        run: a folder with an evaluation artefact in it.
-        start: of the arrays only those whose names begin so.
-
-    What was made since is among ``missing``.
-
-    Raises:
-        UserError: the run was not evaluated, or the evaluation is damaged.
+    Of the arrays only those whose names begin with ``start``. What was made since is among ``missing``. A run that was
+    not evaluated, or a damaged evaluation, is a ``UserError``.
     """
     found = find_artefacts(run, "evaluation")
     if not found:
@@ -306,11 +268,7 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
 
 
 def read_numbers(source: Artefact) -> Mapping[str, Any]:
-    """``metrics.json`` of an evaluation artefact.
-
-    Raises:
-        UserError: it is damaged.
-    """
+    """``metrics.json`` of an evaluation artefact; a ``UserError`` where it is damaged."""
     path = source.path / "metrics.json"
     fault = file_fault(source.path, path.name, source.manifest["files"].get(path.name, ""))
     if fault:

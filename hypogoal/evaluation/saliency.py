@@ -73,15 +73,9 @@ def pick_examples(
 ) -> list[tuple[int, str]]:
     """States on which members disagree, all err, or all are right, so that a reader sees each.
 
-    Args:
-        probabilities: float (N, K), every member's P(sub-goal reached).
-        verdicts: bool (N, K), what members say.
-        labels: bool (N,).
-        per_kind: states of each kind at most.
-
-    Returns:
-        (index, kind) with kind ``disagree`` (the widest spread of probabilities first, true and false states in
-        turn), ``wrong`` (the most sure errors first), ``right yes`` and ``right no``; fewer where there are none.
+    Of N states with K members' probabilities and verdicts, (index, kind), ``per_kind`` at most: ``disagree`` (the
+    widest spread of probabilities first, true and false states in turn), ``wrong`` (the most sure errors first),
+    ``right yes`` and ``right no``; fewer where there are none.
     """
     correct = verdicts == labels[:, None]
     spread = probabilities.max(1) - probabilities.min(1)
@@ -98,17 +92,11 @@ def pick_examples(
 def pick_to_explain(
     probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]
 ) -> list[tuple[int, str]]:
-    """Figures 2 and 9: the few states whose attributions are drawn.
+    """Figures 2 and 9: the few of N states, (index, kind), whose attributions are drawn, no state twice.
 
-    Args:
-        probabilities: float (N, K), every member's P(sub-goal reached).
-        verdicts: bool (N, K).
-        labels: bool (N,).
-
-    Returns:
-        (index, kind), no state twice: ``true positive``, where the most members are right and, of those, the surest on
-        average; ``disagree``, where members differ and their probabilities are the furthest apart; ``false positive``,
-        where the most members err, and the surest. Fewer where there are none.
+    ``true positive``: where the most of K members are right and, of those, the surest on average; ``disagree``: where
+    members differ and their probabilities are the furthest apart; ``false positive``: where the most members err, and
+    the surest. Fewer where there are none.
     """
     yes, mean = verdicts.sum(1), probabilities.mean(1)
     spread = probabilities.max(1) - probabilities.min(1)
@@ -256,9 +244,8 @@ def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
 def attributions_of_members(state: Mapping[str, NDArray[Any]], columns: int = 4) -> Figure:
     """Figure 2: what each member goes by in one state; of a stack of frames the last.
 
-    Args:
-        state: of one state and K members what is in ``EXPLAINED``, as ``arrays.h5`` has it.
-        columns: pictures in a row, the state itself being the first.
+    ``state`` is of one state what is in ``EXPLAINED``, as ``arrays.h5`` has it; the first of a row's pictures is the
+    state itself.
     """
     members = len(state["attributions"])
     columns = min(columns, members + 1)

@@ -51,17 +51,12 @@ SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth,
 
 
 def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Spec F6: chosen / expected under uniform choice among the options offered.
+    """Spec F6: chosen / expected under uniform choice among the options offered, float64 (..., O).
 
     A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered
-    always. This ratio is 1 for a chooser that does not care, whatever is offered how often.
-
-    Args:
-        chosen: (..., O), decisions that chose each option.
-        expected: float (..., O), the sum of 1 / (options offered) over the decisions that offered it.
-
-    Returns:
-        float64 (..., O); NaN where an option was never offered.
+    always. This ratio is 1 for a chooser that does not care, whatever is offered how often, and NaN where an option was
+    never offered. ``chosen`` are the decisions that chose each option, ``expected`` the sum of 1 / (options offered)
+    over those that offered it.
     """
     safe = np.where(expected > 0, expected, 1.0)
     return np.where(expected > 0, chosen / safe, np.nan)
@@ -91,14 +86,9 @@ def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) ->
 def rank_correlations(values: NDArray[np.float64], match: NDArray[np.float64], members: int) -> dict[str, float]:
     """Spec F6: rank correlation between members' values (their preference, say) and their match with the true sub-goal.
 
-    Args:
-        values: float (G*K,), in the order of the options: sub-goal * K + member.
-        match: float (G*K,), balanced accuracy on the layout.
-        members: K.
-
-    Returns:
-        ``all``: over all options at once; ``within``: the mean over sub-goals of the correlation among its own K
-        members, so that a sub-goal that is chosen often does not count; NaN where not defined.
+    Both are (G*K,), sub-goal * K + member; the match is balanced accuracy on the layout. ``all``: over all options at
+    once; ``within``: the mean over sub-goals of the correlation among its own K members, so that a sub-goal that is
+    chosen often does not count; NaN where not defined.
     """
     goals = zip(values.reshape(-1, members), match.reshape(-1, members), strict=True)
     within = [value for value in (rank_correlation(*goal) for goal in goals) if not np.isnan(value)]
@@ -106,15 +96,10 @@ def rank_correlations(values: NDArray[np.float64], match: NDArray[np.float64], m
 
 
 def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[str, NDArray[np.float64]]:
-    """Spec E5, F6: choices counted in equal parts of training, in the order of time.
+    """Spec E5, F6: choices counted in equal parts of training, in the order of time, each in the part in which it ends.
 
-    Args:
-        choices: windows, each counted in the part in which it ends.
-        options: O.
-        parts: at most; as many as there are windows where those are fewer.
-
-    Returns:
-        ``step``, where each part ends (P,), and ``chosen`` and ``expected``, (P, O) each.
+    ``step``, where each part ends (P,), and ``chosen`` and ``expected``, (P, O) each; P is ``parts``, or as many as
+    there are choices where those are fewer.
     """
     windows = np.unique(choices.step)
     parts = min(parts, len(windows))
@@ -452,11 +437,8 @@ def preference_against_match(
 ) -> Figure:
     """Question 5 of the paper: is the member that is chosen more often the one that fits the true sub-goal?
 
-    Args:
-        sub_goals: G names.
-        match: float (R, G, K), a member's balanced accuracy on the run's layout.
-        preference: float (R, G, K), chosen / expected under uniform choice.
-        control: the same two arrays, flat, of the random chooser.
+    ``match``, balanced accuracy on the run's layout, and ``preference``, chosen / expected under uniform choice, are
+    (R, G, K); ``control`` is the same two, flat, of the random chooser.
     """
     with drawing(3.9, 3, handletextpad=0.3) as (figure, axes):
         if control is not None:
@@ -480,8 +462,7 @@ def preference_against_match(
 def termination_states(sides: Sequence[tuple[str, NDArray[np.uint8] | None]]) -> Figure:
     """Figures 7 and 8: overlaid termination states of some members, the most preferred first.
 
-    Args:
-        sides: title and overlay uint8 (H, W, C), None where its classifier never ended an execution.
+    A side is a title and an overlay uint8 (H, W, C), None where its classifier never ended an execution.
     """
     figure, places = grid_of_pictures(1, max(2, len(sides)), PICTURE_TITLE)
     for place, (title, image) in zip(places, sides, strict=False):

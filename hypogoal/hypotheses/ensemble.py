@@ -163,12 +163,9 @@ class Ensemble(nn.Module):
         state: Mapping[str, Tensor],
         view: FullView | AgentView | None = None,
     ) -> Ensemble:
-        """The ensemble that ``state()`` was taken from, in evaluation mode.
+        """The ensemble that ``state()`` was taken from, in evaluation mode; a ``UserError`` where it is no such state.
 
         A state without thresholds is of an ensemble from before there were any: 0.5.
-
-        Raises:
-            UserError: the state is not one of such an ensemble.
         """
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
         numbers = {name.split(".")[1] for name in state if name.startswith("members.")}
@@ -196,15 +193,9 @@ def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:
 
 
 def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ensemble:
-    """The ensemble of one sub-goal.
+    """The ensemble of one sub-goal, from an ensemble artefact's folder and its manifest's configuration.
 
-    Args:
-        folder: an ensemble artefact's folder.
-        config: its manifest's configuration.
-        sub_goal: one of ``config["sub_goals"]``.
-
-    Raises:
-        UserError: the artefact has no such sub-goal, or its weights are missing or damaged.
+    A sub-goal that it does not have, or weights that are missing or damaged, are a ``UserError``.
     """
     if sub_goal not in config["sub_goals"]:
         raise UserError("unknown sub-goal", sub_goal, f"{folder} has {', '.join(config['sub_goals'])}.")

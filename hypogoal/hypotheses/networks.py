@@ -74,14 +74,10 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
 
 
 def load_network(name: str) -> Callable[[int], Parts]:
-    """The function that makes network ``name``: one of :data:`NETWORKS`, an installed entry point, or own code.
+    """The function that makes network ``name``: of :data:`NETWORKS`, an installed entry point, or ``module:function``.
 
-    Args:
-        name: of these, or ``module:function``.
-
-    Raises:
-        UserError: no such network, it cannot be loaded, or it is code that the user did not allow (see
-            :mod:`hypogoal.core.own_code`).
+    No such network, one that cannot be loaded, or code that the user did not allow (see :mod:`hypogoal.core.own_code`)
+    is a ``UserError``.
     """
     if name in NETWORKS:
         return NETWORKS[name]
@@ -107,19 +103,11 @@ def _checked(name: str, parts_of: Callable[[int], Parts]) -> Callable[[int], Par
 
 
 def build_network(name: str, observation_shape: tuple[int, ...], generator: torch.Generator) -> nn.Sequential:
-    """A member network with fresh weights.
+    """A member network, float (N, C, H, W) -> logits (N, 2), on the CPU, for observations of shape (H, W, C).
 
-    Args:
-        name: see :func:`load_network`.
-        observation_shape: (H, W, C).
-        generator: draws the initial weights (PyTorch's default distributions).
-
-    Returns:
-        float (N, C, H, W) -> logits (N, 2), on the CPU.
-
-    Raises:
-        UserError: unknown network, BatchNorm hidden in another of its layers, or observations that are no images or
-            too small for it.
+    ``generator`` draws the initial weights (PyTorch's default distributions). An unknown network (see
+    :func:`load_network`), BatchNorm hidden in another of its layers, or observations that are no images or too small
+    for it are a ``UserError``.
     """
     parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"

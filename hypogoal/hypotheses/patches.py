@@ -23,17 +23,11 @@ LOOKUP_PER_VALUE = 4  # size of a table that ranks values; where it would be lar
 
 @dataclass(frozen=True)
 class Level:
-    """What one convolution or pooling looks at in N images, by patch ids.
+    """What one convolution or pooling looks at in N images, by patch ids."""
 
-    Attributes:
-        parts: int32 (U, k * k), each distinct patch as patch ids of the level below (colours for the first).
-        rows: int32 (R, W), distinct rows of places: the patch at each.
-        lines: int32 (N, H), each image as indices of rows.
-    """
-
-    parts: NDArray[np.int32]
-    rows: NDArray[np.int32]
-    lines: NDArray[np.int32]
+    parts: NDArray[np.int32]  # (U, k * k), each distinct patch as patch ids of the level below (colours for the first)
+    rows: NDArray[np.int32]  # (R, W), distinct rows of places: the patch at each
+    lines: NDArray[np.int32]  # (N, H), each image as indices of rows
 
 
 @dataclass(frozen=True)
@@ -49,21 +43,14 @@ class Batch:
     """The patches that occur in groups of images; those of a group follow those of the group before it.
 
     BatchNorm sees each group on its own, everything else all of them at once.
-
-    Attributes:
-        first: float32 (U, k * k, C), the patches of the first level.
-        parts: for each level above it int64 (U * k * k,), indices of the level below.
-        shares: for each level and group float32 (1, U), the share of the group's places where each patch lies; they sum
-            to 1.
-        places: for each level and group, how many places there are.
-        last: int64 (B, H * W), the last level's patch at each place of all images.
     """
 
-    first: Tensor
-    parts: tuple[Tensor, ...]
+    first: Tensor  # float32 (U, k * k, C), the patches of the first level
+    parts: tuple[Tensor, ...]  # for each level above it int64 (U * k * k,), indices of the level below
+    # For each level and group float32 (1, U), the share of the group's places where each patch lies; they sum to 1.
     shares: tuple[tuple[Tensor, ...], ...]
-    places: tuple[tuple[int, ...], ...]
-    last: Tensor
+    places: tuple[tuple[int, ...], ...]  # for each level and group, how many places there are
+    last: Tensor  # int64 (B, H * W), the last level's patch at each place of all images
 
 
 def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
@@ -209,10 +196,8 @@ def _positions(values: NDArray[np.int32], among: NDArray[np.int64]) -> NDArray[n
 def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) -> Tensor:
     """Logits (B, 2) that ``network`` gives the images of ``batch``, in its training or evaluation mode.
 
-    Args:
-        network: layers that ``windows_of`` knows.
-        batch: images, in groups.
-        counted: for each group whether BatchNorm's running statistics take it in (in training mode); all where empty.
+    Its layers are ones that ``windows_of`` knows. In training mode BatchNorm's running statistics take in the groups
+    that are ``counted``, all where that is empty.
     """
     rows, level = batch.first, -1
     for layer in network:

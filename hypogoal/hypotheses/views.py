@@ -35,18 +35,11 @@ class FullView(nn.Module):
 
 
 class AgentView(nn.Module):
-    """A window around the agent; what is outside the image is 0.
+    """A window around the agent, whom the localiser finds; what is outside the image is 0.
 
-    The same window for every frame of a stack, around where the agent is in the last.
-
-    Args:
-        observation_shape: (H, W, C).
-        height, width: of the window, in pixels.
-        localiser: where the agent is.
-
-    Attributes:
-        shape: (height, width, C).
-        needs_positions: whether the localiser reads positions, which no policy may see: an oracle.
+    The same window for every frame of a stack, around where the agent is in the last. Its ``shape`` is (height, width,
+    C), in pixels, of observations (H, W, C). ``needs_positions`` says whether the localiser reads positions, which no
+    policy may see: an oracle.
     """
 
     def __init__(self, observation_shape: tuple[int, ...], height: int, width: int, localiser: Localiser):
@@ -58,12 +51,9 @@ class AgentView(nn.Module):
     def see(
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> NDArray[np.uint8]:
-        """Windows uint8 (N, height, width, C).
+        """Windows uint8 (N, height, width, C) of uint8 (N, H, W, C), with ``margin`` pixels more on every side.
 
-        Args:
-            observations: uint8 (N, H, W, C).
-            positions: int64 (N, 3) of room, x, y, where the localiser reads them.
-            margin: so many pixels more on every side.
+        Positions are int64 (N, 3) of room, x, y, where the localiser reads them.
         """
         height, width, channels = self.shape
         size = height + 2 * margin, width + 2 * margin
@@ -80,10 +70,7 @@ def windows(
 ) -> NDArray[np.uint8]:
     """Windows uint8 (N, height, width, C) of images uint8 (N, H, W, C); 0 outside them.
 
-    Args:
-        observations: the images.
-        centres: (N, 2), row and column of the pixel in the middle; of an even number of pixels it is the one after.
-        height, width: in pixels.
+    ``centres`` (N, 2) are row and column of the pixel in the middle; of an even number of pixels it is the one after.
     """
     corner = np.floor(centres + 0.5).astype(np.int64) - (height // 2, width // 2)
     rows, rows_inside = _indices(corner[:, 0], height, observations.shape[1])
@@ -107,11 +94,7 @@ def positions_of(origins: Origins | None) -> NDArray[np.int64] | None:
 
 
 def needed(origins: Origins | None, names: tuple[str, ...], why: str) -> Origins:
-    """The origins of states, which must say these.
-
-    Raises:
-        UserError: one is missing.
-    """
+    """The origins of states, which must say these; a ``UserError`` where one is missing."""
     origins = origins or {}
     if missing := ", ".join(name for name in names if name not in origins):
         do = "Collect data that do, or set it otherwise."

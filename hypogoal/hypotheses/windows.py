@@ -46,10 +46,8 @@ def split_of(network: nn.Sequential) -> tuple[int, int, int] | None:
 class KnownWindows:
     """The numbers of windows, by their pixels.
 
-    Args:
-        compute: float32 (BATCH, C, side, side) in 0..1 -> float32 (BATCH, F, 1, 1).
-        side, stride: of the windows, in pixels.
-        most: windows kept; where there are more, it begins anew.
+    ``compute`` maps float32 (BATCH, C, side, side) in 0..1 to float32 (BATCH, F, 1, 1); ``side`` and ``stride`` are in
+    pixels. Where there are more than ``most`` windows it begins anew.
     """
 
     def __init__(self, compute: Callable[[Tensor], Tensor], side: int, stride: int, most: int = MOST):

@@ -20,11 +20,7 @@ RULES = ("any", "vote", "all", "mean")
 
 
 def require_observations(env: Env, shape: tuple[int, ...]) -> None:
-    """Refuse an environment whose observations are not those that networks were trained on.
-
-    Raises:
-        UserError: it is one.
-    """
+    """Refuse (``UserError``) an environment whose observations are not those that networks were trained on."""
     space = env.observation_space
     if space.shape is None or with_channels(space.shape) != shape or space.dtype != np.uint8:
         given = f"{space.dtype} {space.shape}, not uint8 {shape}"

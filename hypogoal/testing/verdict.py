@@ -50,10 +50,9 @@ class Verdict:
 
 
 def run(tests: Iterable[Test]) -> Iterator[Verdict]:
-    """Run tests one after the other, until one fails: those after it build on what it found.
+    """Run tests, names and functions, one after the other, until one fails: those after it build on what it found.
 
-    Args:
-        tests: name and function; the function says what it found, or raises. Warnings that it gives are kept.
+    A function says what it found, or raises. Warnings that it gives are kept.
     """
     for name, test in tests:
         with warnings.catch_warnings(record=True) as given:

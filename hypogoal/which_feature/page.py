@@ -29,12 +29,7 @@ PAPER = "white"  # text on dark colours of a heat map
 
 @dataclasses.dataclass(frozen=True)
 class Line:
-    """What the seeds of one entry at one mix came to; each number as a float (seeds,).
-
-    Attributes:
-        entry, mix: which.
-        coverage, best, same, gap, labels: see :func:`summary`.
-    """
+    """What the seeds of one entry at one mix came to; each number as a float (seeds,), see :func:`summary`."""
 
     entry: str
     mix: float
@@ -46,15 +41,10 @@ class Line:
 
 
 def summary(cells: Iterable[Cell], high: float, low: float) -> list[Line]:
-    """Entries, mix by mix, those that cover most first.
+    """Entries, mix by mix, those that cover most first; ``high`` and ``low`` are of ``scores.owned``.
 
-    Args:
-        cells: any.
-        high, low: of ``scores.owned``.
-
-    Returns:
-        For each entry and mix, by seed: coverage; the highest ranking of a factor by any member, mean over factors;
-        redundancy; calibration gap; labels needed, mean over the factors that are covered (NaN without any).
+    For each entry and mix, by seed: coverage; the highest ranking of a factor by any member, mean over factors;
+    redundancy; calibration gap; labels needed, mean over the factors that are covered (NaN without any).
     """
     lines = []
     for (mix, entry), some in grouped(cells, lambda cell: (cell.mix, cell.entry)).items():

@@ -84,31 +84,23 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Cell:
-    """One training of one entry, scored on crossed states; F factors, K members.
-
-    Attributes:
-        entry, mix, seed: which.
-        ranking: float (K, F), see ``scores.rankings``.
-        balanced_accuracy, at_best: float (K, F), at 0.5 and at the best threshold.
-        labels: int (F,), see ``scores.labels_needed``.
-        surest: int (K, 2, 4), the test states with the highest and with the lowest probability; empty where unknown.
-    """
+    """One training of one entry, scored on crossed states; F factors, K members."""
 
     entry: str
     mix: float
     seed: int
-    ranking: NDArray[np.float64]
-    balanced_accuracy: NDArray[np.float64]
-    at_best: NDArray[np.float64]
-    labels: NDArray[np.int64]
+    ranking: NDArray[np.float64]  # (K, F), see ``scores.rankings``
+    balanced_accuracy: NDArray[np.float64]  # (K, F), at 0.5
+    at_best: NDArray[np.float64]  # (K, F), at the best threshold
+    labels: NDArray[np.int64]  # (F,), see ``scores.labels_needed``
+    # (K, 2, 4), the test states with the highest and with the lowest probability; empty where unknown.
     surest: NDArray[np.int64]
 
 
 def parse_entry(text: str) -> Entry:
     """``dbat``, ``module:object``, ``cnn`` or ``oracle``; of objectives also with a weight, ``dbat:0.01``.
 
-    Raises:
-        UserError: no such objective, code that was not allowed, or no weight.
+    No such objective, code that was not allowed, or no weight is a ``UserError``.
     """
     objective, _, last = text.rpartition(":")
     try:
@@ -173,8 +165,7 @@ def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, te
 def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
     """Every cell that is not in ``out`` yet, seed by seed; then all that are there, ``results.csv`` with them.
 
-    Raises:
-        UserError: ``out`` is something else, was begun with other settings, or a cell in it is damaged.
+    A ``UserError`` where ``out`` is something else, was begun with other settings, or a cell in it is damaged.
     """
     entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in config.diversity.split(","))]
     for entry in entries:

@@ -20,14 +20,9 @@ Table = NDArray[np.float64]  # (K, F)
 
 
 def rankings(probabilities: NDArray[np.float32], factors: NDArray[np.bool_]) -> Table:
-    """Area under the ROC curve of every member on every factor.
+    """Area under the ROC curve of every member (N, K) on every factor (N, F), float64 (K, F).
 
-    Args:
-        probabilities: float32 (N, K).
-        factors: bool (N, F), the truth; every combination equally often.
-
-    Returns:
-        float64 (K, F), .5 where a member knows nothing of a factor.
+    Every combination of factors is there equally often; .5 is where a member knows nothing of a factor.
     """
     return np.stack([ranking(probabilities, truth) for truth in factors.T], axis=1)
 
@@ -43,9 +38,7 @@ def balanced_accuracies(probabilities: NDArray[np.float32], factors: NDArray[np.
 def owned(ranked: Table, high: float = 0.95, low: float = 0.6) -> NDArray[np.bool_]:
     """Which member owns which factor, bool (K, F): it ranks by it, at least ``high``, and by no other, at most ``low``.
 
-    Args:
-        ranked: see :func:`rankings`.
-        high, low: areas under the ROC curve.
+    ``ranked``, ``high`` and ``low`` are areas under the ROC curve, see :func:`rankings`.
     """
     known, unknown = ranked >= high, ranked <= low
     return known & (unknown.sum(axis=1, keepdims=True) == ranked.shape[1] - 1)

@@ -53,11 +53,8 @@ def labelled_states(count: int, seed: int, moved: bool = False) -> States:
 def unlabelled_states(count: int, mix: float, seed: int, moved: bool = False) -> States:
     """States of which members are told nothing.
 
-    Args:
-        count: how many.
-        mix: the probability with which a state's factors are drawn each for itself, evenly; else all are one even bit.
-        seed: of all that is random.
-        moved: two frames, and the factor that needs them.
+    ``mix`` is the probability with which a state's factors are drawn each for itself, evenly; else all are one even
+    bit. ``moved``: two frames, and the factor that needs them.
     """
     rng = rng_for(seed, "which-feature", "unlabelled")
     own, one = rng.random((count, len(names_of(moved)))) < 0.5, rng.random((count, 1)) < 0.5
