@@ -22,6 +22,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, read_text
 from hypogoal.core.hdf5 import Foreign, members, open_hdf5, read_array, walk
 
+AGAIN = "Evaluate the run again."
 WINDOW = 100  # episodes at the end of training by which an agent is judged
 LAST = 100  # executions of an option that count
 MOST = 2**53  # integers that a float holds
