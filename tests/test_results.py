@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import choosing, hypotheses, labels, ladders, thresholds
+from benchmarks import choosing, hypotheses, labels, ladders, thresholds, which_feature
 from benchmarks.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -15,6 +15,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "hypotheses-ladders": ladders.tables,
     "labels-doorkey": labels.tables,
     "thresholds-doorkey": thresholds.tables,
+    "which-feature": which_feature.tables,
 }
 
 
