@@ -34,7 +34,9 @@ def which_feature(
     ] = "0.5",
     members: Annotated[int, typer.Option(help="Hypotheses (K) of an entry.")] = 4,
     seeds: Annotated[str, typer.Option(help="0-4, or 0,3,7.")] = "0-4",
-    moved: Annotated[bool, typer.Option("--moved", help="Two frames, and a fifth feature: the object moved.")] = False,
+    factors: Annotated[
+        str, typer.Option(help="Features that are planted; also moved, which takes two frames. The others vary freely.")
+    ] = "colour,shape,place,count",
     high: Annotated[float, typer.Option(help="Ranking of a feature from which on a member owns it.")] = 0.95,
     low: Annotated[float, typer.Option(help="Its ranking of every other feature is at most this.")] = 0.6,
     set_: Set = None,
@@ -42,8 +44,8 @@ def which_feature(
 ) -> None:
     """Which features do members find, of several that fit the labels equally well?
 
-    Small scenes have four planted features: colour, shape and place of an
-    object, and how many boxes there are. In the labelled ones all four say the
+    Small scenes have planted features (--factors): colour, shape and place of
+    an object, and how many boxes there are. In the labelled ones all say the
     same; in a share of the unlabelled ones (--mix) each is drawn for itself.
     Members are trained as by train-ensemble (--set takes its settings) and
     scored on scenes in which all features are crossed:
@@ -69,7 +71,7 @@ def which_feature(
 
     prepare()
     options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds}
-    config = run.resolved({**options, "moved": moved, "high": high, "low": low}, set_ or ())
+    config = run.resolved({**options, "factors": factors, "high": high, "low": low}, set_ or ())
     with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
         cells = run.run(config, out, quiet)
     draw(page.table_of(cells, config), 79)

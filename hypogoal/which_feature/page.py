@@ -17,8 +17,8 @@ from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.evaluation.plots import INK, drawing, slug
 from hypogoal.which_feature import scores
-from hypogoal.which_feature.run import COPIES, Cell, WhichFeatureConfig, shared
-from hypogoal.which_feature.states import crossed_states, names_of
+from hypogoal.which_feature.run import Cell, WhichFeatureConfig, copies, shared
+from hypogoal.which_feature.states import crossed_states
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -104,19 +104,19 @@ def write(path: Path, cells: Sequence[Cell], config: WhichFeatureConfig) -> None
     for entry, some in grouped(cells, lambda cell: cell.entry).items():
         cell = min(some, key=lambda cell: (abs(cell.mix - 0.5), cell.seed))
         paragraphs = [f"Mix {cell.mix:g}, seed {cell.seed}."]
-        sections.append(page.section(slug(entry), entry, paragraphs, _members(material, cell, config.moved)))
+        sections.append(page.section(slug(entry), entry, paragraphs, _members(material, cell, config.factors)))
     settings = [(name, str(value)) for name, value in shared(config).items()]
     sections.append(page.section("settings", "Settings", [], [page.facts("What all entries share", settings)]))
     version = versions().get("hypogoal", "unknown")
     replace_text(path, page.draw_page(TITLE, "Features planted, found or not", sections, version))
 
 
-def _members(material: page.Material, cell: Cell, moved: bool) -> list[page.Block]:
+def _members(material: page.Material, cell: Cell, names: Sequence[str]) -> list[page.Block]:
     """Each member's ranking of each factor as a heat map, and the test states that it is surest of."""
     members, factors = cell.ranking.shape
     with drawing(0.6 + 0.35 * members, 1) as (figure, axes):
         axes.imshow(cell.ranking, vmin=0.0, vmax=1.0, cmap="PuOr", aspect="auto")
-        axes.set_xticks(range(factors), names_of(moved))
+        axes.set_xticks(range(factors), names)
         axes.set_yticks(range(members), [f"member {member}" for member in range(members)])
         axes.grid(visible=False)
         for member, factor in np.ndindex(members, factors):
@@ -127,7 +127,7 @@ def _members(material: page.Material, cell: Cell, moved: bool) -> list[page.Bloc
     label = f"What members of {cell.entry} rank by"
     caption = "Area under the ROC curve of each feature on states in which all features are crossed; 0.5 is chance."
     drawn = page.Drawn(f"owned-{cell.entry}", label, figure, caption)
-    states = crossed_states(COPIES, cell.seed, moved).observations[..., -3:]
+    states = crossed_states(copies(names), cell.seed, names).observations[..., -3:]
 
     def square(member: int, side: int) -> dict[str, str]:
         upper, lower = states[cell.surest[member, side]].reshape(2, 2, *states.shape[1:])

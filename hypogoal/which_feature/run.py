@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,11 +25,12 @@ from hypogoal.hypotheses.networks import Parts
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
 from hypogoal.which_feature.states import (
+    FACTORS,
+    KNOWN,
     TILE,
     States,
     crossed_states,
     labelled_states,
-    names_of,
     unlabelled_states,
 )
 
@@ -43,7 +44,7 @@ DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other one
     "learning_rate": 2e-3,
     "batch_size": 32,
 }
-LABELLED, UNLABELLED, COPIES = 256, 512, 20  # states; copies of each combination in the test, as many for the oracle
+LABELLED, UNLABELLED = 256, 512  # states
 SHOWN = 4  # test states of each kind that a member is surest of
 COLUMNS = ("entry", "mix", "seed", "member", "factor", "ranking", "balanced_accuracy", "at_best", "labels")
 AGAIN = "Remove it and give the same command again, or choose another --out."
@@ -63,7 +64,7 @@ class WhichFeatureConfig(EnsembleConfig):
 
     mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states whose factors are crossed", low=0.0, high=1.0)
     seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
-    moved: bool = setting(False, "two frames, and whether the object moved between them as a fifth factor")
+    factors: tuple[str, ...] = setting(FACTORS, f"planted features, of {', '.join(KNOWN)}", choices=KNOWN)
     high: float = setting(0.95, "ranking of a factor from which on a member owns it", low=0.5, high=1.0)
     low: float = setting(0.6, "its ranking of every other factor is at most this", low=0.0, high=1.0)
 
@@ -95,6 +96,11 @@ class Cell:
     labels: NDArray[np.int64]  # (F,), see ``scores.labels_needed``
     # (K, 2, 4), the test states with the highest and with the lowest probability; empty where unknown.
     surest: NDArray[np.int64]
+
+
+def copies(factors: Sequence[str]) -> int:
+    """Of each combination of factors in the test, and as many for the oracle: 320 states, more where there are five."""
+    return max(20, 320 >> len(factors))
 
 
 def parse_entry(text: str) -> Entry:
@@ -134,7 +140,7 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
 
     Entries of one seed have the same states, initial weights and batches.
     """
-    test = crossed_states(COPIES, seed, config.moved)
+    test = crossed_states(copies(config.factors), seed, config.factors)
     probabilities = _trained(entry, mix, seed, config_of(entry, config), test)
     ranked = rankings(probabilities, test.factors)
     at_half, at_best = balanced_accuracies(probabilities, test.factors)
@@ -146,18 +152,18 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
 
 def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: States) -> NDArray[np.float32]:
     """Probabilities (N, K) of the trained members on the test states."""
-    moved = config.moved
+    names = config.factors
     with own_code.vouched(NETWORK):
         if entry.objective == ORACLE:
-            told = crossed_states(COPIES, seed, moved, split=ORACLE)
+            told = crossed_states(copies(names), seed, names, split=ORACLE)
             seeds = [seed_for(seed, ORACLE, factor) for factor in range(told.factors.shape[1])]
             members = [
                 fit(told.observations, truth, told.observations[:0], config, own)
                 for truth, own in zip(told.factors.T, seeds, strict=True)
             ]
             return np.concatenate([member.predict(test.observations) for member in members], axis=1)
-        labelled = labelled_states(LABELLED, seed, moved)
-        unlabelled = unlabelled_states(UNLABELLED, mix, seed, moved).observations
+        labelled = labelled_states(LABELLED, seed, names)
+        unlabelled = unlabelled_states(UNLABELLED, mix, seed, names).observations
         ensemble = fit(labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble"))
         return ensemble.predict(test.observations)
 
@@ -170,6 +176,8 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
     entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in config.diversity.split(","))]
     for entry in entries:
         config_of(entry, config)  # whose weight may be none
+    if not config.factors or len(set(config.factors)) < len(config.factors):
+        raise UserError("features are planted once each", f"factors {config.factors}", "Name each once.")
     wanted = [(entry, mix, seed) for seed in config.seeds for mix in config.mix for entry in entries]
     if not wanted:
         raise UserError("there is nothing to run", f"seeds {config.seeds}, mixes {config.mix}", "Give one of each.")
@@ -181,18 +189,18 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
             if not path.exists():
                 replace_text(path, _text(run_cell(*cell, config)))
                 progress.advance()
-    cells = [_read(path, config.moved) for path in sorted((out / "cells").glob("*.json"))]
-    write_table(out / "results.csv", COLUMNS, rows_of(cells, config.moved))
+    cells = [_read(path, config.factors) for path in sorted((out / "cells").glob("*.json"))]
+    write_table(out / "results.csv", COLUMNS, rows_of(cells, config.factors))
     return cells
 
 
-def rows_of(cells: Iterable[Cell], moved: bool) -> Iterator[tuple[Any, ...]]:
+def rows_of(cells: Iterable[Cell], factors: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     """The lines of ``results.csv``: one for each cell, member and factor, in ``COLUMNS``."""
     for cell in cells:
         for member, factor in np.ndindex(*cell.ranking.shape):
             scores = (table[member, factor] for table in (cell.ranking, cell.balanced_accuracy, cell.at_best))
             numbers = (*(f"{score:.4f}" for score in scores), int(cell.labels[factor]))
-            yield (cell.entry, cell.mix, cell.seed, member, names_of(moved)[factor], *numbers)
+            yield (cell.entry, cell.mix, cell.seed, member, factors[factor], *numbers)
 
 
 def shared(config: WhichFeatureConfig) -> dict[str, Any]:
@@ -219,7 +227,7 @@ def _text(cell: Cell) -> str:
     return json.dumps(vars(cell), default=lambda array: array.tolist()) + "\n"
 
 
-def _read(path: Path, moved: bool) -> Cell:
+def _read(path: Path, factors: Sequence[str]) -> Cell:
     """A cell from its file, which may be anyone's."""
     data = read_json(path, "the cell is", AGAIN)
     try:
@@ -228,10 +236,10 @@ def _read(path: Path, moved: bool) -> Cell:
         named = str(data["entry"]), float(data["mix"]), int(data["seed"])
     except (TypeError, ValueError, KeyError, OverflowError):
         raise UserError("the cell is damaged", path, AGAIN) from None
-    shape = (len(ranked) if ranked.ndim else 0, len(names_of(moved)))
+    shape = (len(ranked) if ranked.ndim else 0, len(factors))
     shapes = [array.shape for array in (ranked, at_half, at_best, labels, surest)]
     fitting = shapes == [shape, shape, shape, shape[1:], (shape[0], 2, SHOWN)] and shape[0] > 0
     within = all(((table >= 0) & (table <= 1)).all() for table in (ranked, at_half, at_best))
-    if not (fitting and within and surest.min() >= 0 and surest.max() < COPIES * 2 ** shape[1]):
+    if not (fitting and within and surest.min() >= 0 and surest.max() < copies(factors) * 2 ** shape[1]):
         raise UserError("the cell is damaged", path, AGAIN)
     return Cell(*named, ranked, at_half, at_best, labels, surest)

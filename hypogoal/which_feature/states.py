@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 
 FACTORS = ("colour", "shape", "place", "count")
-MOVED = "moved"  # the fifth, of two frames
+MOVED = "moved"  # needs two frames
+KNOWN = (*FACTORS, MOVED)
 INNER, TILE = 4, 8  # free cells a side within the walls; pixels of a cell
 SIDE = (INNER + 2) * TILE  # pixels of an image
 CELLS = INNER * INNER
@@ -29,49 +31,46 @@ class States:
 
     Attributes:
         observations: uint8 (N, 48, 48, 3); with ``moved`` (N, 48, 48, 6), the frame before and the frame now.
-        factors: bool (N, F), whether each factor holds, in the order of ``FACTORS``: the object is blue, it is a ball,
-            it is in the right half, there are three or four boxes; with ``moved`` also: it was in another cell in the
-            frame before.
+        factors: bool (N, F), whether each factor that was asked for holds. ``colour``: the object is blue; ``shape``:
+            it is a ball; ``place``: it is in the right half; ``count``: there are three or four boxes; ``moved``: the
+            object was in another cell in the frame before. Those not asked for are drawn evenly.
     """
 
     observations: NDArray[np.uint8]
     factors: NDArray[np.bool_]
 
 
-def names_of(moved: bool) -> tuple[str, ...]:
-    """The factors by name."""
-    return (*FACTORS, MOVED) if moved else FACTORS
-
-
-def labelled_states(count: int, seed: int, moved: bool = False) -> States:
+def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS) -> States:
     """The labelled context: half of the states are positives, in which every factor holds; in the others none does."""
     rng = rng_for(seed, "which-feature", "labelled")
     holds = rng.permutation(np.arange(count) % 2 == 0)
-    return _drawn(np.repeat(holds[:, None], len(names_of(moved)), axis=1), rng)
+    return drawn(np.repeat(holds[:, None], len(names), axis=1), names, rng)
 
 
-def unlabelled_states(count: int, mix: float, seed: int, moved: bool = False) -> States:
+def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str] = FACTORS) -> States:
     """States of which members are told nothing.
 
     ``mix`` is the probability with which a state's factors are drawn each for itself, evenly; else all are one even
-    bit. ``moved``: two frames, and the factor that needs them.
+    bit.
     """
     rng = rng_for(seed, "which-feature", "unlabelled")
-    own, one = rng.random((count, len(names_of(moved)))) < 0.5, rng.random((count, 1)) < 0.5
-    return _drawn(np.where(rng.random((count, 1)) < mix, own, one), rng)
+    own, one = rng.random((count, len(names))) < 0.5, rng.random((count, 1)) < 0.5
+    return drawn(np.where(rng.random((count, 1)) < mix, own, one), names, rng)
 
 
-def crossed_states(copies: int, seed: int, moved: bool = False, *, split: str = "test") -> States:
+def crossed_states(copies: int, seed: int, names: Sequence[str] = FACTORS, *, split: str = "test") -> States:
     """Every combination of factors ``copies`` times, in random order; each ``split`` has random numbers of its own."""
     rng = rng_for(seed, "which-feature", split)
-    every = np.array(list(product((False, True), repeat=len(names_of(moved)))))
-    return _drawn(rng.permutation(np.repeat(every, copies, axis=0)), rng)
+    every = np.array(list(product((False, True), repeat=len(names))))
+    return drawn(rng.permutation(np.repeat(every, copies, axis=0)), names, rng)
 
 
-def _drawn(factors: NDArray[np.bool_], rng: np.random.Generator) -> States:
-    """Scenes of these factors; all else is drawn at random, in the same way whatever the factors are."""
+def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Generator) -> States:
+    """Scenes of these factors, bool (N, F); all else is drawn at random, in the same way whatever the factors are."""
     count = len(factors)
-    colour, shape, place, many = factors[:, : len(FACTORS)].T.astype(np.int64)
+    truth = dict(zip(names, factors.T, strict=True))
+    truth |= {name: rng.random(count) < 0.5 for name in FACTORS if name not in truth}
+    colour, shape, place, many = (truth[name].astype(np.int64) for name in FACTORS)
     rows = np.arange(count)
     x, y = rng.integers(INNER // 2, size=count) + place * (INNER // 2), rng.integers(INNER, size=count)
     up = np.where(y == 0, False, (y == INNER - 1) | (rng.random(count) < 0.5))
@@ -89,10 +88,10 @@ def _drawn(factors: NDArray[np.bool_], rng: np.random.Generator) -> States:
     ids = np.empty((count, CELLS), dtype=np.int64)
     np.put_along_axis(ids, cells, things, axis=1)
     frames = [_image(ids)]
-    if factors.shape[1] > len(FACTORS):
+    if MOVED in truth:
         earlier = ids.copy()
         earlier[rows, cells[:, 1]] = AGENT + rng.integers(4, size=count)
-        moved = rows[factors[:, -1]]
+        moved = rows[truth[MOVED]]
         earlier[moved, now[moved]], earlier[moved, before[moved]] = FLOOR, things[moved, 0]
         frames.insert(0, _image(earlier))
     return States(np.concatenate(frames, axis=-1), factors)

@@ -11,20 +11,21 @@ from scipy.stats import binomtest
 from hypogoal.which_feature.states import (
     AGENT,
     CELLS,
+    FACTORS,
     FLOOR,
     GOAL,
     INNER,
+    KNOWN,
     OBJECT,
     TILE,
     _image,
     crossed_states,
     labelled_states,
-    names_of,
     tiles,
     unlabelled_states,
 )
 
-BOTH = pytest.mark.parametrize("moved", [False, True])
+SETS = pytest.mark.parametrize("names", [FACTORS, KNOWN, ("shape", "place"), ("moved", "count")])
 
 
 def kinds(observations: np.ndarray) -> np.ndarray:
@@ -48,30 +49,32 @@ def test_a_scene_is_drawn_as_minigrid_draws_it() -> None:
     assert (tiles()[1] == Grid.render_tile(Wall(), tile_size=TILE).astype(np.uint8)).all()
 
 
-@BOTH
-def test_the_truth_is_what_is_seen(moved: bool) -> None:
+@SETS
+def test_the_truth_is_what_is_seen(names: tuple[str, ...]) -> None:
     """Each factor, counted again from the pixels; all else is there whatever the factors are."""
-    states = crossed_states(10, 3, moved)
+    states = crossed_states(10, 3, names)
     seen = kinds(states.observations)
     things = (seen >= OBJECT) & (seen < OBJECT + 4)
     assert (things.sum((1, 2)) == 1).all()
     column = things.any(1).argmax(1)
     kind = seen[things] - OBJECT
     boxes = ((seen >= OBJECT + 4) & (seen < GOAL)).sum((1, 2))
-    truth = [kind % 2 == 1, kind >= 2, column >= INNER // 2, boxes > 2]
-    if moved:
-        before = kinds(states.observations[..., :3])
-        truth.append((things & (before != seen)).any((1, 2)))
-    assert (np.stack(truth, axis=1) == states.factors).all()
+    truth = {"colour": kind % 2 == 1, "shape": kind >= 2, "place": column >= INNER // 2, "count": boxes > 2}
+    before = kinds(states.observations[..., :3])
+    truth["moved"] = (things & (before != seen)).any((1, 2))
+    assert (np.stack([truth[name] for name in names], axis=1) == states.factors).all()
+    for name in set(FACTORS) - set(names):  # they vary freely
+        assert binomtest(int(truth[name].sum()), len(kind), 0.5).pvalue > 1e-4
+        assert abs(np.corrcoef(truth[name], states.factors[:, 0])[0, 1]) < 0.5
     assert set(boxes.tolist()) == {1, 2, 3, 4}
     assert (((seen >= AGENT) & (seen < OBJECT)).sum((1, 2)) == 1).all()
 
 
-@BOTH
-def test_labelled_states_are_aligned(moved: bool) -> None:
+@SETS
+def test_labelled_states_are_aligned(names: tuple[str, ...]) -> None:
     """Whichever factor is the sub-goal, the labels are the same; half are positives."""
-    factors = labelled_states(256, 0, moved).factors
-    assert factors.shape == (256, len(names_of(moved)))
+    factors = labelled_states(256, 0, names).factors
+    assert factors.shape == (256, len(names))
     assert (factors == factors[:, :1]).all()
     assert factors[:, 0].sum() == 128
 
@@ -86,23 +89,23 @@ def test_mix_is_the_share_of_states_drawn_factor_by_factor(mix: float) -> None:
         assert binomtest(int(holds.sum()), 4000, 0.5).pvalue > 1e-4
 
 
-@BOTH
-def test_test_states_are_fully_crossed(moved: bool) -> None:
+@SETS
+def test_test_states_are_fully_crossed(names: tuple[str, ...]) -> None:
     """Every combination equally often."""
-    factors = crossed_states(7, 0, moved).factors
+    factors = crossed_states(7, 0, names).factors
     combinations, counts = np.unique(factors, axis=0, return_counts=True)
-    assert len(combinations) == 2 ** len(names_of(moved))
+    assert len(combinations) == 2 ** len(names)
     assert (counts == 7).all()
 
 
-@BOTH
-def test_a_seed_gives_the_same_bytes_and_another_others(moved: bool) -> None:
+@SETS
+def test_a_seed_gives_the_same_bytes_and_another_others(names: tuple[str, ...]) -> None:
     """And so do the sets of one seed: what is not a factor is drawn anew in each."""
     makers = (
-        lambda seed: labelled_states(64, seed, moved),
-        lambda seed: unlabelled_states(64, 0.5, seed, moved),
-        lambda seed: crossed_states(4, seed, moved),
-        lambda seed: crossed_states(4, seed, moved, split="oracle"),
+        lambda seed: labelled_states(64, seed, names),
+        lambda seed: unlabelled_states(64, 0.5, seed, names),
+        lambda seed: crossed_states(4, seed, names),
+        lambda seed: crossed_states(4, seed, names, split="oracle"),
     )
     sets = {make: make(1).observations for make in makers}
     for make, images in sets.items():
@@ -110,4 +113,5 @@ def test_a_seed_gives_the_same_bytes_and_another_others(moved: bool) -> None:
         assert images.tobytes() != make(2).observations.tobytes()
     bodies = [{image.tobytes() for image in images} for images in sets.values()]
     assert len(set.union(*bodies)) == sum(len(some) for some in bodies)
-    assert all(images.dtype == np.uint8 and images.shape[1:] == (48, 48, 6 if moved else 3) for images in sets.values())
+    channels = 6 if "moved" in names else 3
+    assert all(images.dtype == np.uint8 and images.shape[1:] == (48, 48, channels) for images in sets.values())
