@@ -2,6 +2,8 @@
 
 hypogoal sweep examples/choosing.toml --out runs/choosing
 python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
+hypogoal sweep examples/which-feature.toml --out runs/which-feature
+python -m benchmarks.choosing runs/which-feature docs/results/which-feature-rooms.csv
 python -m benchmarks.choosing --tables docs/results/choosing-doorkey.csv
 """
 
@@ -18,7 +20,19 @@ from numpy.typing import NDArray
 from benchmarks.cells import interval, table
 from hypogoal.evaluation.choosing import FROZEN, OF_CHOICE, OF_PLAY, UNIFORM
 
-METHODS = {"dbat": "D-BAT, K = 6", "none": "no diversity, K = 6", "one": "one classifier, K = 1"}
+METHODS = {  # by what the names of artefacts have in them, the longest first
+    "dbat-truth-shape": "shape: D-BAT, K = 3",
+    "divdis-truth-shape": "shape: DivDis, K = 3",
+    "none-truth-shape": "shape: no diversity, K = 3",
+    "one-truth-shape": "shape: one classifier, K = 1",
+    "dbat-truth-place": "place: D-BAT, K = 3",
+    "divdis-truth-place": "place: DivDis, K = 3",
+    "none-truth-place": "place: no diversity, K = 3",
+    "one-truth-place": "place: one classifier, K = 1",
+    "dbat": "D-BAT, K = 6",
+    "none": "no diversity, K = 6",
+    "one": "one classifier, K = 1",
+}
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
 SHOWN = {
     "success": "solved",
@@ -52,6 +66,7 @@ def tables(path: Path) -> Iterator[str]:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     layouts = list(dict.fromkeys(row["layout"] for row in rows))
+    methods = {name: title for name, title in METHODS.items() if any(row["method"] == name for row in rows)}
 
     def of(method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
         found = {
@@ -72,7 +87,7 @@ def tables(path: Path) -> Iterator[str]:
                 *(_mean(of(method, chooser, quantity)) for quantity in SHOWN),
                 f"{(of(method, chooser, 'success') >= 0.95).sum()} of {len(layouts)}",
             ]
-            for method, title in METHODS.items()
+            for method, title in methods.items()
             for chooser in ("agent", "uniform")
         ),
     )
@@ -90,7 +105,7 @@ def tables(path: Path) -> Iterator[str]:
                     )
                 ),
             ]
-            for method, title in METHODS.items()
+            for method, title in methods.items()
         ),
     )
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 BUILT_IN = {
     "doorkey": "hypogoal.domains.doorkey:DOMAIN",
     "montezuma": "hypogoal.domains.montezuma:DOMAIN",
+    "which-feature": "hypogoal.which_feature.domain:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
 IMPORTED = "imported"  # what states are of where 'hypogoal import' was not told

@@ -28,7 +28,7 @@ class EnsembleConfig:
     )
     network: str = setting(
         "doorkey",
-        "member network: doorkey, montezuma, montezuma-crop, or module:function",
+        "member network: doorkey, montezuma, montezuma-crop, tiles, or module:function",
         source="the paper's appendix",
     )
     steps: int = setting(

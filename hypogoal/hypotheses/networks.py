@@ -65,10 +65,16 @@ def montezuma_crop(channels: int) -> Parts:
     return [*_convolution(channels, 16, 5, 2), *_convolution(16, 32, 5, 2)], (64,)
 
 
+def tiles(channels: int) -> Parts:
+    """Pictures of 8x8 tiles: a layer that reads tiles, one of 3x3 tiles, one hidden dense layer; from 24x24 pixels."""
+    return [*_convolution(channels, 16, 8, 8), *_convolution(16, 16, 3, 1)], (64,)
+
+
 NETWORKS: dict[str, Callable[[int], Parts]] = {
     "doorkey": doorkey,
     "montezuma": montezuma,
     "montezuma-crop": montezuma_crop,
+    "tiles": tiles,
 }
 """By name: number of channels -> convolutional part, and the widths of the hidden dense layers behind it."""
 

@@ -10,9 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
-from hypogoal.core import own_code
 from hypogoal.core.config import as_dict, from_values, resolve, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text, write_table
@@ -21,13 +19,11 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.diversity import load_objective
 from hypogoal.evaluation.plots import slug
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.networks import Parts
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
 from hypogoal.which_feature.states import (
     FACTORS,
     KNOWN,
-    TILE,
     States,
     crossed_states,
     labelled_states,
@@ -35,11 +31,10 @@ from hypogoal.which_feature.states import (
 )
 
 CNN, ORACLE = "cnn", "oracle"  # entries that are no objectives: one member, and one taught by each factor's truth
-NETWORK = f"{__name__}:tiles"
 DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other ones of
     "members": 4,
     "diversity_weight": 0.01,
-    "network": NETWORK,
+    "network": "tiles",
     "steps": 150,
     "learning_rate": 2e-3,
     "batch_size": 32,
@@ -48,14 +43,6 @@ LABELLED, UNLABELLED = 256, 512  # states
 SHOWN = 4  # test states of each kind that a member is surest of
 COLUMNS = ("entry", "mix", "seed", "member", "factor", "ranking", "balanced_accuracy", "at_best", "labels")
 AGAIN = "Remove it and give the same command again, or choose another --out."
-
-
-def tiles(channels: int) -> Parts:
-    """The benchmark's member network: a layer that reads tiles, one of 3x3 tiles, one hidden dense layer."""
-    layers: list[nn.Module] = []
-    for inputs, kernel, stride in ((channels, TILE, TILE), (16, 3, 1)):
-        layers += [nn.Conv2d(inputs, 16, kernel, stride, bias=False), nn.BatchNorm2d(16), nn.ReLU()]
-    return layers, (64,)
 
 
 @dataclass(frozen=True)
@@ -153,19 +140,18 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
 def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: States) -> NDArray[np.float32]:
     """Probabilities (N, K) of the trained members on the test states."""
     names = config.factors
-    with own_code.vouched(NETWORK):
-        if entry.objective == ORACLE:
-            told = crossed_states(copies(names), seed, names, split=ORACLE)
-            seeds = [seed_for(seed, ORACLE, factor) for factor in range(told.factors.shape[1])]
-            members = [
-                fit(told.observations, truth, told.observations[:0], config, own)
-                for truth, own in zip(told.factors.T, seeds, strict=True)
-            ]
-            return np.concatenate([member.predict(test.observations) for member in members], axis=1)
-        labelled = labelled_states(LABELLED, seed, names)
-        unlabelled = unlabelled_states(UNLABELLED, mix, seed, names).observations
-        ensemble = fit(labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble"))
-        return ensemble.predict(test.observations)
+    if entry.objective == ORACLE:
+        told = crossed_states(copies(names), seed, names, split=ORACLE)
+        seeds = [seed_for(seed, ORACLE, factor) for factor in range(told.factors.shape[1])]
+        members = [
+            fit(told.observations, truth, told.observations[:0], config, own)
+            for truth, own in zip(told.factors.T, seeds, strict=True)
+        ]
+        return np.concatenate([member.predict(test.observations) for member in members], axis=1)
+    labelled = labelled_states(LABELLED, seed, names)
+    unlabelled = unlabelled_states(UNLABELLED, mix, seed, names).observations
+    ensemble = fit(labelled.observations, labelled.factors[:, 0], unlabelled, config, seed_for(seed, "ensemble"))
+    return ensemble.predict(test.observations)
 
 
 def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:

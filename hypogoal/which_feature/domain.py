@@ -1,0 +1,163 @@
+"""WhichFeature as a domain: rooms, one of which has the feature that is rewarded (Spec H1).
+
+An agent stands before some rooms and goes into one. Labels were given where several features say the same, so which
+of them the reward asks for only the reward can tell: ``truth`` of the world an agent is trained in.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.config import setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import Collected, States
+from hypogoal.domains.base import Domain, Engine, Plan, Step
+from hypogoal.which_feature import states
+from hypogoal.which_feature.states import FACTORS, KNOWN, MOVED, SIDE, crossed_states, drawn
+
+DECKS = 64  # sets of rooms of a layout; episodes go round them
+SUB_GOALS = ("right-room",)
+HELDOUT = 20  # layouts' worth of held-out states
+
+
+@dataclass(frozen=True)
+class RoomsConfig:
+    """What ``hypogoal collect which-feature`` can be told."""
+
+    factors: tuple[str, ...] = setting(("shape", "place"), "planted features: equal in labelled states", choices=KNOWN)
+    truth: str = setting("shape", "the feature that rooms are rewarded for", choices=KNOWN)
+    rooms: int = setting(5, "rooms to choose among, one of which is right", low=2, high=32)
+    mix: float = setting(1.0, "share of unlabelled states whose features are crossed", low=0.0, high=1.0)
+    labelled: int = setting(256, "labelled states", low=4, high=100_000)
+    unlabelled: int = setting(2048, "unlabelled states", low=1, high=100_000)
+
+
+class RoomsEngine(Engine):
+    """Environments of one layout: ``DECKS`` sets of rooms, gone round. An action is the room to go into.
+
+    The right room has the true feature, none of the others has; every other feature is drawn evenly. Going into a room
+    ends the episode, with a reward of 1 if it is the right one. Before them the agent sees a scene in which no feature
+    holds. States are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck.
+
+    Args:
+        layout_seed: draws the rooms.
+        count: environments (E).
+        max_steps: an episode has one step, so it is never cut.
+        factors, truth, rooms: see ``RoomsConfig``.
+    """
+
+    resumes = True
+    n_states = 0
+
+    def __init__(self, layout_seed: int, count: int, max_steps: int, factors: tuple[str, ...], truth: str, rooms: int):
+        self.count, self.max_steps, self.n_actions = count, max_steps, rooms
+        self.n_states = DECKS * (1 + rooms)
+        rng = rng_for(layout_seed, "which-feature", "rooms")
+        right = np.arange(rooms) == rng.integers(rooms, size=(DECKS, 1))
+        holds = rng.random((DECKS, rooms, len(factors))) < 0.5
+        holds[..., factors.index(truth)] = right
+        every = np.concatenate([np.zeros((DECKS, len(factors)), np.bool_), holds.reshape(-1, len(factors))])
+        self._pictures = drawn(every, factors, rng).observations
+        self._right = np.concatenate([np.zeros(DECKS, np.bool_), right.ravel()])
+        self.observation_shape = self._pictures.shape[1:]
+        self.reset()
+
+    def reset(self) -> NDArray[np.int64]:
+        self.ids = np.arange(self.count) % DECKS
+        self.elapsed = np.zeros(self.count, np.int64)
+        return self.ids.copy()
+
+    def step(self, actions: NDArray[np.int64]) -> Step:
+        following = DECKS + self.ids * self.n_actions + actions
+        self.ids = (self.ids + self.count) % DECKS
+        over = np.ones(self.count, np.bool_)
+        return Step(following, self._right[following].astype(np.float32), over, ~over)
+
+    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        return np.take(self._pictures, ids, axis=0, out=self.room_for(len(ids), out))
+
+    def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return self._right[ids][:, None]
+
+    def reachable(self) -> NDArray[np.int64]:
+        return np.arange(self.n_states)
+
+    def plan(self) -> Plan:
+        ids, final = self.reachable(), self.reachable() >= DECKS
+        following = np.repeat(ids[:, None], self.n_actions, axis=1)
+        following[:DECKS] = ids[DECKS:].reshape(DECKS, self.n_actions)
+        return Plan(ids, np.arange(self.n_actions), following, final, self._right)
+
+    def shortest_path(self) -> int:
+        return 1
+
+    def random_success(self, episodes: int, rng: np.random.Generator) -> float:
+        return 1 / self.n_actions
+
+    def snapshot(self) -> dict[str, NDArray[Any]]:
+        return {"ids": self.ids.copy()}
+
+    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        self.ids = snapshot["ids"].copy()
+
+
+class RoomsDomain(Domain):
+    """Spec H1: a domain in which one labelled context cannot say what the sub-goal is."""
+
+    name = "which-feature"
+    sub_goals = SUB_GOALS
+    config_class = RoomsConfig
+    engine_settings = ("factors", "truth", "rooms")
+    defaults = MappingProxyType(
+        {
+            "train-ensemble": MappingProxyType(
+                {
+                    "network": "tiles",
+                    "schedule": "sequential",
+                    "diversity_weight": 0.03,
+                    "learning_rate": 2e-3,
+                    "batch_size": 32,
+                    "threshold": "unlabelled-split",
+                }
+            ),
+            "train-meta": MappingProxyType({"network": "planned", "steps": 10_000}),
+        }
+    )
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        return (SIDE, SIDE, 3)
+
+    def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
+        """Labelled, unlabelled and fully crossed held-out states; ``layout_seed`` of the latter parts them in 20."""
+        names = config.factors
+        if config.truth not in names or len(set(names)) < len(names) or MOVED in names:
+            what = "features are planted once each, the true one among them, and all are seen in one frame"
+            raise UserError(what, f"factors={names}, truth={config.truth}", f"Choose of {', '.join(FACTORS)}.")
+        column = names.index(config.truth)
+        progress.expect(1)
+        sets = [
+            states.labelled_states(config.labelled, seed, names),
+            states.unlabelled_states(config.unlabelled, config.mix, seed, names),
+            crossed_states(HELDOUT * 4, seed, names),
+        ]
+        told = [States(one.observations, one.factors[:, [column]], _origins(len(one.factors))) for one in sets]
+        progress.advance()
+        return Collected(self.observation_shape, SUB_GOALS, *told)
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
+        """An engine of ``count`` environments of one layout; ``arguments``: its ``engine_settings``."""
+        settings = {name: arguments.get(name, getattr(RoomsConfig(), name)) for name in self.engine_settings}
+        return RoomsEngine(layout_seed, count, max_steps, **settings)
+
+
+def _origins(count: int) -> dict[str, NDArray[np.int64]]:
+    return {"layout_seed": np.arange(count) % HELDOUT}
+
+
+DOMAIN = RoomsDomain()
