@@ -28,7 +28,7 @@ from hypogoal.core.terminal import draw, give, say
 
 @app.command()
 def collect(
-    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
+    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, which-feature, or module:object.")],
     out: Out,
     preset: Preset = None,
     set_: Set = None,
@@ -144,7 +144,7 @@ def train_meta(
 
 @app.command("train-baseline")
 def train_baseline(
-    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, or module:object.")],
+    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, which-feature, or module:object.")],
     out: Out,
     agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
     data: Annotated[

@@ -55,12 +55,13 @@ class RoomsEngine(Engine):
     n_states = 0
 
     def __init__(self, layout_seed: int, count: int, max_steps: int, factors: tuple[str, ...], truth: str, rooms: int):
+        column = _column(factors, truth)
         self.count, self.max_steps, self.n_actions = count, max_steps, rooms
         self.n_states = DECKS * (1 + rooms)
         rng = rng_for(layout_seed, "which-feature", "rooms")
         right = np.arange(rooms) == rng.integers(rooms, size=(DECKS, 1))
         holds = rng.random((DECKS, rooms, len(factors))) < 0.5
-        holds[..., factors.index(truth)] = right
+        holds[..., column] = right
         every = np.concatenate([np.zeros((DECKS, len(factors)), np.bool_), holds.reshape(-1, len(factors))])
         self._pictures = drawn(every, factors, rng).observations
         self._right = np.concatenate([np.zeros(DECKS, np.bool_), right.ravel()])
@@ -135,11 +136,7 @@ class RoomsDomain(Domain):
 
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and fully crossed held-out states; ``layout_seed`` of the latter parts them in 20."""
-        names = config.factors
-        if config.truth not in names or len(set(names)) < len(names) or MOVED in names:
-            what = "features are planted once each, the true one among them, and all are seen in one frame"
-            raise UserError(what, f"factors={names}, truth={config.truth}", f"Choose of {', '.join(FACTORS)}.")
-        column = names.index(config.truth)
+        names, column = config.factors, _column(config.factors, config.truth)
         progress.expect(1)
         sets = [
             states.labelled_states(config.labelled, seed, names),
@@ -154,6 +151,13 @@ class RoomsDomain(Domain):
         """An engine of ``count`` environments of one layout; ``arguments``: its ``engine_settings``."""
         settings = {name: arguments.get(name, getattr(RoomsConfig(), name)) for name in self.engine_settings}
         return RoomsEngine(layout_seed, count, max_steps, **settings)
+
+
+def _column(factors: tuple[str, ...], truth: str) -> int:
+    if truth not in factors or len(set(factors)) < len(factors) or MOVED in factors:
+        what = "features are planted once each, the true one among them, and all are seen in one frame"
+        raise UserError(what, f"factors={','.join(factors)}, truth={truth}", f"Choose of {', '.join(FACTORS)}.")
+    return factors.index(truth)
 
 
 def _origins(count: int) -> dict[str, NDArray[np.int64]]:

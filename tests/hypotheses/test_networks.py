@@ -19,7 +19,7 @@ from hypogoal.hypotheses.networks import (
     smallest_side,
 )
 
-SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "montezuma-crop": (24, 32, 4)}
+SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4), "montezuma-crop": (24, 32, 4), "tiles": (48, 48, 3)}
 
 
 def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -> nn.Sequential:
@@ -43,6 +43,8 @@ def network_of(name: str, shape: tuple[int, ...] | None = None, seed: int = 0) -
         ("montezuma", 3, 2, 8192 + 64 + 32768 + 128 + 36864 + 128 + 1606144 + 1026),
         # 16x4x25 + 32 + 32x16x25 + 64, 32 x 3 x 5 features: 480x64 + 64 + 64x2 + 2
         ("montezuma-crop", 2, 2, 1600 + 32 + 12800 + 64 + 30784 + 130),
+        # 16x3x64 + 32 + 16x16x9 + 32, 16 x 4 x 4 features: 256x64 + 64 + 64x2 + 2
+        ("tiles", 2, 2, 3072 + 32 + 2304 + 32 + 16448 + 130),
     ],
 )
 def test_the_layers_are_the_papers(name: str, convolutions: int, dense: int, parameters: int) -> None:
@@ -66,7 +68,9 @@ def test_logits_of_each_state(name: str) -> None:
     torch.testing.assert_close(network(images[3:4]), logits[3:4])
 
 
-@pytest.mark.parametrize(("name", "smallest"), [("doorkey", 41), ("montezuma", 36), ("montezuma-crop", 13)])
+@pytest.mark.parametrize(
+    ("name", "smallest"), [("doorkey", 41), ("montezuma", 36), ("montezuma-crop", 13), ("tiles", 24)]
+)
 def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     """Spec C5, G2: dense layers take what the convolutions leave; too small an image is one clear line."""
     shape = (smallest, smallest + 9, 1)
@@ -89,8 +93,8 @@ def test_images_too_small_are_told_where_to_go() -> None:
     begin = "It takes 41x41 pixels: give larger ones,"
     own = "or a network of your own (--set network=module:function)."
     assert told == [
-        f"{begin} --set network=montezuma, --set network=montezuma-crop, {own}",
-        f"{begin} --set network=montezuma-crop, {own}",
+        f"{begin} --set network=montezuma, --set network=montezuma-crop, --set network=tiles, {own}",
+        f"{begin} --set network=montezuma-crop, --set network=tiles, {own}",
         f"{begin} {own}",
     ]
 
