@@ -40,7 +40,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "say-no": {"diversity": "say-no"},
 }
 MEMBERS = 3
-LOOKS = (50, 100, 200, 300, 450, 600, 800, 1000)
+LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
 SCOPES = ("all", "unseen", "first", "second")  # all rooms; those of no training set, and both halves of these
 KEYS = ("groups", "method", "seed", "step", "member")
 COLUMNS = (*KEYS, *(f"{name}_{scope}" for scope in SCOPES for name in ("ranking", "balanced_accuracy", "accuracy")))

@@ -4,15 +4,16 @@
     python -m benchmarks.which_feature --gather docs/results/which-feature.csv runs/which-choice/results.csv ...
     python -m benchmarks.which_feature --chosen   the entries at the weights that the rule chose
     python -m benchmarks.which_feature            the tables of docs/results/which-feature.md
+    python -m benchmarks.which_feature --two      those of docs/results/which-feature-two.md
 
-``--gather`` makes the first file of the others, which the benchmark wrote.
+With ``--two`` the grid and the chosen entries are those of two features, too. ``--gather`` makes the first file of the others, which the benchmark wrote.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +30,15 @@ WEIGHTS = (1.0, 0.1, 0.01, 0.001, 0.0001)
 OBJECTIVES = (  # in the order in which they are run
     "dbat", "divdis", "mutual-information", "ace", "repulsive", "hsic", "dbat-unpaired", "say-no", "input-gradients",
 )  # fmt: skip
+OF_TWO = OBJECTIVES[:6]
 UNWEIGHTED = ("none", "cnn", "oracle")
-CHOICE_SEEDS, CHOICE_MIX = (100,), 0.5
+CHOICE_SEEDS, CHOICE_MIX, CHOICE_MIX_OF_TWO = (100,), 0.5, 1.0
 HIGH, LOW = 0.95, 0.6
 SCORES = ("ranking", "balanced_accuracy", "at_best")
 NONE = np.empty((0, 2, 0), dtype=np.int64)  # states that members are surest of: not in the CSV
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
+TWO = CSV.with_name("which-feature-two.csv")
+SEQUENTIAL = CSV.with_name("which-feature-two-sequential.csv")  # members one after the other
 LONG = CSV.with_name("which-feature-long.csv")  # cells of 600 steps instead of 150
 
 
@@ -55,21 +59,21 @@ def read(path: Path) -> list[Cell]:
         rows = list(csv.DictReader(file))
     cells = []
     for (entry, mix, seed), of in grouped(rows, lambda row: (row["entry"], row["mix"], row["seed"])).items():
-        shape = (-1, len(FACTORS))
+        shape = (-1, len({row["factor"] for row in of}))
         ranked, at_half, at_best = (np.array([float(row[name]) for row in of]).reshape(shape) for name in SCORES)
-        labels = np.array([int(row["labels"]) for row in of[: len(FACTORS)]])
+        labels = np.array([int(row["labels"]) for row in of[: shape[1]]])
         cells.append(Cell(entry, float(mix), int(seed), ranked, at_half, at_best, labels, NONE))
     return cells
 
 
-def chosen(cells: Sequence[Cell]) -> dict[str, str]:
+def chosen(cells: Sequence[Cell], objectives: Sequence[str] = OBJECTIVES, mix: float = CHOICE_MIX) -> dict[str, str]:
     """The rule: of each objective's weights the one with the highest coverage, ties by best; by objective its entry.
 
     Objectives of which a weight or a seed is still missing are left out.
     """
-    lines = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS and cell.mix == CHOICE_MIX], HIGH, LOW)
+    lines = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS and cell.mix == mix], HIGH, LOW)
     found = {}
-    for objective in OBJECTIVES:
+    for objective in objectives:
         entries = _entries(objective)
         own = [line for line in lines if line.entry in entries and len(line.coverage) == len(CHOICE_SEEDS)]
         if len(own) == len(entries):
@@ -80,17 +84,8 @@ def chosen(cells: Sequence[Cell]) -> dict[str, str]:
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     cells = read(path)
-    winners = chosen(cells)
-    choice = [cell for cell in cells if cell.seed in CHOICE_SEEDS]
-    by_entry = {line.entry: line for line in summary(choice, HIGH, LOW)}
-    yield "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose."
-    yield ""
-    yield from table(
-        ["", *(f"{weight:g}" for weight in WEIGHTS)],
-        (
-            [name, *(_choice(by_entry.get(entry), entry in winners.values()) for entry in _entries(name))]
-            for name in OBJECTIVES
-        ),
+    yield from _weights(
+        "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose.", cells, chosen(cells)
     )
     test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS]
     yield from _board("Test", test)
@@ -99,6 +94,29 @@ def tables(path: Path) -> Iterator[str]:
     yield from table(["", *FACTORS], _by_factor([cell for cell in test if cell.mix == CHOICE_MIX]))
     if LONG.exists():
         yield from _board("600 steps", read(LONG))
+
+
+def tables_of_two(path: Path) -> Iterator[str]:
+    """What the cells of two features say, members trained at once and one after the other."""
+    for title, cells in (("At once", read(path)), ("One after the other", read(path.with_name(SEQUENTIAL.name)))):
+        what = f"{title}: coverage (best) by weight, seed 100 at mix 1; in bold what the rule chose."
+        yield from _weights(what, cells, chosen(cells, OF_TWO, CHOICE_MIX_OF_TWO))
+        yield from _board(title, [cell for cell in cells if cell.seed not in CHOICE_SEEDS])
+
+
+def _weights(what: str, cells: Iterable[Cell], winners: Mapping[str, str]) -> Iterator[str]:
+    choice = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS], HIGH, LOW)
+    by_entry = {line.entry: line for line in choice}
+    yield what
+    yield ""
+    yield from table(
+        ["", *(f"{weight:g}" for weight in WEIGHTS)],
+        (
+            [name, *(_choice(by_entry.get(entry), entry in winners.values()) for entry in _entries(name))]
+            for name in OBJECTIVES
+            if any(entry in by_entry for entry in _entries(name))
+        ),
+    )
 
 
 def _board(title: str, cells: Iterable[Cell]) -> Iterator[str]:
@@ -137,15 +155,20 @@ def main() -> None:
     parser.add_argument("--grid", action="store_true", help="print every objective at every weight")
     parser.add_argument("--chosen", action="store_true", help="print the entries that the rule chose, and the others")
     parser.add_argument("--gather", nargs="+", type=Path, metavar="CSV", help="make the first of the others")
+    parser.add_argument("--two", action="store_true", help="of two features")
+    parser.add_argument("--sequential", action="store_true", help="with --two --chosen: members one after the other")
     arguments = parser.parse_args()
+    objectives = OF_TWO if arguments.two else OBJECTIVES
     if arguments.grid:
-        print(",".join(entry for objective in OBJECTIVES for entry in _entries(objective)))
+        print(",".join(entry for objective in objectives for entry in _entries(objective)))
     elif arguments.gather:
         gather(arguments.gather[0], arguments.gather[1:])
     elif arguments.chosen:
-        print(",".join([*chosen(read(CSV)).values(), *UNWEIGHTED]))
+        path = CSV if not arguments.two else SEQUENTIAL if arguments.sequential else TWO
+        mix = CHOICE_MIX_OF_TWO if arguments.two else CHOICE_MIX
+        print(",".join([*chosen(read(path), objectives, mix).values(), *UNWEIGHTED]))
     else:
-        print("\n".join(tables(CSV)))
+        print("\n".join(tables_of_two(TWO) if arguments.two else tables(CSV)))
 
 
 if __name__ == "__main__":
