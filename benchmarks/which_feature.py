@@ -6,7 +6,8 @@
     python -m benchmarks.which_feature            the tables of docs/results/which-feature.md
     python -m benchmarks.which_feature --two      those of docs/results/which-feature-two.md
 
-With ``--two`` the grid and the chosen entries are those of two features, too. ``--gather`` makes the first file of the others, which the benchmark wrote.
+With ``--two`` the grid and the chosen entries are those of two features, too. ``--gather`` makes the first file of the
+others, which the benchmark wrote.
 """
 
 from __future__ import annotations
