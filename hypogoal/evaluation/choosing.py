@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, base_name
+from hypogoal.evaluation.curves import LEARNED, NEARLY, base_name, near_shortest
 from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.run import Episodes
 from hypogoal.evaluation.selection import rank_correlation
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ STEPS, ENVIRONMENTS = 8_000, 16  # played by the agent, and as many by chance
 LEAST = 20.0  # expected choices of a member, below which its preference is not told
 DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to choose
 MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
-NEAR = 1.5  # times the shortest path
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
 TITLE = "What choosing is worth"
@@ -50,8 +50,8 @@ class Choices:
 def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choices]:
     """Let an agent play; nothing is learned, options are greedy and choices are drawn as in training.
 
-    Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (share solved within 1.5 times the
-    layout's shortest path) and ``length`` (mean steps).
+    Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (see :func:`near_shortest`) and
+    ``length`` (mean steps).
     """
     from hypogoal.options.choosers import Chooser  # with PyTorch, which a report needs not
 
@@ -71,11 +71,10 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
     while loop.recorder.steps < end:
         loop.advance(explore=False)
     loop.chooser = inner
-    episodes = loop.recorder.episodes[first:]
-    solved = np.array([terminated and reward > 0 for _, _, reward, terminated in episodes], dtype=np.bool_)
-    lengths, shortest = np.array([row[1] for row in episodes], dtype=np.float64), loop.engine.shortest_path()
-    near = solved & (lengths <= NEAR * shortest) if shortest else np.full(len(solved), np.nan)
-    played = {"success": mean_of(solved), "near": mean_of(near), "length": mean_of(lengths)}
+    rows = np.array(loop.recorder.episodes[first:], dtype=np.float64).reshape(-1, 4)
+    episodes = Episodes(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3] > 0)
+    played = {"success": mean_of(episodes.succeeded), "near": near_shortest(episodes, loop.engine.shortest_path())}
+    played["length"] = mean_of(episodes.length)
     return played, Choices(*(np.concatenate(column) for column in zip(*heard, strict=True)))
 
 
@@ -245,7 +244,7 @@ UNIFORM = "uniform among its own options"
 COLUMNS = (
     page.label("chooser", "chooser"),
     page.number("solved", "success", page.spread, 2),
-    page.number("within 1.5 shortest paths", "near", page.spread, 2),
+    page.number(*NEARLY, page.spread, 2),
     page.number("steps", "length", page.spread, 1),
     page.number("within-rho", "within_rho", page.spread, 2),
     page.number("better of two", "pair", page.spread, 2),
@@ -289,7 +288,6 @@ QUESTION = Question(
     rows=rows,
     sections=sections,
     meanings={
-        "near": ("fraction", "share of episodes solved within 1.5 times the layout's shortest path"),
         "quality": (
             "fraction",
             "share of an option's greedy executions that bring about the true sub-goal, the episode not lost; begun "

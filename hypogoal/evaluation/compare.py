@@ -260,7 +260,7 @@ def _panels(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
 
 def _pairs(about: Mapping[str, Any]) -> Block:
     first = about["runs"][0]["label"]
-    digits = {"length": 0, "success": 2, "discounted_return": 2, "distance, best member": 1}
+    digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2, "distance, best member": 1}
     rows = about["comparisons"]
     blocks = page.comparison_tables(
         rows, "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)", digits
@@ -281,8 +281,9 @@ PARTS: Mapping[str, Part] = {
         [curves.AGENT],
         curves.HEADLINE,
         "Over the last 100 training episodes of each run of an agent: mean ± standard error over layouts, or over "
-        "runs of one layout. 95 % at: median number of environment steps at which 95 of the last 100 episodes "
-        "succeeded, or how many runs got there.",
+        f"runs of one layout. Within {curves.NEAR} shortest paths, in short near: the share of episodes that succeeded "
+        "so soon. 95 % at: median number of environment steps at which 95 of the last 100 episodes succeeded, or how "
+        "many runs got there.",
         "name",
         itemgetter("agents"),
         curves.against,

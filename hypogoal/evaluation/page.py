@@ -293,9 +293,9 @@ def deviation(aggregated: Entry | None, digits: int) -> dict[str, str]:
     return spread(aggregated, digits, error="standard_deviation")
 
 
-def interval(aggregated: Entry, digits: int, scale: float = 1.0) -> str:
+def interval(aggregated: Entry | None, digits: int, scale: float = 1.0) -> str:
     """The mean or the interquartile mean, whichever the 95 % interval beside it is of."""
-    if aggregated["iqm"] is None:
+    if aggregated is None or aggregated["iqm"] is None:
         return "–"
     value = aggregated["mean" if STUDENT in aggregated["interval_over"] else "iqm"]
     low, high = aggregated["interval"]

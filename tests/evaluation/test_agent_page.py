@@ -10,12 +10,13 @@ from hypogoal.evaluation.curves import (
     common_grid,
     curves_section,
     group_runs,
+    rows,
     summary_section,
 )
 from hypogoal.evaluation.explorer import _options
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Material
-from hypogoal.evaluation.questions import paper_figures
+from hypogoal.evaluation.questions import meanings, paper_figures
 from hypogoal.evaluation.run import Choices, Episodes
 from hypogoal.evaluation.selection import choices_section, over_training, selection_of_run, terminations_section
 
@@ -101,6 +102,37 @@ def test_the_summary_leaves_out_a_shortest_path_that_is_not_known():
     """Spec F5: no dash in the sentence."""
     assert "took 20 steps, 2.0 times the shortest path (1 run: layout seed 200" in answer(made())
     assert "took 20 steps (1 run: layout seed 200" in answer(made(shortest=None))
+
+
+def tables_of(material):
+    """Of every table of agents the cell of the first agent in the column of those near the shortest path."""
+    blocks = [*summary_section(material)["blocks"], *curves_section(material)["blocks"]]
+    tables = [block for block in blocks if block["kind"] == "table" and block["columns"][0]["name"] == "agent"]
+    names = [[column["name"] for column in block["columns"]] for block in tables]
+    places = [name.index("within 1.5 shortest paths") for name in names]
+    return [block["rows"][0]["cells"][place] for block, place in zip(tables, places, strict=True)]
+
+
+def test_every_table_of_agents_says_how_many_came_near_the_shortest_path():
+    """Spec F5: its mean with its error, its interval, each run's; dashes where nobody knows the path, or said it."""
+    known = [made(seed, length=length, steps=2_000) for seed, length in enumerate((15, 16))]
+    material = material_of(*known)
+    spread, interval, every = tables_of(material)
+    assert (spread["text"], spread["small"]) == ("0.50", "± 0.50")
+    assert interval.startswith("0.50 [")
+    assert every == "1.00"
+    near = [row.value for row in rows(material.metrics, {}) if row.quantity == "near"]
+    assert near == [1, 0]
+    assert "1.5 times the layout's shortest path" in meanings()["near"]["meaning"]
+    unknown = material_of(*(made(seed, shortest=None) for seed in (0, 1)))
+    older = material_of(*known)
+    for agent in older.metrics["agents"]:
+        for numbers in (agent, *agent["runs"]):
+            del numbers["near"]
+    for material in (unknown, older):
+        spread, *others = tables_of(material)
+        assert [spread["text"], *others] == ["–"] * 3
+        assert not [row for row in rows(material.metrics, {}) if row.quantity == "near"]
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,20 @@ def test_the_agent_finds_the_planted_truth() -> None:
     assert abs(by_chance["score"]) < 0.15
 
 
+def test_what_is_said_of_play_is_of_the_episodes_played() -> None:
+    """Spec H2: solved, solved within one and a half shortest paths, steps; of earlier episodes nothing."""
+    loop = agent(220, 4_000)
+    earlier, shortest = len(loop.recorder.episodes), loop.engine.shortest_path()
+    assert earlier and shortest
+    played, _ = play(loop, 4_000)
+    rows = loop.recorder.episodes[earlier:]
+    solved = [length for _, length, reward, terminated in rows if terminated and reward > 0]
+    near = [length for length in solved if 2 * length <= 3 * shortest]
+    assert 0 < len(near) < len(solved) < len(rows)
+    lengths = [length for _, length, _, _ in rows]
+    assert played == {"success": len(solved) / len(rows), "near": len(near) / len(rows), "length": np.mean(lengths)}
+
+
 def test_right_members_have_quality_one() -> None:
     """Where their sub-goal can be had within the timeout and no other key comes into their way."""
     engine = DoorKeyEngine(220, 1)

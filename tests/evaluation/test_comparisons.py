@@ -55,7 +55,8 @@ def test_pairs_without_a_number_are_left_out():
 
 
 def run(layout, seed, length):
-    return {"layout_seed": layout, "seed": seed, "success": 1.0, "length": length, "discounted_return": 1 / length}
+    numbers = {"success": 1.0, "length": length, "near": float(length <= 15), "discounted_return": 1 / length}
+    return {"layout_seed": layout, "seed": seed, **numbers}
 
 
 def test_agents_are_paired_by_layout_and_seed():
@@ -65,14 +66,20 @@ def test_agents_are_paired_by_layout_and_seed():
     alone = {"name": "elsewhere", "runs": [run(500, 0, 1)]}
     rows = curves.against([own, other, alone])
     assert [(row["first"], row["second"], row["quantity"]) for row in rows] == [
-        ("options", "random", quantity) for quantity in ("success", "length", "discounted_return")
+        ("options", "random", quantity) for quantity in ("success", "length", "near", "discounted_return")
     ]
-    success, length, _ = rows
+    success, length, near, _ = rows
     assert (success["ties"], success["probability"]) == (3, 0.5)
     assert (length["n"], length["wins"]) == (3, 2)
+    assert (near["n"], near["wins"], near["ties"]) == (3, 1, 2)
     assert length["units"] == 2
     assert length["difference"] == pytest.approx(((-12 + 1) / 2 - 10) / 2)  # each layout once
     assert curves.against([]) == curves.against([own]) == []
+    older = [{**agent, "runs": [{**of, "near": None} for of in agent["runs"]]} for agent in (own, other)]
+    assert [row["n"] for row in curves.against(older)] == [3, 3, 0, 3]
+    for one in older[0]["runs"]:
+        del one["near"]  # as an evaluation has it that was made before there was this number
+    assert [row["n"] for row in curves.against(older)] == [3, 3, 0, 3]
 
 
 def ensemble(name, seed, **best):

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.curves import curves, discounted_return, run_numbers, steps_to_solve, trailing_mean
+from hypogoal.evaluation.curves import (
+    curves,
+    discounted_return,
+    near_shortest,
+    run_numbers,
+    steps_to_solve,
+    trailing_mean,
+)
 from hypogoal.evaluation.numbers import (
     BOOTSTRAP_FROM,
     STUDENT,
@@ -53,6 +60,18 @@ def test_discounted_return_tells_short_from_long():
     assert discounted_return(episodes([1, 1], length=3)) == pytest.approx(0.9801)
     assert discounted_return(episodes([1, 0], length=3)) == pytest.approx(0.9801 / 2)
     assert np.isnan(discounted_return(episodes([])))
+
+
+def test_near_counts_successes_within_one_and_a_half_shortest_paths():
+    """Spec F5: of a shortest path of 10, 15 steps are near and 16 are not; nor is a death, nor a cut at the cap."""
+    length = np.array([10, 15, 16, 15, 15, 12, 400, 11])
+    reward = np.array([1.0, 1, 1, 0, 1, -1, 1, 1])
+    run = Episodes(np.cumsum(length), length, reward, np.array([1, 1, 1, 1, 0, 1, 1, 1], dtype=bool))
+    assert near_shortest(run, 10) == 3 / 8
+    assert near_shortest(run, 11) == 4 / 8
+    assert run_numbers(run, 10, window=2)["near"] == 1 / 2  # of the last ones
+    for unknown in (near_shortest(run, None), run_numbers(run, None)["near"], near_shortest(episodes([]), 10)):
+        assert np.isnan(unknown)
 
 
 def test_numbers_of_a_run():

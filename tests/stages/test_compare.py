@@ -71,6 +71,8 @@ def test_runs_are_paired_by_layout_and_seed(compared):
     assert (length["first"], length["second"], length["where"]) == ("slow", "fast", "PPO tuned")
     assert (length["n"], length["wins"], length["probability"]) == (4, 1, 0.25)
     assert length["difference"] == pytest.approx((5 + 5 + 5 - 1) / 4)
+    (near,) = (row for row in compared["comparisons"] if row["quantity"] == "near")
+    assert (near["n"], near["wins"], near["ties"], near["difference"]) == (4, 0, 2, -0.5)  # 15 steps of 10 are near
     assert compared["shared"] == ["agents"]
 
 
@@ -82,6 +84,7 @@ def test_the_page_shows_both(runs, compared):
     assert text.count("<figure") == 2
     assert "± one standard error over them (slow, 4 runs: layout seeds 100 and 101, run seeds 0 and 1; fast" in text
     assert "DQN tuned" in text
+    assert "within 1.5 shortest paths</th>" in text
     assert not re.search(r'(?:src|href)="(?!#|data:)', text)
     artefact = open_artefact(runs / "both", "comparison")
     assert [entry["kind"] for entry in artefact.manifest["inputs"]] == ["evaluation", "evaluation"]
