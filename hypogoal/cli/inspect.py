@@ -70,7 +70,9 @@ def watch(
 @app.command()
 def config(
     stage: Annotated[str, typer.Argument(help="For example train-meta.")],
-    domain: Annotated[str, typer.Option(help="Whose settings: doorkey, montezuma, which-feature, or module:object.")] = "doorkey",
+    domain: Annotated[
+        str, typer.Option(help="Whose settings: doorkey, montezuma, which-feature, or module:object.")
+    ] = "doorkey",
     as_json: AsJson = False,
 ) -> None:
     """Every setting of a stage: default, unit, meaning, source."""
