@@ -2,7 +2,7 @@
 
 hypogoal sweep examples/choosing.toml --out runs/choosing
 python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
-hypogoal sweep examples/which-feature.toml --out runs/which-feature
+hypogoal run which-feature --out runs/which-feature
 python -m benchmarks.choosing runs/which-feature docs/results/which-feature-rooms.csv
 python -m benchmarks.choosing --tables docs/results/choosing-doorkey.csv
 """

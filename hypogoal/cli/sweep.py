@@ -15,7 +15,7 @@ SLURM = "Slurm (with --engine slurm)"
 
 @app.command()
 def run(
-    experiment: Annotated[str, typer.Argument(help="doorkey or montezuma-ladders.")],
+    experiment: Annotated[str, typer.Argument(help="doorkey, montezuma-ladders or which-feature.")],
     out: Out,
     preset: Preset = None,
     set_: Set = None,
@@ -54,7 +54,9 @@ def sweep(
     out: Annotated[Path, typer.Option("--out", help="The sweep's folder. Started again on it, a sweep goes on.")],
     experiment: Annotated[
         str | None,
-        typer.Argument(help="doorkey, montezuma-ladders, figure3, figure4, figure6, or an own .toml file."),
+        typer.Argument(
+            help="doorkey, montezuma-ladders, which-feature, figure3, figure4, figure6, or an own .toml file."
+        ),
     ] = None,
     preset: Preset = None,
     set_: Set = None,

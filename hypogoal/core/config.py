@@ -63,7 +63,7 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
     if name is None:
         return {}
     every = resources.files("hypogoal") / "presets"
-    folder = every / domain if domain.isidentifier() and (every / domain).is_dir() else every / DOMAIN
+    folder = every / domain if domain.replace("-", "_").isidentifier() and (every / domain).is_dir() else every / DOMAIN
     known = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
     if name.endswith(".toml"):
         if not Path(name).exists():
