@@ -126,7 +126,8 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
         played = {LOG, EPISODES, LAYOUT, OPTIONS, "choices.csv", "terminations.h5"}
         played |= {"initiation.safetensors"} if config.get("initiation") == "learned" else set()
         played |= {"visited.h5"} if config.get("save_visited") else set()
-        return played | ({"meta.safetensors"} if (kind, config.get("chooser")) == ("meta", "ppo") else set())
+        chooses = kind == "meta" and config.get("chooser") in ("ppo", "thompson", "exp3")
+        return played | ({"meta.safetensors"} if chooses else set())
     scored = {SCORES} if config.get("score_every") else set()
     return {
         "ensemble": {LOG, *scored, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, NEARLY, base_name, near_shortest
+from hypogoal.evaluation.curves import BANDITS, LEARNED, NEARLY, base_name, near_shortest
 from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import Episodes
@@ -53,7 +53,7 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
     Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (see :func:`near_shortest`) and
     ``length`` (mean steps).
     """
-    from hypogoal.options.choosers import Chooser  # with PyTorch, which a report needs not
+    from hypogoal.options.choosers import Chooser, Outcome  # with PyTorch, which a report needs not
 
     heard: list[tuple[NDArray[Any], ...]] = []
     inner = loop.chooser
@@ -65,6 +65,9 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
             chosen = inner.choose(environments, ids, offered)
             heard.append((ids.copy(), chosen.copy(), offered.copy()))
             return chosen
+
+        def record(self, outcome: Outcome) -> None:
+            inner.record(outcome)
 
     loop.chooser = Heard()
     first, end = len(loop.recorder.episodes), loop.recorder.steps + steps
@@ -170,7 +173,7 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
 
 
 def numbers(work: Work) -> dict[str, Any]:
-    """Every run of an agent that chooses by PPO among members' options, in a domain that knows what follows."""
+    """Every run of an agent that learned to choose among members' options, in a domain that knows what follows."""
     from hypogoal.meta.episodes import agent_of  # with PyTorch, which a report needs not
     from hypogoal.options.choosers import RandomChooser
 
@@ -182,7 +185,7 @@ def numbers(work: Work) -> dict[str, Any]:
             artefact = artefacts[about["path"]]
             config = artefact.config
             known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
-            if base_name(artefact.kind, config) != LEARNED or not known:
+            if base_name(artefact.kind, config) not in (LEARNED, *BANDITS.values()) or not known:
                 continue
             domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)
             if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(domain.sub_goals):

@@ -44,12 +44,13 @@ SOLVED = 0.95  # share of the window's episodes
 GAMMA = 0.99  # per environment step, of the discounted return
 NEAR = 1.5  # times the shortest path
 LEARNED = "options (learned members)"
+BANDITS = {"thompson": "Thompson sampling", "exp3": "Exp3"}  # by their setting, over learned members
 RANDOM = "random choice"
 ORACLE = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
 PRETRAINING = "random choice while options learn"
 BASELINES = ("PPO tuned", "PPO paper", "DQN tuned", "DQN paper")
-ORDER = (LEARNED, RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
+ORDER = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
 UNITS = {
     "success": "share of episodes",
     "reward": "undiscounted, per episode",
@@ -182,6 +183,8 @@ def base_name(kind: str, config: Mapping[str, Any]) -> str:
         return f"{config['agent'].upper()} {config['setting']}"
     if kind == "options":
         return PRETRAINING
+    if bandit := BANDITS.get(config["chooser"]):
+        return f"{bandit}, {ORACLE}" if config["termination"] == "oracle" else bandit
     if config["termination"] == "oracle":
         return ORACLE_RANDOM if config["chooser"] == "random" else ORACLE
     return RANDOM if config["chooser"] == "random" else LEARNED

@@ -18,6 +18,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain, step_of
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import (
+    BANDITS,
     LAYOUTS_OR_RUNS,
     LEARNED,
     PRETRAINING,
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 LATE = 0.25  # the last part of training that is looked at by itself
 PARTS = 20  # of training, in which choices are counted apart
-SELECTED = (LEARNED, RANDOM, PRETRAINING)  # agents whose options are members: the others have nothing to select
+SELECTED = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING)  # agents whose options are members: to select among
 QUANTITIES = {
     "preference": "preference",
     "late_preference": "preference, last quarter",

@@ -118,7 +118,7 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
     )
     chooser: str = setting(
         "ppo",
-        "the meta-policy, or uniform choice among those offered",
-        source="ours: a control",
-        choices=("ppo", "random"),
+        "the meta-policy, uniform choice among those offered, or a bandit that sees no state (thompson, exp3)",
+        source="ours: controls; Thompson 1933; Auer et al. 2002",
+        choices=("ppo", "random", "thompson", "exp3"),
     )

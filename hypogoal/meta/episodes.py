@@ -70,7 +70,7 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1) -> OptionLoop
         "replay": REPLAY,
         "decisions": 2,
         "save_visited": 0,
-        "chooser": "ppo" if "meta.safetensors" in files else "random",
+        "chooser": artefact.config["chooser"] if "meta.safetensors" in files else "random",
         "initiation": "learned" if "initiation.safetensors" in files else "anywhere",
     }
     domain = load_domain(artefact.config["domain"])

@@ -16,6 +16,7 @@ from hypogoal.domains.base import Domain, Engine
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
 from hypogoal.meta.ppo import MetaPolicy
+from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import STACK
 from hypogoal.options.initiation import Initiation
@@ -69,6 +70,8 @@ def assemble(
         gamma = config.gamma
         if config.chooser == "ppo":
             chooser = MetaPolicy(engine, options, config, seed, device)
+        elif config.chooser in BANDITS:
+            chooser = BANDITS[config.chooser](options, engine.count, rng)
     return OptionLoop(
         engine,
         terminations,

@@ -63,7 +63,7 @@ def agents_of(run: Path) -> list[Artefact]:
     found = [
         artefact
         for artefact in find_artefacts(run, "meta")
-        if (artefact.config["chooser"], artefact.config["termination"]) == ("ppo", "learned")
+        if artefact.config["chooser"] != "random" and artefact.config["termination"] == "learned"
     ]
     if not found:
         needed = "Videos need a meta artefact with learned terminations: train-meta."

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import harsh, planted
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
@@ -15,39 +16,14 @@ from hypogoal.options.choosers import Chooser, RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
-from hypogoal.options.termination import Terminations
 
 MEMBERS, GOALS = 3, np.repeat(np.arange(5), 3)
 RIGHT = [0, 3, 6, 9, 12]  # the first member of every sub-goal knows it
 
 
-def planted(engine: DoorKeyEngine) -> Terminations:
-    """Fifteen hypotheses that agree where the agent holds one key at a time, in the order blue, green, red, on one
-    layout: keys by colour, by the cell that is empty, by how many are gone; wrong doors and wrong goals.
-    """
-    cells = np.array(engine.layout.keys)[[1, 2, 0]]  # each key's "own" cell is another's
-
-    def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        labels, origins = engine.labels(ids), engine.origins(ids)
-        empty = ~((engine.codes(ids)[:, cells] >= 3) & (engine.codes(ids)[:, cells] < 6))
-        gone = labels[:, :3].sum(axis=1)[:, None] > np.arange(3)
-        x, y = origins["agent_x"], origins["agent_y"]
-        near_door = np.abs(y * 8 + x - engine.layout.door) == 1
-        columns = [np.stack([labels[:, key], empty[:, key], gone[:, key]], axis=1) for key in range(3)]
-        columns.append(np.stack([labels[:, 3], near_door, labels[:, 2]], axis=1))
-        columns.append(np.stack([labels[:, 4], (x == 1) & (y == 1), (x == 1) & (y == 6)], axis=1))
-        return np.concatenate(columns, axis=1)
-
-    return Terminations(classify, 15)
-
-
 def agent(layout_seed: int, steps: int) -> OptionLoop:
     """PPO over planned options of planted members, in a world where a wrong key ends the episode."""
-    engine = DoorKeyEngine(layout_seed, 16, wrong_key="ends")
-    shortest = engine.shortest_path()
-    assert shortest is not None
-    engine.max_steps = 3 * shortest
-    config = TrainMetaConfig(network="planned")
+    engine, config = harsh(layout_seed, 16), TrainMetaConfig(network="planned")
     terminations = planted(engine)
     learner = PlannedLearner(engine, terminations, config, seed=0)
     loop = OptionLoop(

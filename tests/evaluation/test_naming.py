@@ -37,16 +37,21 @@ def test_agents_are_named_after_how_they_choose():
     runs = [
         made(kind="baseline", agent="dqn", setting="paper"),
         made(termination="oracle"),
+        made(chooser="exp3", termination="oracle"),
         made(chooser="random"),
+        made(chooser="exp3"),
+        made(chooser="thompson"),
         made(),
         made(layout_seed=101, seed=1),
         made(kind="baseline", agent="ppo", setting="tuned"),
     ]
     groups = group_runs(runs)
-    assert list(groups) == [LEARNED, RANDOM, ORACLE, "PPO tuned", "DQN paper"]
+    bandits, control = ["Thompson sampling", "Exp3"], "Exp3, oracle terminations"
+    assert list(groups) == [LEARNED, *bandits, RANDOM, ORACLE, "PPO tuned", "DQN paper", control]
     assert len(groups[LEARNED]) == 2
     assert base_name("options", {}) == "random choice while options learn"
     assert missing(work_of(agents=named(*groups))) == ["no agent 'PPO paper'", "no agent 'DQN tuned'"]
+    assert f"no agent '{ORACLE}'" in missing(work_of(agents=named(LEARNED, control)))
 
 
 def test_a_setting_that_differs_splits_an_agent():

@@ -12,7 +12,8 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.meta import training
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.choosers import EvenChooser, RandomChooser
+from hypogoal.options.bandits import BANDITS
+from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.loop import OptionLoop
@@ -41,6 +42,8 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
     "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
+    "light, thompson": (Corridor, "light", {}, "thompson"),
+    "light, exp3": (Corridor, "light", {}, "exp3"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
     "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
 }
@@ -53,13 +56,15 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     engine = engine_class(3)
     verdicts = oracle_terminations(engine, (0, 1))
     learner = training.LEARNERS[network](engine, verdicts, config, seed=1, device=device)
-    chooser = RandomChooser(rng_for(0, "choice"))
+    chooser: Chooser = RandomChooser(rng_for(0, "choice"))
     if chooser_name == "even":
         chooser = EvenChooser(2, rng_for(0, "choice"))
+    elif chooser_name in BANDITS:
+        chooser = BANDITS[chooser_name](2, 3, rng_for(0, "choice"))
     elif chooser_name != "random":
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=16, meta_batch=8)
-        chooser = MetaPolicy(engine, 2, meta, 2, device)  # type: ignore[assignment]
+        chooser = MetaPolicy(engine, 2, meta, 2, device)
     initiation = Initiation(engine, 2, config, seed=3, device=device) if config.initiation == "learned" else None
     return OptionLoop(
         engine, verdicts, learner, chooser, Recorder(2, engine, 100), config, gamma=0.9, initiation=initiation

@@ -12,13 +12,18 @@ from PIL import Image
 
 from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.manifests import files_of
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.evaluation import choosing
+from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.pictures import BAR, draw_frame, episode_gif, frame_lines
+from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
+from hypogoal.options.bandits import BANDITS
 from hypogoal.options.initiation import Initiation
 from hypogoal.stages.collect import collect
 from hypogoal.stages.report import agents_of, draw_videos
@@ -120,6 +125,27 @@ def test_options_are_held_back_as_in_training(run, tmp_path, monkeypatch):
     monkeypatch.setattr(Initiation, "narrow", watched)
     draw_videos([artefact], tmp_path, tmp_path / "videos", 1)
     assert asked and [path.suffix for path in (tmp_path / "videos").iterdir()] == [".gif"]
+
+
+@pytest.mark.parametrize("name", BANDITS)
+def test_a_bandit_is_back_and_learns_no_more(run, tmp_path, name):
+    """Spec E6, H4: its file is asked for, what it learned is in it, and playing changes nothing of that."""
+    config = TrainMetaConfig(
+        steps=320, chooser=name, max_episode_steps=CAP, environments=4, random_episodes=1, warm_up=400
+    )
+    train_meta(run / "ensemble", config, tmp_path / "meta", **QUIET)
+    (artefact,) = agents_of(tmp_path)
+    assert "meta.safetensors" in files_of("meta", artefact.config)
+    kept = load_tensors(artefact.path / "meta.safetensors")["credit"].numpy()
+    loops = [agent_of(artefact, seed=1) for _ in range(2)]
+    first, second = ([frame.option for frame in play_episode(loop)] for loop in loops)
+    assert type(loops[0].chooser) is BANDITS[name] and kept.any() and first == second
+    np.testing.assert_array_equal(loops[0].chooser.credit, kept)
+    work = Work(Contents(tmp_path, [], [artefact], [], [], []), None, None, metrics={})
+    run_of = {"path": work.contents.name(artefact), "seed": 0, "layout_seed": 100}
+    work.metrics["agents"] = [{"name": "a bandit", "runs": [run_of]}]
+    (judged,) = choosing.numbers(work)["choosing"]
+    assert len(judged["runs"][0]["members"]) == 5 * MEMBERS
 
 
 def test_weights_of_another_policy_are_one_line(run, tmp_path):

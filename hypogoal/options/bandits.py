@@ -1,0 +1,106 @@
+"""Bandits over options: each option has one worth, whatever the state, learned from whole episodes (Spec H4).
+
+An episode is solved that is over with rewards, discounted within options, above 0 in sum. That is credited to every
+option chosen in it, also to those that did nothing for it.
+What holds already is not offered, and of the others the one whose turn it is not fails: so an order is learned too.
+An option's worth is taken for fixed: failures from before its policy had learned its way count for ever.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import AGAIN, check_fit
+from hypogoal.options.choosers import Chooser, Outcome
+
+# Of decisions: uniform among those offered. What the bound of Exp3 asks for with 15 options and 2,400 episodes solved
+# by the best (Auer et al. 2002, Corollary 3.2: sqrt(K ln K / ((e - 1) g))).
+MIXING = 0.1
+
+
+class Bandit(Chooser):
+    """``record`` notes what episodes came to, ``learn`` alone learns from it: a frozen agent does not, as of PPO.
+
+    ``rng`` is of the draws.
+
+    Attributes:
+        credit: float64 (2, O), how much each option was credited with episodes that were solved, and that were not.
+    """
+
+    CHANGING = ("rng", "credit", "_due", "_taken", "_earned", "_drawn")
+
+    def __init__(self, options: int, environments: int, rng: np.random.Generator):
+        self.rng = rng
+        self.credit, self._due = np.zeros((2, options)), np.zeros((2, options))
+        self._taken, self._drawn = np.zeros((environments, options)), np.zeros((environments, options))
+        self._earned = np.zeros(environments)
+
+    def record(self, outcome: Outcome) -> None:
+        self._earned[outcome.environments] += outcome.returns
+        over = outcome.terminated | outcome.truncated
+        ended = outcome.environments[over]
+        solved = outcome.terminated[over] & (self._earned[ended] > 0)
+        self._due += self._taken[ended[solved]].sum(0), self._taken[ended[~solved]].sum(0)
+        self._taken[ended], self._earned[ended] = 0.0, 0.0
+
+    def learn(self) -> dict[str, float]:
+        self.credit += self._due
+        self._due[:] = 0.0
+        return {}
+
+    def state(self) -> dict[str, Tensor]:
+        return {"credit": torch.from_numpy(self.credit.copy())}
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        """What an artefact's learned; a ``UserError`` where it is not that of such a bandit."""
+        check_fit(self.state(), state, "meta.safetensors", AGAIN)
+        if (state["credit"] < 0).any():
+            raise UserError("a bandit's credit is below 0", "meta.safetensors", AGAIN)
+        self.credit = state["credit"].numpy().copy()
+
+
+class ThompsonChooser(Bandit):
+    """For an episode each option's share of solved episodes is drawn from Beta(1 + solved, 1 + unsolved).
+
+    Of the options offered it takes the one with the highest draw. Source: Thompson 1933; Russo et al. 2018, A Tutorial
+    on Thompson Sampling, Algorithm 3.2.
+    """
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        fresh = environments[~self._taken[environments].any(1)]
+        solved, unsolved = 1.0 + self.credit
+        self._drawn[fresh] = self.rng.beta(solved, unsolved, (len(fresh), len(solved)))
+        chosen = np.where(offered, self._drawn[environments], -1.0).argmax(1)
+        self._taken[environments, chosen] = 1.0
+        return chosen
+
+
+class Exp3Chooser(Bandit):
+    """Exponential weights of importance-weighted credit, mixed with uniform choice among the options offered.
+
+    A decision's credit is 1 / (the probability with which it was taken), given where the episode is solved; an option's
+    log weight is ``MIXING`` / O times its credit, so a decision adds at most 1 to it. Source: Auer, Cesa-Bianchi,
+    Freund and Schapire 2002, The Nonstochastic Multiarmed Bandit Problem, Figure 1. Their bound on the regret is for
+    one decision per episode among all options: it does not carry over to states, masks, or several decisions.
+    """
+
+    def choose(
+        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        weights = np.where(offered, self.credit[0] * (MIXING / offered.shape[1]), -np.inf)
+        weights = np.exp(weights - weights.max(1, keepdims=True))
+        shares = (1 - MIXING) * weights / weights.sum(1, keepdims=True)
+        shares += MIXING * offered / offered.sum(1, keepdims=True)
+        up_to = shares.cumsum(1)
+        chosen = (up_to > up_to[:, -1:] * self.rng.random((len(environments), 1))).argmax(1)
+        np.add.at(self._taken, (environments, chosen), 1 / shares[np.arange(len(chosen)), chosen])
+        return chosen
+
+
+BANDITS: dict[str, type[Bandit]] = {"thompson": ThompsonChooser, "exp3": Exp3Chooser}

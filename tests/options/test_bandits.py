@@ -1,0 +1,146 @@
+"""Bandits over options (Spec H4): what they find, by hand what they are credited with, and what stays of them."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from planted import NearPlanner, harsh, planted
+
+from hypogoal.core.errors import UserError
+from hypogoal.evaluation.choosing import play
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.options.bandits import BANDITS, MIXING, Bandit, Exp3Chooser, ThompsonChooser
+from hypogoal.options.choosers import Chooser, Outcome, RandomChooser
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.planned import PlannedLearner
+from hypogoal.options.recording import Recorder
+
+HERE = np.arange(2)  # two environments
+ALL = np.ones((2, 3), np.bool_)  # three options
+
+
+def loop_of(name: str, kind: type[PlannedLearner], seed: int, environments: int) -> OptionLoop:
+    engine, config = harsh(220, environments), TrainMetaConfig(network="planned")
+    terminations, rng = planted(engine), np.random.default_rng(seed)
+    chooser: Chooser = RandomChooser(rng) if name == "random" else BANDITS[name](15, environments, rng)
+    learner = kind(engine, terminations, config, seed=0)
+    return OptionLoop(engine, terminations, learner, chooser, Recorder(15, engine), config, config.gamma)
+
+
+def solved(loop: OptionLoop, episodes: int, last: int) -> float:
+    """The share of the last of so many training episodes."""
+    while len(loop.recorder.episodes) < episodes:
+        loop.step()
+    return float(np.mean([terminated and reward > 0 for _, _, reward, terminated in loop.recorder.episodes][-last:]))
+
+
+def test_thompson_finds_the_right_members_within_200_episodes() -> None:
+    """In nine of ten seeds, in their order: key, door, goal. Uniform choice never does."""
+    found, chance = 0, []
+    for seed in range(10):
+        loop = loop_of("thompson", NearPlanner, seed, 4)
+        share = solved(loop, 200, 50)
+        successes = loop.chooser.credit[0]  # type: ignore[attr-defined]
+        found += share >= 0.8 and successes[9:12].argmax() == 0 and successes[12:].argmax() == 0
+        chance.append(solved(loop_of("random", NearPlanner, seed, 4), 200, 50))
+    assert found >= 9
+    assert max(chance) <= 0.15
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_exp3_beats_uniform_choice(seed: int) -> None:
+    assert solved(loop_of("exp3", PlannedLearner, seed, 16), 2_000, 200) >= 0.7
+    assert solved(loop_of("random", PlannedLearner, seed, 16), 2_000, 200) <= 0.15
+
+
+def ended(bandit: Bandit, returned: list[float], terminated: list[bool], truncated: list[bool]) -> None:
+    """What the options that run in both environments came to."""
+    no, one = np.zeros(2, np.bool_), np.ones(2)
+    over = np.array(terminated), np.array(truncated)
+    bandit.record(Outcome(HERE, HERE, no, no, ~no, np.array(returned), HERE, one, HERE, *over))
+
+
+def only(*options: int) -> NDArray[np.bool_]:
+    """One option offered in each environment."""
+    return np.arange(3) == np.array(options)[:, None]
+
+
+def test_episodes_credit_what_was_chosen_in_them() -> None:
+    """Solved: over, and rewarded in sum. Each option once, however often it was chosen in the episode."""
+    bandit = ThompsonChooser(3, 2, np.random.default_rng(0))
+    for offered in (only(0, 1), only(0, 2)):
+        assert bandit.choose(HERE, HERE, offered).tolist() == offered.argmax(1).tolist()
+        assert not bandit.credit.any()
+        ended(bandit, [0.5, 0.0], [False, False], [False, False])
+        bandit.learn()
+    bandit.choose(HERE, HERE, only(2, 2))
+    ended(bandit, [-0.25, 1.0], [True, False], [False, True])  # solved; rewarded, but cut
+    bandit.learn()
+    assert bandit.credit.tolist() == [[1, 0, 1], [0, 1, 1]]
+    bandit.choose(HERE, HERE, only(1, 1))
+    ended(bandit, [0.0, 1.0], [True, True], [False, False])  # lost; solved
+    bandit.learn()
+    assert bandit.credit.tolist() == [[1, 1, 1], [0, 2, 1]]
+
+
+@pytest.mark.parametrize("kind", BANDITS.values())
+def test_a_snapshot_holds_what_came_of_an_episode_so_far(kind: type[Bandit]) -> None:
+    """Spec G1: what an episode has earned, and what is noted but not learned."""
+    one, other = (kind(3, 2, np.random.default_rng(seed)) for seed in (0, 1))
+    one.choose(HERE, HERE, only(0, 1))
+    ended(one, [0.5, 0.0], [False, True], [False, False])
+    other.restore(one.snapshot())
+    for bandit in (one, other):
+        ended(bandit, [-0.25, 0.0], [True, False], [False, False])
+        bandit.learn()
+        np.testing.assert_array_equal(bandit.credit, [[1, 0, 0], [0, 1, 0]])
+
+
+def test_a_decision_of_exp3_counts_by_its_probability() -> None:
+    """Of three options one is not offered: by hand the shares, and what a solved decision gets, each time."""
+    bandit = Exp3Chooser(3, 2, np.random.default_rng(0))
+    bandit.credit[0] = np.array([0, 1000, np.log(3)]) * 3 / MIXING
+    offered = np.tile([True, False, True], (2, 1))
+    shares = (1 - MIXING) * np.array([0.25, 0, 0.75]) + MIXING / 2
+    chosen = np.concatenate([bandit.choose(HERE, HERE, offered) for _ in range(5_000)])
+    assert set(chosen) == {0, 2}
+    assert np.mean(chosen == 0) == pytest.approx(shares[0], abs=0.015)
+    before = bandit.credit.copy()
+    ended(bandit, [1.0, 0.0], [True, True], [False, False])
+    bandit.learn()
+    np.testing.assert_allclose(
+        (bandit.credit - before).sum(0)[[0, 2]], [(chosen == n).sum() / shares[n] for n in (0, 2)]
+    )
+    np.testing.assert_allclose((bandit.credit - before)[0, 0], (chosen[::2] == 0).sum() / shares[0])
+
+
+def test_thompson_draws_anew_for_every_episode() -> None:
+    """In an episode it stays with what it drew, also where it is asked again; environments differ, episodes too."""
+    many, offered = np.arange(50), np.ones((50, 3), np.bool_)
+    bandit = ThompsonChooser(3, 50, np.random.default_rng(0))
+    first = bandit.choose(many, many, offered)
+    assert set(first) == {0, 1, 2}
+    np.testing.assert_array_equal(bandit.choose(many, many, offered), first)
+    loop = loop_of("thompson", PlannedLearner, 0, 1)
+    choices = play(loop, 2_000)[1]
+    assert len({int(option) for option in choices.options[choices.offered.all(1)]}) > 5
+    assert not loop.chooser.credit.any()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", BANDITS)
+def test_what_is_loaded_chooses_alike(name: str) -> None:
+    """From the same draws as the one that learned; another's, or a damaged one, is one line."""
+    loop = loop_of(name, PlannedLearner, 3, 4)
+    solved(loop, 150, 1)
+    one, other = loop.chooser, BANDITS[name](15, 4, np.random.default_rng(7))
+    assert isinstance(one, Bandit) and one.credit[0].any()
+    fresh = BANDITS[name](15, 4, np.random.default_rng(7))
+    other.load(one.state())
+    one.rng, one._taken[:] = np.random.default_rng(7), 0.0
+    where, offered = np.arange(4), np.ones((4, 15), np.bool_)
+    chosen = [np.stack([it.choose(where, where, offered) for _ in range(50)]) for it in (one, other, fresh)]
+    np.testing.assert_array_equal(chosen[0], chosen[1])
+    assert (chosen[0] != chosen[2]).any()
+    for wrong in (torch.zeros(2, 14, dtype=torch.float64), torch.full((2, 15), -1.0, dtype=torch.float64)):
+        with pytest.raises(UserError, match=r"do not fit|below 0"):
+            other.load({"credit": wrong})
