@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
@@ -23,7 +24,6 @@ from hypogoal.evaluation.curves import BANDITS, LEARNED, NEARLY, base_name, near
 from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import Episodes
-from hypogoal.evaluation.selection import rank_correlation
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
@@ -124,6 +124,13 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
         rows = place[ids]
         found[option] = np.average(truth[rows, goal] & ~lost[rows], weights=counts[begins])
     return found
+
+
+def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Spearman's rank correlation of (n,) and (n,), ties sharing their mean rank; NaN where a side is constant."""
+    one, other = (ranks - ranks.mean() for ranks in (rankdata(first), rankdata(second)))
+    spread = np.sqrt((one**2).sum() * (other**2).sum())
+    return float((one * other).sum() / spread) if spread > 0 else math.nan
 
 
 def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:

@@ -389,7 +389,7 @@ def _answers(material: Material) -> list[str]:
     for agent in shown:
         name = f"the agent '{agent['name']}'" if several else "the option agent"
         text = _achieved(agent, name, material.metrics["settings"]["window"])
-        control = control_of(material, agent, agents)
+        control = control_of(material, agent)
         if agent["success"]["mean"] is not None and control is not None:
             alike = not several or same_settings(agent, control)
             text += f" {_by_chance(control, 'options of the same members' if alike else 'options of its ensemble')}"
@@ -598,15 +598,13 @@ def variants(entries: Iterable[Entry], name: str = LEARNED) -> list[Entry]:
     return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{name}, ")]
 
 
-def control_of(material: Material, agent: Entry, entries: Sequence[Entry]) -> Entry | None:
+def control_of(material: Material, agent: Entry) -> Entry | None:
     """The random chooser among a variant's options: the one with the same settings added to its name.
 
     Settings that most runs of a name share are not added to it, so a name can leave open which options were chosen
     among. Then it is the only chooser with an ensemble of this variant, if no other variant has that ensemble.
-
-    ``material.selection`` tells the runs' ensembles; entries are agents, or agents of the selection.
     """
-    agents, controls = variants(entries), variants(entries, RANDOM)
+    agents, controls = variants(material.metrics["agents"]), variants(material.metrics["agents"], RANDOM)
     if len(agents) == len(controls) == 1:
         return controls[0]
     ensembles = {of["name"]: {run["ensemble"] for run in of["runs"]} for of in material.metrics.get("selection", ())}

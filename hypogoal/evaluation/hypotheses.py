@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import Metrics, Row, Rows, grouped, over, pairs, ranked, rows_of, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import GREY, drawing, style_of
+from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, drawing
 from hypogoal.hypotheses.scores import (
     best_mean_worst,
     by_member,
@@ -269,7 +269,7 @@ def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
             for entry in alike:
                 values[sub_goals.index(entry["sub_goal"])] = np.array([entry[which]["mean"] for which in WHICH], float)
             y = np.arange(len(sub_goals), dtype=np.float64) + (index - (len(kinds) - 1) / 2) * step
-            colour, marker = style_of(index)
+            colour, marker = PALETTE[index % len(PALETTE)], MARKERS[index % len(MARKERS)]
             axes.hlines(y, values[:, 2], values[:, 0], color=colour, linewidth=1.6, alpha=0.6)
             axes.plot(values[:, 0], y, marker, color=colour, markersize=7, label=name)
             axes.plot(values[:, 1], y, "|", color=colour, markersize=10, markeredgewidth=1.8)

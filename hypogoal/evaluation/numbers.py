@@ -116,11 +116,6 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "duration": ("steps", "mean steps of an execution"),
     "preference": ("ratio", "chosen / expected; 1 for a chooser that does not care"),
     "late_preference": ("ratio", "preference over the last quarter of training"),
-    "share": ("fraction", "chosen / all decisions; confounded by how often an option is offered"),
-    "rank_correlation": (
-        "Spearman's rho, -1..1",
-        "with the match; 'all': over all options, 'within': mean over sub-goals of that among members",
-    ),
     "probability": (
         "fraction",
         "share of pairs of runs, alike in layout and seed, in which the first is better; a tie counts half; each unit "

@@ -74,11 +74,6 @@ def drawing(height: float, columns: int, **more: Any) -> Iterator[tuple[Figure, 
         legend_below(figure, [axes], columns, **more)
 
 
-def style_of(index: int) -> tuple[str, str]:
-    """Colour and marker of the thing number ``index``: both come again together after 77."""
-    return PALETTE[index % len(PALETTE)], MARKERS[index % len(MARKERS)]
-
-
 def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any) -> None:
     """A legend under the plots, for which the figure becomes higher: each label once, whichever of the plots has it.
 

@@ -1,9 +1,9 @@
-"""Question 5, Figures 7 and 8: which members the meta-policy prefers, and whether they are the good ones (Spec F6)."""
+"""Figures 7 and 8: which members the meta-policy prefers, and where their options stop (Spec F6)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,27 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, load_domain, step_of
-from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import (
-    BANDITS,
-    LAYOUTS_OR_RUNS,
-    LEARNED,
-    PRETRAINING,
-    RANDOM,
-    base_name,
-    control_of,
-    variants,
-    which,
-)
-from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of_members
+from hypogoal.evaluation import choosing, page
+from hypogoal.evaluation.curves import BANDITS, LEARNED, PRETRAINING, RANDOM, base_name, variants, which
+from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
-from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, drawing, grid_of_pictures, show_picture, style_of
+from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
 from hypogoal.evaluation.run import Choices, read_choices, read_terminations, within
 from hypogoal.hypotheses.scores import member_scores, most_and_least
 
@@ -41,11 +30,6 @@ if TYPE_CHECKING:
 LATE = 0.25  # the last part of training that is looked at by itself
 PARTS = 20  # of training, in which choices are counted apart
 SELECTED = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING)  # agents whose options are members: to select among
-QUANTITIES = {
-    "preference": "preference",
-    "late_preference": "preference, last quarter",
-    "share": "raw share (confounded)",
-}
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
 MOST = ("most", "least")  # preferred
 SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth, on a run's layout
@@ -61,39 +45,6 @@ def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[n
     """
     safe = np.where(expected > 0, expected, 1.0)
     return np.where(expected > 0, chosen / safe, np.nan)
-
-
-def shares(chosen: NDArray[Any]) -> NDArray[np.float64]:
-    """Spec F6: the share of all decisions that chose each option, (O,); NaN without decisions."""
-    total = chosen.sum()
-    return chosen / total if total > 0 else np.full(chosen.shape, np.nan)
-
-
-def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Spec F6: Spearman's rank correlation of (n,) and (n,), ties sharing their mean rank.
-
-    Pairs with a NaN are left out. NaN where fewer than two pairs are left or one side is constant: then there is no
-    ranking to compare.
-    """
-    defined = ~(np.isnan(first) | np.isnan(second))
-    if defined.sum() < 2:
-        return math.nan
-    ranks = rankdata(first[defined]), rankdata(second[defined])
-    deviations = [rank - rank.mean() for rank in ranks]
-    spread = np.sqrt((deviations[0] ** 2).sum() * (deviations[1] ** 2).sum())
-    return float((deviations[0] * deviations[1]).sum() / spread) if spread > 0 else math.nan
-
-
-def rank_correlations(values: NDArray[np.float64], match: NDArray[np.float64], members: int) -> dict[str, float]:
-    """Spec F6: rank correlation between members' values (their preference, say) and their match with the true sub-goal.
-
-    Both are (G*K,), sub-goal * K + member; the match is balanced accuracy on the layout. ``all``: over all options at
-    once; ``within``: the mean over sub-goals of the correlation among its own K members, so that a sub-goal that is
-    chosen often does not count; NaN where not defined.
-    """
-    goals = zip(values.reshape(-1, members), match.reshape(-1, members), strict=True)
-    within = [value for value in (rank_correlation(*goal) for goal in goals) if not np.isnan(value)]
-    return {"all": rank_correlation(values, match), "within": mean_of(within)}
 
 
 def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[str, NDArray[np.float64]]:
@@ -115,8 +66,8 @@ def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[st
 
 def selection_of_run(
     choices: Choices, match: NDArray[np.float64], sub_goals: Sequence[str], members: int
-) -> dict[str, Any]:
-    """Spec F6: how often each member was offered and chosen, beside how well it matches the true sub-goal here.
+) -> list[dict[str, Any]]:
+    """Spec F6: how often each member was offered and chosen, beside its match.
 
     Args:
         choices: the run's table of choices.
@@ -125,39 +76,37 @@ def selection_of_run(
         members: K.
 
     Returns:
-        ``sub_goals``: a row per member (option, offered, chosen, expected, preference, late_preference, share, reached,
-        mean duration in steps, match), the most and the least preferred member; ``rank_correlation`` of preference,
-        late preference (the last quarter of training) and raw share with the match, each over all options and within
-        sub-goals. NaN where not defined.
+        A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option,
+        offered, chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last
+        quarter of training). NaN where not defined.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
     begin, end = (choices.step.min(), choices.step.max()) if len(choices.step) else (0, 0)
     late = choices.since(end - LATE * (end - begin))
-    values = {
+    duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
+    counts = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")}
+    floats = {"expected": totals["expected"], "duration": duration, "match": match}
+    columns = {
+        **counts,
+        **floats,
         "preference": preference(totals["chosen"], totals["expected"]),
         "late_preference": preference(late.total("chosen", options), late.total("expected", options)),
-        "share": shares(totals["chosen"]),
     }
-    duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
-    floats = {"expected": totals["expected"], "duration": duration, "match": match, **values}
-    columns = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")} | floats
-    order = ("offered", "chosen", "expected", "reached", "duration", "match", *values)
     by_goal = []
     for index, sub_goal in enumerate(sub_goals):
         start = index * members
-        most, least = most_and_least(values["preference"][start : start + members])
+        most, least = most_and_least(columns["preference"][start : start + members])
         rows = [
-            {"member": option - start, "option": option, **{name: columns[name][option].item() for name in order}}
+            {"member": option - start, "option": option, **{name: of[option].item() for name, of in columns.items()}}
             for option in range(start, start + members)
         ]
         by_goal.append({"sub_goal": sub_goal, "members": rows, "most": most, "least": least})
-    correlations = {name: rank_correlations(value, match, members) for name, value in values.items()}
-    return {"sub_goals": by_goal, "rank_correlation": correlations}
+    return by_goal
 
 
 def numbers(work: Work) -> dict[str, Any]:
-    """Spec F6: for each agent whose options are members: choices against match, per run and over runs."""
+    """Spec F6: the choices of every run of each agent whose options are members."""
     found, metrics = work.contents, []
     artefacts = {found.name(artefact): artefact for artefact in found.agents}
     match_of = cache(match_on_layout)
@@ -179,9 +128,9 @@ def numbers(work: Work) -> dict[str, Any]:
                 work.arrays[f"choices/{about['path']}/{column}"] = counts
             of = {name: about[name] for name in ("path", "seed", "layout_seed")}
             chosen = selection_of_run(choices, match, config["sub_goals"], config["members"])
-            rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), **chosen})
+            rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})
         if rows:
-            metrics.append({"name": agent["name"], "runs": rows, "rank_correlation": _over_runs(agent["name"], rows)})
+            metrics.append({"name": agent["name"], "runs": rows})
     return {"selection": metrics}
 
 
@@ -222,16 +171,6 @@ def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
     return np.unique(np.concatenate([engine.ids, *met]))
 
 
-def _over_runs(name: str, rows: Sequence[Entry]) -> dict[str, Any]:
-    layouts = [row["layout_seed"] for row in rows]
-
-    def of(quantity: str, scope: str) -> dict[str, Any]:
-        values = [row["rank_correlation"][quantity][scope] for row in rows]
-        return over(values, "Spearman's rho", name, quantity, scope, layouts=layouts)
-
-    return {quantity: {scope: of(quantity, scope) for scope in ("all", "within")} for quantity in QUANTITIES}
-
-
 def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
     """Every member as an option of every run."""
     for agent in metrics["selection"]:
@@ -249,13 +188,6 @@ def missing(work: Work) -> list[str]:
     return [f"no truth of {name} in its domain, to match members with" for name in names]
 
 
-CORRELATIONS = (
-    page.label("chooser", "chooser", once=True),
-    page.label("ranked by", "ranked by"),
-    page.number("within sub-goals", "within", page.interval, 2),
-    page.number("over all options", "all", page.interval, 2),
-    page.number("runs", "within.n"),
-)
 MEMBERS = (
     page.label("sub-goal", "sub_goal", once=True),
     page.label("member", "name"),
@@ -264,7 +196,6 @@ MEMBERS = (
     page.number("expected", "expected", page.fixed, 0),
     page.number("preference", "preference", page.fixed, 2),
     page.number("late", "late_preference", page.fixed, 2),
-    page.number("share, %", "share", lambda share: page.fixed(None if share is None else 100 * share, 1)),
     page.number("steps", "duration", page.fixed, 1),
     page.number("match", "match", page.fixed, 2),
 )
@@ -332,39 +263,20 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
 
 
 def choices_section(material: Material) -> Block:
-    """Question 5: does reward lead to the hypotheses that transfer?"""
-    agent, title, selection = _agent(material), "Which hypotheses are chosen", material.metrics["selection"]
-    drawn = page.shown(material, _scatter(material))
+    """How often each member was chosen, over what a uniform choice would have."""
+    agent, title = _agent(material), "Which hypotheses are chosen"
     if agent is None:
-        return page.section("choices", title, [], [drawn])
+        lacking = ["How often each member was chosen: it needs a meta artefact with learned terminations: train-meta."]
+        return page.section("choices", title, [], [], lacking)
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
-        "would have chosen it. Raw shares are confounded by availability: a member that fires everywhere is masked "
-        "nearly always, one that never fires is always offered. The random chooser's numbers show what no preference "
-        "looks like."
-    )
-    correlations = page.table(
-        CORRELATIONS,
-        [
-            {"chooser": chooser["name"], "ranked by": name, **chooser["rank_correlation"][key]}
-            for chooser in selection
-            for key, name in QUANTITIES.items()
-        ],
-        heading="Rank correlation with the match",
-        caption="Spearman's rank correlation between how a member is ranked and its match with the true sub-goal on "
-        "the run's layout. Within: mean over sub-goals of the correlation among a sub-goal's members. 1 would mean "
-        "that reward picks out the hypotheses that transfer, 0 that it does not. "
-        f"{page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
+        "would have chosen it: 1 for a chooser that does not care; numbers.csv has the random chooser's too, if one "
+        "was run. Match is the balanced accuracy of the member's classifier on the layout, not how good its option is. "
+        f"What that choosing is worth is the question below, '{choosing.TITLE}', for agents whose options can be asked "
+        "anywhere."
     )
     members = [_members(run, folded=index > 0) for index, run in enumerate(agent["runs"])]
-    control, variant = control_of(material, agent, selection), which(agent, selection)
-    lacking = "No random chooser beside it: it needs a meta artefact with chooser=random."
-    if variant:
-        variant = f"{variant} Rank correlations are those of every variant."
-        lacking = f"No random choice among the options of {agent['name']} was run."
-    return page.section(
-        "choices", title, [text, variant], [drawn, correlations, *members], [] if control else [lacking]
-    )
+    return page.section("choices", title, [text, which(agent, material.metrics["selection"])], members)
 
 
 def _members(run: Entry, *, folded: bool) -> Block:
@@ -380,14 +292,12 @@ def _members(run: Entry, *, folded: bool) -> Block:
         heading="" if folded else name,
         folded=name if folded else "",
         caption="Decisions at which the option was offered and chosen; expected under uniform choice; preference "
-        "over all and over the last quarter of training; raw share of decisions; mean steps of an execution; match "
-        "on this layout.",
+        "over all and over the last quarter of training; mean steps of an execution; match on this layout.",
     )
 
 
 def figures(material: Material) -> Iterator[Drawn]:
-    """Preference against match; Figures 7 and 8 and the other sub-goals', of the agent's first run."""
-    yield _scatter(material)
+    """Figures 7 and 8 and the other sub-goals', of the agent's first run."""
     agent, selection = _agent(material), material.metrics["selection"]
     run = agent["runs"][0] if agent else {"sub_goals": []}
     for goal in run["sub_goals"]:
@@ -404,60 +314,6 @@ def figures(material: Material) -> Iterator[Drawn]:
         ).rstrip()
         drawn = termination_states([(f"{title}\n{note}", image) for title, note, image in sides])
         yield Drawn(name, title, drawn, caption)
-
-
-def _values(agent: Mapping[str, Any], key: str) -> NDArray[np.float64]:
-    """Float (runs, sub-goals, members)."""
-    runs = [[[member[key] for member in goal["members"]] for goal in run["sub_goals"]] for run in agent["runs"]]
-    return np.array(runs, dtype=np.float64)
-
-
-def _scatter(material: Material) -> Drawn:
-    agent, selection = _agent(material), material.metrics["selection"]
-    if agent is None:
-        needed = "It needs a meta artefact with learned terminations: train-meta."
-        return Drawn("preference", "Which hypotheses are chosen", None, missing=needed)
-    control = control_of(material, agent, selection)
-    uncaring = (_values(control, "match").ravel(), _values(control, "preference").ravel()) if control else None
-    names = [goal["sub_goal"] for goal in agent["runs"][0]["sub_goals"]]
-    drawn = preference_against_match(names, _values(agent, "match"), _values(agent, "preference"), uncaring)
-    layouts = sorted({run["layout_seed"] for run in agent["runs"]})
-    caption = (
-        "Question 5 of the paper: a point per member and run, over all of training; up: chosen more often than by a "
-        f"uniform chooser; right: closer to the true sub-goal on that layout (layout seed {page.listed(layouts)}; "
-        f"runs: {len(agent['runs'])}). {which(agent, selection)}"
-    ).rstrip()
-    return Drawn("preference", "Preference against match", drawn, caption)
-
-
-def preference_against_match(
-    sub_goals: Sequence[str],
-    match: NDArray[np.float64],
-    preference: NDArray[np.float64],
-    control: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
-) -> Figure:
-    """Question 5 of the paper: is the member that is chosen more often the one that fits the true sub-goal?
-
-    ``match``, balanced accuracy on the run's layout, and ``preference``, chosen / expected under uniform choice, are
-    (R, G, K); ``control`` is the same two, flat, of the random chooser.
-    """
-    with drawing(3.9, 3, handletextpad=0.3) as (figure, axes):
-        if control is not None:
-            axes.plot(*control, ".", color=GREY, markersize=5, alpha=0.6, label="random choice")
-        for index, name in enumerate(sub_goals):
-            colour, marker = style_of(index)
-            x, y = match[:, index].ravel(), preference[:, index].ravel()
-            axes.plot(x, y, marker, color=colour, markersize=6, alpha=0.85, linestyle="none", label=name)
-        axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=":")
-        axes.set_yscale("symlog", base=2, linthresh=0.25)
-        top = max(2.0, float(np.nanmax(preference))) if np.isfinite(preference).any() else 2.0
-        ticks = [0, 0.25, 0.5, *(2.0**power for power in range(int(np.ceil(np.log2(top))) + 1))]
-        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.minorticks_off()
-        axes.set_ylim(-0.04, ticks[-1] * 1.1)
-        axes.set_xlabel("match: balanced accuracy on the run's layout")
-        axes.set_ylabel("preference: chosen / expected")
-    return figure
 
 
 def termination_states(sides: Sequence[tuple[str, NDArray[np.uint8] | None]]) -> Figure:

@@ -8,7 +8,6 @@ from hypogoal.evaluation.distance import distance_bars
 from hypogoal.evaluation.hypotheses import best_mean_worst_members
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.evaluation.plots import BLUE, VERMILLION, to_png, to_svg
-from hypogoal.evaluation.selection import preference_against_match
 
 GRID = np.arange(0, 1_001, 100)
 
@@ -36,17 +35,11 @@ def members():
     return best_mean_worst_members([of_members(*values) for values in found])
 
 
-def preferences():
-    match = np.array([[[0.5, 1.0], [0.7, np.nan]]])
-    return preference_against_match(["red", "blue"], match, 4 * match, (match.ravel(), match.ravel()))
-
-
 @pytest.mark.parametrize(
     ("draw", "texts"),
     [
         (curves, ["options", "PPO", "random play", "reward per episode", "environment steps, in thousands"]),
         (members, ["red", "blue", "dbat, K=3", "single CNN", "balanced accuracy on held-out states"]),
-        (preferences, ["red", "blue", "random choice", "preference: chosen / expected", "match: balanced accuracy"]),
     ],
 )
 def test_figures_say_what_they_show(draw, texts):
@@ -87,12 +80,7 @@ def long_members():
     return best_mean_worst_members([of_members(name, "red", 0.8, 0.8, 0.8) for name in LONG])
 
 
-def long_preferences():
-    match = np.full((1, len(LONG), 2), 0.8)
-    return preference_against_match(LONG, match, match)
-
-
-@pytest.mark.parametrize("draw", [long_curves, long_members, long_preferences])
+@pytest.mark.parametrize("draw", [long_curves, long_members])
 def test_every_entry_of_a_legend_is_on_the_picture(draw):
     """Spec F: fewer columns and broken lines for long names, a higher figure for many; a dollar is a dollar."""
     figure = draw()
@@ -118,10 +106,8 @@ def test_an_observation_as_png_is_the_same_pixels():
 
 def test_a_name_that_begins_with_an_underscore_is_in_the_legend():
     """Spec F: matplotlib takes such a label for its own; a user's sub-goal or setting may be called so."""
-    match = np.full((1, 2, 2), 0.8)
     values = np.linspace(0, 1, 11)[None]
     for figure in (
-        preference_against_match(["_x", "red"], match, match),
         best_mean_worst_members([of_members(name, "red", 0.8, 0.8, 0.8) for name in ("_x", "red")]),
         learning_curves(GRID, [Line("_x", values, BLUE), Line("red", values, VERMILLION)], "reward"),
         distance_bars([(name, "N=1", 4.0, 1.0, (3.0, 5.0)) for name in ("_x", "red")], ["_x", "red"], 300),

@@ -307,14 +307,15 @@ def test_the_page_shows_all_of_it(run, page):
         "Which hypotheses are chosen", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
-    assert page.count("<figure") == 4
+    assert "is the question below, &#39;What choosing is worth&#39;" in page.split("<h2>What choosing is worth</h2>")[0]
+    assert page.count("<figure") == 3
     assert page.count("<h3>Seed by seed: ") == 2
     assert "1 run: layout seed 100, run seed 0" in page
     assert "Figure 6 of the paper" in page
     assert "no agent &#39;DQN tuned&#39;" in page
     assert page.count("data:image/png;base64,") >= 15
     assert sorted(path.name for path in (run / "report" / "figures").iterdir()) == sorted(
-        f"{name}.{kind}" for name in ("reward", "length", "members", "preference") for kind in ("svg", "png")
+        f"{name}.{kind}" for name in ("reward", "length", "members") for kind in ("svg", "png")
     )
 
 
@@ -328,15 +329,7 @@ def test_the_papers_figures_as_files(run, metrics, tmp_path):
     kind = "pdf"
     written, missing = draw_figures(run, tmp_path / "figures", kind)
     names = {path.name for path in written}
-    wanted = {
-        "figure6",
-        "figure6-length",
-        "figure7",
-        "figure8",
-        "members",
-        "preference",
-        "terminations-collect-red-key",
-    }
+    wanted = {"figure6", "figure6-length", "figure7", "figure8", "members", "terminations-collect-red-key"}
     assert {f"{name}.{kind}" for name in wanted} <= names
     explained = [goal["sub_goal"] for goal in metrics["saliency"]["sub_goals"] if goal["states"]]
     assert len(explained) > 1
