@@ -26,6 +26,8 @@ from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import Episodes
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 
@@ -269,15 +271,27 @@ MEMBERS = (
 )
 
 
+def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
+    """Each agent, and below it chance among its own options."""
+    both = ((agent | {"chooser": agent["name"]}, agent["uniform"] | {"chooser": UNIFORM}) for agent in agents)
+    return [chooser for pair in both for chooser in pair]
+
+
+def summary(metrics: Metrics) -> list[Table]:
+    """For a terminal, where there is anything to choose."""
+    agents = metrics.get("choosing", [])
+    return [page.terminal(TITLE, (*COLUMNS[:2], COLUMNS[-1]), _choosers(agents))] if agents else []
+
+
 def sections(material: Material) -> list[Block]:
-    """The table, and the members of the first run."""
+    """Who solves how much, in words and as a table, and the members of the first run."""
     agents = material.metrics.get("choosing", [])
     if not agents:
         return []
-    table = [
-        entry
+    verdict = [
+        f"{agent['name']}: the agent solves {page.percent(agent['success'])} of its episodes, chance among its own "
+        f"options {page.percent(agent['uniform']['success'])}."
         for agent in agents
-        for entry in ({**agent, "chooser": agent["name"]}, {**agent["uniform"], "chooser": UNIFORM})
     ]
     text = (
         "The trained agent plays on, frozen, and so does chance with the agent's own final options. An option's "
@@ -287,15 +301,16 @@ def sections(material: Material) -> list[Block]:
         "the best quality it goes (chance 0)."
     )
     blocks = [
-        page.table(COLUMNS, table, main=lambda entry: entry["chooser"] == LEARNED),
+        page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED),
         page.table(MEMBERS, agents[0]["runs"][0]["members"], folded=f"Members of {agents[0]['runs'][0]['path']}"),
     ]
-    return [page.section("choosing", TITLE, [text], blocks)]
+    return [page.section("choosing", TITLE, [" ".join(verdict), text], blocks)]
 
 
 QUESTION = Question(
     numbers=numbers,
     rows=rows,
+    summary=summary,
     sections=sections,
     meanings={
         "quality": (

@@ -30,7 +30,17 @@ STUDENT = "Student's t of the mean"
 PICKED = ("best", "validated", "mean")  # members that methods are compared by
 # Settings that may differ between two runs that are averaged, or that follow from others.
 NOT_A_VARIANT = frozenset(
-    {"layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"}
+    # ``world`` says again what the domain's own settings say.
+    {
+        "layout_seed",
+        "sub_goals",
+        "observation_shape",
+        "setting",
+        "random_episodes",
+        "workers",
+        "hyperparameters",
+        "world",
+    }
 )
 # Settings of ensembles without effect.
 IDLE = {

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import versions
 from hypogoal.core.files import replace_text
 from hypogoal.evaluation import page
-from hypogoal.evaluation.numbers import grouped
+from hypogoal.evaluation.numbers import grouped, student_interval
 from hypogoal.evaluation.pictures import image_png
 from hypogoal.evaluation.plots import INK, drawing, slug
 from hypogoal.which_feature import scores
@@ -63,8 +63,8 @@ def told(values: NDArray[np.float64]) -> str:
     known = values[~np.isnan(values)]
     if len(known) < 3:
         return ", ".join(f"{value:.2f}" for value in known) or "–"
-    mean, half = scores.student(known)
-    return f"{mean:.2f} ± {half:.2f}"
+    low, high = student_interval(known)
+    return f"{known.mean():.2f} ± {(high - low) / 2:.2f}"
 
 
 def _mean(values: NDArray[np.float64]) -> str:

@@ -6,7 +6,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t
 
 from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
 
@@ -93,11 +92,3 @@ def labels_needed(
         failing = np.flatnonzero(chances < SURE)
         needed.append(failing[-1] + 1 if len(failing) else 0)
     return np.array(needed, dtype=np.int64)
-
-
-def student(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Mean, and half the width of Student's 95 % interval over seeds; NaN where there are fewer than three."""
-    if len(values) < 3:
-        return float(np.mean(values)) if len(values) else float("nan"), float("nan")
-    half = t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    return float(np.mean(values)), float(half)

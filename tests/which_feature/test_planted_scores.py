@@ -89,11 +89,3 @@ def test_labels_do_not_tell_members_that_say_the_same() -> None:
     members = np.concatenate([0.5 * SURE[:, :1], np.full((320, 1), 0.2, np.float32)], axis=1)
     needed = scores.labels_needed(members, FACTORS, scores.rankings(members, FACTORS), rng())
     assert needed[0] == scores.MOST_LABELS + 1
-
-
-def test_intervals_are_students() -> None:
-    """By hand: of 0, .5, 1 the mean is .5, half of the interval 4.303 * .5 / sqrt(3). Two points have none."""
-    mean, half = scores.student(np.array([0.0, 0.5, 1.0]))
-    assert mean == 0.5
-    assert half == pytest.approx(1.2421, abs=1e-4)
-    assert np.isnan(scores.student(np.array([0.0, 1.0]))[1])
