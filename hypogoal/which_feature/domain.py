@@ -121,7 +121,8 @@ class RoomsDomain(Domain):
                     "network": "tiles",
                     "schedule": "sequential",
                     "diversity_weight": 0.03,
-                    "learning_rate": 2e-3,
+                    "learning_rate": 5e-4,
+                    "steps": 300,
                     "batch_size": 32,
                     "threshold": "unlabelled-split",
                 }
