@@ -2,6 +2,7 @@
 PYTHON ?= python3
 JOBS ?= 2
 DEMO ?= runs/demo
+ROOMS ?= runs/rooms
 ONLY ?= doorkey montezuma training options loop startup
 
 VENV := .venv
@@ -28,8 +29,9 @@ $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
-# An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(DEMO).
-demo: $(STAMP) ## three-key DoorKey from nothing to a report, in runs/demo
+# An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(ROOMS) and $(DEMO).
+demo: $(STAMP) ## where an ensemble is needed, in runs/rooms, then three-key DoorKey, in runs/demo: from nothing to a report
+	$(BIN)/hypogoal run which-feature --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
 
 test: $(STAMP) ## the tests, without those marked slow or slurm

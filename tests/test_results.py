@@ -16,6 +16,8 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "labels-doorkey": labels.tables,
     "thresholds-doorkey": thresholds.tables,
     "which-feature": which_feature.tables,
+    "which-feature-rooms": choosing.rooms,
+    "which-feature-two": which_feature.tables_of_two,
 }
 
 
