@@ -78,6 +78,13 @@ class Learner(Resumable, ABC):
     ):
         self.engine, self.terminations, self.config = engine, terminations, config
         self.options, self.device = terminations.options, torch.device(device)
+        self.actions = action_set(engine, config.actions)
+        self._index = np.zeros(engine.n_actions, dtype=np.int64)
+        self._index[self.actions] = np.arange(len(self.actions))
+        self.rng = rng_for(seed, "options")
+        self.exploration = Exploration(config, engine.count, len(self.actions), self.rng)
+        self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), dtype=np.int64)
+        self.build(config, seed)
         reach = self.reach(config, self.options)
         if engine.memory is not None and reach > engine.memory:  # Spec D3
             raise UserError(
@@ -85,12 +92,10 @@ class Learner(Resumable, ABC):
                 f"replay={config.replay}",
                 f"Give --set replay={max(100, config.replay - (reach - engine.memory))} or less.",
             )
-        self.actions = action_set(engine, config.actions)
-        self._index = np.zeros(engine.n_actions, dtype=np.int64)
-        self._index[self.actions] = np.arange(len(self.actions))
-        self.rng = rng_for(seed, "options")
-        self.exploration = Exploration(config, engine.count, len(self.actions), self.rng)
-        self.option_steps, self.positives, self.steps_since_positive = np.zeros((3, self.options), dtype=np.int64)
+
+    @abstractmethod
+    def build(self, config: OptionConfig, seed: int) -> None:
+        """The policies, once all above is there."""
 
     @staticmethod
     @abstractmethod

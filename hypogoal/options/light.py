@@ -18,14 +18,12 @@ from torch import Tensor
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
-from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import double_q_targets, follow_tensors
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, StepsAhead
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
-from hypogoal.options.termination import Terminations
 
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
@@ -44,14 +42,7 @@ class LightLearner(Learner):
         *("online", "target", "optimiser", "replay", "ahead", "positive", "steps", "updates", "_due"),
     )
 
-    def __init__(
-        self,
-        engine: Engine,
-        terminations: Terminations,
-        config: OptionConfig,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ):
+    def build(self, config: OptionConfig, seed: int) -> None:
         self.running_only = config.experience == "own"
         if config.n_step > 1 and not self.running_only:
             raise UserError(
@@ -59,14 +50,13 @@ class LightLearner(Learner):
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
-        super().__init__(engine, terminations, config, seed, device)
-        self.ahead = StepsAhead(engine.count, config.n_step)
+        self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
-            self.online = LightQNetwork(engine.observation_shape, self.options, len(self.actions)).to(self.device)
+            self.online = LightQNetwork(self.engine.observation_shape, self.options, len(self.actions)).to(self.device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
-        self.pixels = Pixels(engine, 2 * config.option_batch, self.device) if pictures else None
+        self.pixels = Pixels(self.engine, 2 * config.option_batch, self.device) if pictures else None
         self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
         self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)

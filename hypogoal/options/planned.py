@@ -7,15 +7,12 @@ whose options are planned shows what its hypotheses are worth, whatever option l
 from collections.abc import Mapping
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
-from hypogoal.options.termination import Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
 
@@ -32,24 +29,16 @@ class PlannedLearner(Learner):
         UserError: nobody knows what follows in this engine.
     """
 
-    def __init__(
-        self,
-        engine: Engine,
-        terminations: Terminations,
-        config: OptionConfig,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ):
-        super().__init__(engine, terminations, config, seed, device)
-        plan = engine.plan()
+    def build(self, config: OptionConfig, seed: int) -> None:
+        plan = self.engine.plan()
         if plan is None:
             what = "nobody knows what follows on each action in this domain"
             raise UserError(what, "network=planned", "Give --set network=light.")
         self.actions = plan.actions
-        self._place = np.full(engine.n_states, -1, np.int64)
+        self._place = np.full(self.engine.n_states, -1, np.int64)
         self._place[plan.ids] = np.arange(len(plan.ids))
         self._after = self._place[plan.following]
-        self.steps = distances(terminations.of(plan.ids), self._after, plan.final)
+        self.steps = distances(self.terminations.of(plan.ids), self._after, plan.final)
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:

@@ -23,7 +23,6 @@ from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import PaperQNetwork
-from hypogoal.options.termination import Terminations
 
 FIELDS = {
     "s": np.int32, "a": np.int16, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
@@ -54,14 +53,7 @@ class RecurrentLearner(Learner):
 
     CHANGING = (*Learner.CHANGING, "members", "hidden", "running")
 
-    def __init__(
-        self,
-        engine: Engine,
-        terminations: Terminations,
-        config: OptionConfig,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ):
+    def build(self, config: OptionConfig, seed: int) -> None:
         if config.experience != "own":
             raise UserError(
                 "the paper's network learns from its member's own executions only",
@@ -72,11 +64,10 @@ class RecurrentLearner(Learner):
             raise UserError(
                 "the paper's network learns one step ahead only", f"n_step={config.n_step}", "Give --set n_step=1."
             )
-        super().__init__(engine, terminations, config, seed, device)
         count = len(self.actions)
-        self.members = [Member(engine, config, seed, option, count, self.device) for option in range(self.options)]
-        self.hidden = torch.zeros(engine.count, PaperQNetwork.HIDDEN, device=self.device)
-        self.running: list[list[tuple[int, int, int, bool, bool]]] = [[] for _ in range(engine.count)]
+        self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
+        self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
+        self.running: list[list[tuple[int, int, int, bool, bool]]] = [[] for _ in range(self.engine.count)]
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
