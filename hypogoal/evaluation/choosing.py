@@ -284,15 +284,10 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """Who solves how much, in words and as a table, and the members of the first run."""
+    """The table, and the members of the first run."""
     agents = material.metrics.get("choosing", [])
     if not agents:
         return []
-    verdict = [
-        f"{agent['name']}: the agent solves {page.percent(agent['success'])} of its episodes, chance among its own "
-        f"options {page.percent(agent['uniform']['success'])}."
-        for agent in agents
-    ]
     text = (
         "The trained agent plays on, frozen, and so does chance with the agent's own final options. An option's "
         "quality is the share of its executions that bring about the true sub-goal, begun where agents decide. Choice "
@@ -304,7 +299,7 @@ def sections(material: Material) -> list[Block]:
         page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED),
         page.table(MEMBERS, agents[0]["runs"][0]["members"], folded=f"Members of {agents[0]['runs'][0]['path']}"),
     ]
-    return [page.section("choosing", TITLE, [" ".join(verdict), text], blocks)]
+    return [page.section("choosing", TITLE, [text], blocks)]
 
 
 QUESTION = Question(

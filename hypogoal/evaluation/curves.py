@@ -377,7 +377,7 @@ def summary_section(material: Material) -> Block:
         "hypotheses that are true there?"
     )
     headline = [_headline(material)] if metrics["agents"] else []
-    return page.section("summary", "Summary", [asked, *_answers(material)], headline, metrics["missing"])
+    return page.section("summary", "Summary", [*_answers(material), asked], headline, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
@@ -393,7 +393,11 @@ def _answers(material: Material) -> list[str]:
         if agent["success"]["mean"] is not None and control is not None:
             alike = not several or same_settings(agent, control)
             text += f" {_by_chance(control, 'options of the same members' if alike else 'options of its ensemble')}"
-        elif several and control is None:
+        frozen = [entry for entry in material.metrics.get("choosing", []) if entry["name"] == agent["name"]]
+        for entry in frozen:
+            solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
+            text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
+        if several and control is None and not frozen:
             text += " No random choice among options of the same members was run."
         paragraphs.append(text)
     return paragraphs

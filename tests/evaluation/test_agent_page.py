@@ -69,7 +69,7 @@ def chosen(name, runs, arrays):
 def answer(*runs):
     """What the summary says of the option agent."""
     material = material_of(*runs)
-    return summary_section(material)["paragraphs"][1]
+    return summary_section(material)["paragraphs"][0]
 
 
 @pytest.mark.parametrize("reward", [20.0, -3.0])
@@ -154,7 +154,7 @@ def two(chooser="ppo", **more):
 
 
 def answers(*runs):
-    return summary_section(material_of(*runs))["paragraphs"][1:]
+    return summary_section(material_of(*runs))["paragraphs"][:-1]
 
 
 def test_each_variant_of_the_option_agent_has_its_own_answer_and_control():
@@ -166,6 +166,23 @@ def test_each_variant_of_the_option_agent_has_its_own_answer_and_control():
         assert "Uniformly random choice among options of the same members: 0 %, 500 steps." in text
     for text in answers(*two()):
         assert text.endswith("No random choice among options of the same members was run.")
+
+
+def test_an_agent_that_played_on_has_chance_among_its_own_options_beside_it():
+    """Spec H2: in the page's first lines; nobody misses another control then."""
+    material = material_of(*two())
+    shares = {"dbat": (0.92, 0.61), "none": (0.25, 0.25)}
+    material.metrics["choosing"] = [
+        {
+            "name": f"options (learned members), ensemble={name}",
+            "success": {"mean": own},
+            "uniform": {"success": {"mean": chance}},
+        }
+        for name, (own, chance) in shares.items()
+    ]
+    dbat, none, _ = summary_section(material)["paragraphs"]
+    assert dbat.endswith("Played on, frozen, it solves 92 %; uniform choice among its own options 61 %.")
+    assert none.endswith("Played on, frozen, it solves 25 %; uniform choice among its own options 25 %.")
 
 
 def test_a_control_is_never_that_of_another_variant():
@@ -184,7 +201,7 @@ def test_a_control_is_never_that_of_another_variant():
 def test_of_one_variant_nothing_is_said_of_variants():
     """Spec F7: the page of one option agent and its control, whatever their names, speaks of no variant."""
     material = material_of(made(), made(chooser="random", reward=0.0))
-    (text,) = summary_section(material)["paragraphs"][1:]
+    (text,) = summary_section(material)["paragraphs"][:-1]
     assert text.startswith("The option agent reached the goal")
     assert "Uniformly random choice among options of the same members: 0 %" in text
     said = str([terminations_section(material), choices_section(material)])
