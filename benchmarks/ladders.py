@@ -172,7 +172,7 @@ def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
     seeds = list(numbers["dbat"])
     yield f"N = {groups}, {len(seeds)} seeds: ranking on unseen rooms of the best member there, by steps."
     yield ""
-    looks = list(next(iter(numbers["dbat"].values())))
+    looks = sorted(next(iter(numbers["dbat"].values())))
     for name, of in (("ranking_unseen", np.max), ("ranking_unseen", np.mean), ("balanced_accuracy_all", np.max)):
         if (name, of) != ("ranking_unseen", np.max):
             yield f"{'Its mean member' if of is np.mean else 'Balanced accuracy at 0.5, all rooms, of the best there'}."
