@@ -111,11 +111,13 @@ def tables(path: Path) -> Iterator[str]:
 
 
 def rooms(path: Path) -> Iterator[str]:
-    """The tables of both settings of rooms, the last one first."""
-    yield from tables(path)
-    yield "The first setting:"
-    yield ""
-    yield from tables(path.with_name("which-feature-rooms-first.csv"))
+    """The tables of all settings of rooms, the last one first."""
+    for which in ("", "-second", "-first"):
+        of = path.with_stem(path.stem + which)
+        if of.exists():
+            yield f"The {which[1:] or 'third'} setting:"
+            yield ""
+            yield from tables(of)
 
 
 def _mean(values: NDArray[np.float64]) -> str:

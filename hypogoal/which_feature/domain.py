@@ -121,8 +121,7 @@ class RoomsDomain(Domain):
                     "network": "tiles",
                     "schedule": "sequential",
                     "diversity_weight": 0.03,
-                    "learning_rate": 5e-4,
-                    "steps": 300,
+                    "steps": 600,
                     "batch_size": 32,
                     "threshold": "unlabelled-split",
                 }
