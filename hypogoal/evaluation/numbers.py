@@ -30,10 +30,11 @@ STUDENT = "Student's t of the mean"
 PICKED = ("best", "validated", "mean")  # members that methods are compared by
 # Settings that may differ between two runs that are averaged, or that follow from others.
 NOT_A_VARIANT = frozenset(
-    {"layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers"}
-) | {
-    *("hyperparameters", "world", "members")  # the domain's settings and the ensemble's name say the latter two
-}
+    {
+        *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
+        *("world", "members"),  # which the domain's settings and the ensemble's name say
+    }
+)
 # Settings of ensembles without effect.
 IDLE = {
     "single CNN": {"diversity", "diversity_weight", "schedule", "members"},
