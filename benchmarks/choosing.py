@@ -135,7 +135,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.tables:
         collect(arguments.run, arguments.csv)
-    print("\n".join(tables(arguments.csv)))
+    drawn = rooms if arguments.csv.stem == "which-feature-rooms" else tables
+    print("\n".join(drawn(arguments.csv)))
 
 
 if __name__ == "__main__":
