@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import choosing, hypotheses, labels, ladders, thresholds, which_feature
+from benchmarks import bandits, choosing, hypotheses, labels, ladders, thresholds, which_feature
 from benchmarks.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -16,6 +16,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "labels-doorkey": labels.tables,
     "thresholds-doorkey": thresholds.tables,
     "which-feature": which_feature.tables,
+    "which-feature-bandits": bandits.tables,
     "which-feature-rooms": choosing.rooms,
     "which-feature-two": which_feature.tables_of_two,
 }
