@@ -32,7 +32,10 @@ METHODS = {  # by what the names of artefacts have in them, the longest first
     "dbat": "D-BAT, K = 6",
     "none": "no diversity, K = 6",
     "one": "one classifier, K = 1",
+    "ppo": "PPO on primitive actions",
+    "dqn": "DQN on primitive actions",
 }
+BASELINES = ("ppo", "dqn")
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
 SHOWN = {
     "success": "solved",
@@ -43,10 +46,14 @@ SHOWN = {
 }
 
 
-def collect(run: Path, path: Path) -> None:
-    """Take what the evaluation says of frozen agents and of chance: a row per layout and number."""
-    with (run / "evaluation" / "numbers.csv").open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["scope"] == FROZEN and not row["sub_goal"]]
+def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
+    """Take what the evaluation says of frozen agents and of chance: a row per layout and number.
+
+    Of baselines it takes the last training episodes.
+    """
+    rows = [row for row in _numbers(run) if row["scope"] == FROZEN and not row["sub_goal"]]
+    if baselines:
+        rows += [row for row in _numbers(baselines) if row["seed"] and row["quantity"] in ("success", "near")]
     kept = []
     for row in rows:
         method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
@@ -59,6 +66,11 @@ def collect(run: Path, path: Path) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows(kept)
+
+
+def _numbers(run: Path) -> list[dict[str, str]]:
+    with (run / "evaluation" / "numbers.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -88,7 +100,7 @@ def tables(path: Path) -> Iterator[str]:
                 *(f"{(of(method, chooser, 'success') >= least).sum()} of {len(layouts)}" for least in (0.95, 0.9)),
             ]
             for method, title in methods.items()
-            for chooser in ("agent", "uniform")
+            for chooser in (("agent",) if method in BASELINES else ("agent", "uniform"))
         ),
     )
     yield "Share of episodes solved, layout by layout: the agent / chance among its own options."
@@ -106,6 +118,7 @@ def tables(path: Path) -> Iterator[str]:
                 ),
             ]
             for method, title in methods.items()
+            if method not in BASELINES
         ),
     )
 
@@ -131,10 +144,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
     parser.add_argument("csv", type=Path, help="the file of rows")
+    parser.add_argument("--baselines", type=Path, help="the folder of the sweep of baselines")
     parser.add_argument("--tables", action="store_true", help="print the tables only")
     arguments = parser.parse_args()
     if not arguments.tables:
-        collect(arguments.run, arguments.csv)
+        collect(arguments.run, arguments.csv, arguments.baselines)
     drawn = rooms if arguments.csv.stem == "which-feature-rooms" else tables
     print("\n".join(drawn(arguments.csv)))
 
