@@ -81,4 +81,4 @@ def test_an_agent_finds_the_member_that_the_reward_asks_for(tmp_path: Path) -> N
         with (tmp_path / f"of-{truth}" / "numbers.csv").open(newline="") as file:
             rows = [row for row in csv.DictReader(file) if (row["scope"], row["quantity"]) == (FROZEN, "success")]
         numbers[truth] = {row["method"] == UNIFORM: float(row["value"]) for row in rows}
-    assert all(solved[False] >= 0.9 and solved[True] <= 0.75 for solved in numbers.values()), numbers
+    assert all(solved[False] >= 0.8 and solved[False] - solved[True] >= 0.15 for solved in numbers.values()), numbers
