@@ -1,4 +1,4 @@
-"""What choosing is worth, from the numbers of a sweep: the rows behind the result, and its tables.
+"""What choosing is worth, played by the agents of a sweep: the rows behind the result, and its tables.
 
 hypogoal sweep examples/choosing.toml --out runs/choosing
 python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
@@ -18,7 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import interval, table
-from hypogoal.evaluation.choosing import FROZEN, OF_CHOICE, OF_PLAY, UNIFORM
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.base import load_domain
+from hypogoal.evaluation.choosing import ENVIRONMENTS, OF_CHOICE, OF_PLAY, UNIFORM, judge, play, qualities
+from hypogoal.evaluation.curves import LEARNED
+from hypogoal.meta.episodes import agent_of
+from hypogoal.options.choosers import RandomChooser
 
 METHODS = {  # by what the names of artefacts have in them, the longest first
     "dbat-truth-shape": "shape: D-BAT, K = 3",
@@ -47,13 +53,13 @@ SHOWN = {
 
 
 def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
-    """Take what the evaluation says of frozen agents and of chance: a row per layout and number.
+    """Play every agent of a run, frozen, as the evaluation does, and chance with its options: a row per number.
 
-    Of baselines it takes the last training episodes.
+    Of evaluated baselines it takes the last training episodes.
     """
-    rows = [row for row in _numbers(run) if row["scope"] == FROZEN and not row["sub_goal"]]
+    rows = [row for path in sorted((run / "agent").iterdir()) for row in _played(path)]
     if baselines:
-        rows += [row for row in _numbers(baselines) if row["seed"] and row["quantity"] in ("success", "near")]
+        rows += [row for row in _numbers(baselines) if row["seed"] and not row["step"] and row["quantity"] in OF_PLAY]
     kept = []
     for row in rows:
         method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
@@ -66,6 +72,25 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows(kept)
+
+
+def _played(path: Path) -> list[dict[str, str]]:
+    artefact = open_artefact(path, "meta")
+    config, seed = artefact.config, artefact.manifest["seed"]
+    loop = agent_of(artefact, seed, ENVIRONMENTS)
+    columns = load_domain(config["domain"]).sub_goals
+    goals = np.repeat([columns.index(goal) for goal in config["sub_goals"]], config["members"])
+    rows, quality = [], np.empty(0)
+    for method in (LEARNED, UNIFORM):
+        if method == UNIFORM:
+            loop.chooser = RandomChooser(rng_for(seed, "uniform-choice"))
+        played, choices = play(loop)
+        quality = qualities(loop, goals, choices.states) if method == LEARNED else quality
+        numbers = played | judge(choices, quality, config["members"])
+        place = {"method": method, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": path.name}
+        known = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
+        rows += [place | {"quantity": name, "value": str(numbers[name])} for name in known]
+    return rows
 
 
 def _numbers(run: Path) -> list[dict[str, str]]:
