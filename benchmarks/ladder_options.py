@@ -1,0 +1,213 @@
+"""How near to a ladder's base do options stop that were learned on it? Figure 4.
+
+    python -m benchmarks.ladder_options docs/results/figure4-ladders.csv --groups 1 --seeds 10
+
+A cell is a method, N (labelled ladder groups), a ladder and a seed: the options of all members of an ensemble, learned
+on that ladder. The stages themselves are run, in the folder of ``--work``; ensembles stay there, of options only the
+rows of the CSV. Kept and gone on with as in ``benchmarks.hypotheses``; ``--tables`` draws the cells.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cells import Row, interval, run_cells, table
+from benchmarks.ladders import read as read_lengths
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.config import parse_integers
+from hypogoal.core.workers import in_processes
+from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
+from hypogoal.evaluation.distance import NEAR, option_numbers
+from hypogoal.evaluation.run import read_executions
+from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.meta.config import TrainOptionsConfig
+from hypogoal.stages.collect import collect
+from hypogoal.stages.train_ensemble import train_ensemble
+from hypogoal.stages.train_options import train_options
+
+METHODS: dict[str, dict[str, Any]] = {
+    "dbat": {"diversity": "dbat"},
+    "none": {"diversity": "none"},
+    "cnn": {"members": 1, "diversity": "none"},
+    "oracle": {},  # ends at the true base, whatever the ensemble
+}
+TITLES = {"dbat": "D-BAT", "none": "no diversity", "cnn": "single CNN", "oracle": "true sub-goal"}
+MEMBERS, STEPS = 3, 40_000
+# The paper's Figure 4 has twelve; the tops of 4-10, 11-19 and 13-21 are bases themselves.
+LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13")
+KEYS = ("groups", "method", "seed", "ladder", "step", "member")
+NUMBERS = ("distance", "reached_base", "inside_at_start", "timed_out", "died", "duration")
+COLUMNS = (*KEYS, "ensemble_steps", *NUMBERS)
+LENGTHS = Path("docs/results/hypotheses-ladders.csv")
+
+
+def length(groups: int, method: str) -> int:
+    """The rule: the look at which the best member's balanced accuracy over all rooms is highest, mean over seeds."""
+    seeds = read_lengths(LENGTHS, groups)[method].values()
+    looks = next(iter(seeds))
+    return max(looks, key=lambda look: np.mean([of[look]["balanced_accuracy_all"].max() for of in seeds]))
+
+
+def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
+    """Where the ensemble is; trained if it is not there."""
+    out = work / f"{method}-{groups}-{seed}"
+    if not (out / "manifest.json").exists():
+        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, **METHODS[method], "workers": 1}
+        config = TrainEnsembleConfig(**settings | {"steps": length(groups, method)})
+        train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
+    return out
+
+
+def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> list[Row]:
+    """Learn the options of one ensemble on one ladder; of each member the last executions' numbers."""
+    ensemble = ensemble_of(work, groups, "dbat" if method == "oracle" else method, seed)
+    ending = "oracle" if method == "oracle" else "members"
+    settings = {**DOMAIN.defaults["train-options"], "start": ladder, "steps": STEPS, "termination": ending}
+    out = work / f"options-{groups}-{method}-{seed}-{ladder}"
+    train_options(ensemble, TrainOptionsConfig(**settings), out, seed=seed, force=True, quiet=True)
+    executions, members = read_executions(out / "executions.csv"), open_artefact(out, "options").config["members"]
+    trained = open_artefact(ensemble, "ensemble").config["steps"]
+    rows = []
+    for member in range(members):
+        numbers = option_numbers(executions.of(member))
+        place = dict(zip(KEYS, (groups, method, seed, ladder, STEPS, member), strict=True))
+        rows.append(place | {"ensemble_steps": trained} | {name: float(numbers[name]) for name in NUMBERS})
+    shutil.rmtree(out)
+    return rows
+
+
+Distances = dict[tuple[str, str], dict[int, NDArray[np.float64]]]  # by method and ladder, by seed: (K,)
+
+
+def read(path: Path, groups: int, name: str = "distance") -> Distances:
+    """A number of the cells of one N."""
+    found: Distances = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if int(row["groups"]) == groups:
+                seeds = found.setdefault((row["method"], row["ladder"]), {})
+                seed = int(row["seed"])
+                seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name]))
+    return found
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    for groups in range(1, 8):
+        if found := read(path, groups):
+            yield from _tables(groups, found, read(path, groups, "reached_base"), read(path, groups, "inside_at_start"))
+
+
+def _tables(groups: int, found: Distances, reached: Distances, inside: Distances) -> Iterator[str]:
+    methods = [method for method in METHODS if any(name == method for name, _ in found)]
+    whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in methods)]
+    seeds = sorted(set.intersection(*(set(found[method, ladder]) for method in methods for ladder in whole)))
+    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member, mean over seeds."
+    yield ""
+    yield from table(
+        ["ladder", "seeds", *(TITLES[method] for method in methods)],
+        (
+            [
+                ladder,
+                str(len(set.intersection(*(set(found[method, ladder]) for method in methods)))),
+                *(_three(found[method, ladder]) for method in methods),
+            ]
+            for ladder in whole
+        ),
+    )
+    yield f"Mean over {len(whole)} ladders, Student's 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
+    yield ""
+    yield from table(
+        [
+            "",
+            "best member",
+            "mean member",
+            f"best within {NEAR} of a base",
+            "began inside",
+            "mean member minus D-BAT's",
+        ],
+        (
+            [
+                TITLES[method],
+                interval(over(found, method, whole, seeds, np.min), 1),
+                interval(over(found, method, whole, seeds, np.mean), 1),
+                interval(over(reached, method, whole, seeds, np.max), 2),
+                interval(over(inside, method, whole, seeds, np.mean), 2),
+                _against(found, method, whole, seeds),
+            ]
+            for method in methods
+        ),
+    )
+
+
+def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
+    return " / ".join(f"{np.mean([of(members) for members in seeds.values()]):.0f}" for of in (np.min, np.mean, np.max))
+
+
+def over(
+    found: Distances,
+    method: str,
+    ladders: list[str],
+    seeds: list[int],
+    of: Callable[[NDArray[np.float64]], np.floating[Any]],
+) -> NDArray[np.float64]:
+    """A number of each ladder's members, mean over seeds: float64 (ladders,)."""
+    return np.array([np.mean([of(found[method, ladder][seed]) for seed in seeds]) for ladder in ladders])
+
+
+def _against(found: Distances, method: str, ladders: list[str], seeds: list[int]) -> str:
+    if method == "dbat":
+        return "-"
+    apart = [over(found, name, ladders, seeds, np.mean) for name in (method, "dbat")]
+    return interval(apart[0] - apart[1], 1)
+
+
+def main() -> None:
+    """Run the cells that are not in the file yet."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser.add_argument(
+        "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
+    )
+    parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
+    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--seeds", type=parse_integers, default=(10,), help="10-12 or 10,12")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
+    arguments = parser.parse_args()
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+        return
+    work, methods = arguments.work, arguments.methods.split(",")
+    for groups in arguments.groups:
+        if not (work / f"groups-{groups}.h5").exists():
+            collect(DOMAIN, MontezumaConfig(groups=groups, workers=1), work / f"groups-{groups}.h5", quiet=True)
+    trained = {"dbat" if method == "oracle" else method for method in methods}
+    ensembles = [
+        partial(ensemble_of, work, groups, method, seed)
+        for groups in arguments.groups
+        for seed in arguments.seeds
+        for method in sorted(trained)
+    ]
+    in_processes(ensembles, arguments.workers, lambda *_: None)
+    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+        (str(groups), method, str(seed), ladder): partial(run_cell, work, groups, method, seed, ladder)
+        for groups in arguments.groups
+        for seed in arguments.seeds
+        for ladder in LADDERS
+        for method in methods
+    }
+    run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, lambda _: (STEPS,), arguments.workers)
+
+
+if __name__ == "__main__":
+    main()
