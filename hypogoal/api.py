@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from hypogoal.core.artefacts import MANIFEST, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import AGAIN, load_tensors
@@ -12,6 +14,7 @@ from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.policies import make_policies
+from hypogoal.options.termination import Dwell, Patience, rule_of, thresholds_in
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 
@@ -61,8 +64,14 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     folder = Path(ensemble) if ensemble else artefact.input("ensemble")
     source = open_artefact(folder, "ensemble").whole()
     ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
-    policies = make_policies(config, load_tensors(artefact.path / "options.safetensors"), source.config)
+    weights = load_tensors(artefact.path / "options.safetensors")
+    policies = make_policies(config, weights, source.config)
     goals, members = tuple(config["sub_goals"]), config["members"]
+    rule, length = rule_of(config["termination"])
+    if rule is Patience:
+        lowered = thresholds_in(weights, len(goals) * members).reshape(len(goals), members)
+        for own, log_odds in zip(ensembles, lowered, strict=True):
+            own.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
     initiation = None
     if INITIATION in artefact.manifest["files"]:
         learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
@@ -80,4 +89,5 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
         masked,
         domain=config["domain"],
         domain_config=config["domain_config"],
+        dwell=length if rule is Dwell else 1,
     )

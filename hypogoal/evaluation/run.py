@@ -86,7 +86,7 @@ def most_used(contents: Contents) -> int | None:
 
 def takes(artefact: Artefact) -> bool:
     """Whether it was learned with the verdicts of an ensemble's members."""
-    return artefact.kind != "baseline" and artefact.config["termination"] == "learned"
+    return artefact.kind != "baseline" and artefact.config["termination"] != "oracle"
 
 
 def within(contents: Contents, source: Artefact) -> str | None:

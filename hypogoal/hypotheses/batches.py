@@ -14,13 +14,12 @@ from torch.nn import functional
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.hypotheses import patches
+from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input
 
 CHUNK = 256  # states at once where no gradient is kept
 LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
-GREY_KNOTS = 8  # random steps of which a map of shades is made, straight in between
-GREY_DARKEST, GREY_BRIGHTEST = (0.0, 0.2), (0.7, 1.0)  # where black and white come to lie
 
 
 class Seen(NamedTuple):
@@ -43,6 +42,7 @@ class TrainingStates:
         device: where they are to be used.
         ladders: int64 (N,), at which ladder each labelled state is, where batches are drawn by them.
         grey: whether the shades of each state of a training batch are mapped at random.
+        context: whether, before that, what is around its middle is replaced in most: :func:`.changes.other_context`.
         jitter: by how many pixels at most each of them is moved at random; the images have that margin on every side.
 
     Raises:
@@ -59,6 +59,7 @@ class TrainingStates:
         *,
         ladders: NDArray[np.int64] | None = None,
         grey: bool = False,
+        context: bool = False,
         jitter: int = 0,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
@@ -71,7 +72,7 @@ class TrainingStates:
         self.ladders, self.device = ladders, device
         self._labelled = observations
         images = np.concatenate([observations, unlabelled])
-        self._grey, self._jitter = grey, jitter
+        self._grey, self._jitter, self._context = grey, jitter, context
         tables = device.type == "cpu" and not (grey or jitter)  # of patches, which change with the images
         self._tables = patches.make_tables(images, network) if tables else None
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
@@ -144,6 +145,8 @@ class TrainingStates:
     def _inputs(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
         assert self._images is not None
         images = self._images[torch.from_numpy(states).to(self.device)]
+        if self._context and changes is not None:
+            images = torch.from_numpy(other_context(images.cpu().numpy(), changes)).to(self.device)
         if self._jitter:
             images = _cut(images, self._jitter, changes)
         if changes is None or not self._grey:
@@ -222,18 +225,6 @@ def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor
     rows = corner[:, :1] + torch.arange(height - size + 1, device=images.device)
     columns = corner[:, 1:] + torch.arange(width - size + 1, device=images.device)
     return images[torch.arange(count)[:, None, None], rows[:, :, None], columns[:, None, :]]
-
-
-def grey_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Random rising maps of the shades 0..255 to 0..1, float32 (count, 256)."""
-    rises = rng.random((count, GREY_KNOTS)) ** 2 + 0.02  # squared: steep in places, nearly level in others
-    risen = np.concatenate([np.zeros((count, 1)), rises.cumsum(1)], axis=1) / rises.sum(1, keepdims=True)
-    darkest, brightest = rng.uniform(*GREY_DARKEST, (count, 1)), rng.uniform(*GREY_BRIGHTEST, (count, 1))
-    at = np.linspace(0, GREY_KNOTS, 256)
-    knot = np.minimum(at.astype(np.int64), GREY_KNOTS - 1)
-    between = at - knot
-    shades = risen[:, knot] * (1 - between) + risen[:, knot + 1] * between
-    return (darkest + (brightest - darkest) * shades).astype(np.float32)
 
 
 def _forward(network: nn.Sequential, inputs: Tensor, sizes: Sequence[int], counted: Sequence[bool]) -> Tensor:

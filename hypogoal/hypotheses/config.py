@@ -79,9 +79,10 @@ class EnsembleConfig:
     )
     augment: str = setting(
         "none",
-        "what is done to each state of a training batch: none; grey, its shades are mapped by a random rising function",
+        "what is done to each state of a training batch: none; grey, its shades are mapped by a random rising "
+        "function; grey-context, before that what is around the agent is often replaced (view=agent-crop)",
         source=BEYOND,
-        choices=("none", "grey"),
+        choices=("none", "grey", "grey-context"),
     )
     jitter: int = setting(
         0,
@@ -99,10 +100,10 @@ class EnsembleConfig:
     )
     threshold: str = setting(
         "0.5",
-        "a member says yes above 0.5; to 5 % of the unlabelled states; or above the cut that best parts the unlabelled "
-        "states in two",
+        "a member says yes above 0.5; to 5 % of the unlabelled states; above the cut that best parts the unlabelled "
+        "states in two; or to half of its labelled positives",
         source=f"{BEYOND}; unlabelled-split: Otsu 1979",
-        choices=("0.5", "unlabelled-q95", "unlabelled-split"),
+        choices=("0.5", "unlabelled-q95", "unlabelled-split", "positives-median"),
     )
 
 

@@ -80,6 +80,12 @@ class Ensemble(nn.Module):
         """Whether predictions need the agent's positions (localiser=ram): an oracle, wherever it is shown."""
         return self.view.needs_positions
 
+    def thresholds_as_log_odds(self) -> NDArray[np.float32]:
+        """The thresholds (K,) of :meth:`log_odds`, with the same verdicts up to rounding."""
+        chance = self.thresholds.cpu().numpy().astype(np.float64)
+        log_odds: NDArray[np.float32] = (np.log(chance) - np.log1p(-chance)).astype(np.float32)
+        return log_odds
+
     def set_thresholds(self, thresholds: NDArray[np.float32]) -> None:
         """The probabilities (K,) above which the members' verdicts are yes."""
         self.thresholds.copy_(torch.from_numpy(thresholds))
@@ -118,19 +124,35 @@ class Ensemble(nn.Module):
         Raises:
             UserError: observations of another shape or type, or positions that are needed and not given.
         """
+        both = torch.from_numpy(self.logits(observations, positions))
+        probabilities: NDArray[np.float32] = both.softmax(dim=-1)[..., 1].numpy()
+        return probabilities
+
+    def log_odds(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float32]:
+        """How much each member's logit of yes is above that of no: float32 (N, K); see :meth:`predict`."""
+        both = self.logits(observations, positions)
+        gaps: NDArray[np.float32] = both[..., 1] - both[..., 0]
+        return gaps
+
+    def logits(
+        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float32]:
+        """Every member's logits of no and of yes: float32 (N, K, 2); see :meth:`predict`."""
         observations = self.see(observations, positions)
         was_training = self.training
         if was_training:
             self.eval()
-        probabilities = np.empty((len(observations), len(self)), dtype=np.float32)
+        logits = np.empty((len(observations), len(self), 2), dtype=np.float32)
         chunk = PATCH_CHUNK if self.thresholds.device.type == "cpu" else CHUNK * 16
         with torch.inference_mode():
             for start in range(0, len(observations), chunk):
                 some = observations[start : start + chunk]
-                probabilities[start : start + chunk] = self._logits(some).softmax(dim=-1)[..., 1].T.cpu().numpy()
+                logits[start : start + chunk] = self._logits(some).transpose(0, 1).cpu().numpy()
         if was_training:
             self.train()
-        return probabilities
+        return logits
 
     def _logits(self, observations: NDArray[np.uint8]) -> Tensor:
         """(K, N, 2), each image's distinct patches computed once where that pays."""

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.seeding import rng_for, seed_for
-from hypogoal.hypotheses.batches import grey_maps
+from hypogoal.hypotheses.changes import grey_maps, pattern
 from hypogoal.hypotheses.networks import folded
 
 CELL = 4  # pixels: the side of a heat-map's cell
 FEATURES = 32  # of a cell
 CHUNK = 64  # states at once where no gradient is kept
-STEPS, BATCH, LEARNING_RATE, L2_WEIGHT = 600, 24, 2e-3, 1e-4
+STEPS, BATCH, LEARNING_RATE, L2_WEIGHT = 1500, 24, 2e-3, 1e-4
+HELD_SHARE = 0.35  # of the labelled states are shown as if nothing moved
 FARTHEST_SHIFT = 20  # pixels
 # From the agent, rows and columns: where clutter begins; the agent is 8 x 4 pixels.
 NEAREST, FARTHEST = (6, 4), (13, 11)
@@ -126,7 +127,7 @@ def fit_localiser(
     rng = rng_for(seed, "states")
     for _ in range(steps):
         drawn = rng.integers(len(observations), size=BATCH)
-        images, places = _changed(observations[drawn], pixels[drawn], rng)
+        images, places = _changed(_held(observations[drawn], rng), pixels[drawn], rng)
         others = rng.integers(max(len(unlabelled), 1), size=BATCH if len(unlabelled) else 0)
         images = np.concatenate([images, _moved(unlabelled[others], rng)])
         features = network[:-1](_as_heat_input(torch.from_numpy(images)))
@@ -139,6 +140,13 @@ def fit_localiser(
         optimiser.step()
         schedule.step()
     return LearnedLocaliser(observations.shape[1:], folded(network.eval()).requires_grad_(False))
+
+
+def _held(observations: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Some of the states uint8 (B, H, W, C) with their last frame in place of all: an agent that stands still."""
+    held = rng.random(len(observations)) < HELD_SHARE
+    observations[held] = observations[held][..., -1:]
+    return observations
 
 
 def _heat_loss(heat: Tensor, places: NDArray[np.float64]) -> Tensor:
@@ -209,7 +217,7 @@ def _changed(
             for _ in range(rng.integers(1, PATTERNS, endpoint=True)):
                 corner = rng.integers(-height // 4, height, size=2)
                 box = _box(corner, corner + rng.integers(8, height, size=2))
-                image[box] = np.where(free[box], _pattern(height, width, rng)[box], image[box])
+                image[box] = np.where(free[box], pattern(height, width, rng)[box], image[box])
         for _ in range(rng.integers(BLOBS, endpoint=True)):
             _add_blob(image, free, rng)
         _change_shades(image, rng)
@@ -246,20 +254,6 @@ def _box(first: NDArray[np.floating | np.integer], last: NDArray[np.floating | n
     top, left = np.maximum(first, 0).astype(np.int64).tolist()
     bottom, right = np.maximum(last, 0).astype(np.int64).tolist()
     return slice(top, bottom), slice(left, right)
-
-
-def _pattern(height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A pattern (height, width, 1) in 0..255, of two shades or of many: pixels repeated like bricks, or blocks."""
-    dark, bright = np.sort(rng.uniform(0, 255, size=2))
-    bricks = rng.random() < 0.6
-    cell = np.array((1, 1)) if bricks else rng.integers(1, (5, 8))
-    shape = rng.integers(2, 8, size=2) if bricks else -(-np.array((height, width)) // cell)
-    shades = rng.random(shape)
-    if rng.random() < 0.6:
-        shades = (shades < (0.5 if bricks else rng.uniform(0.1, 0.9))).astype(np.float64)
-    blocks = shades.repeat(cell[0], axis=0).repeat(cell[1], axis=1)
-    pattern = np.tile(blocks, -(-np.array((height, width)) // blocks.shape))[:height, :width]
-    return (dark + (bright - dark) * pattern)[:, :, None]
 
 
 def _add_blob(image: NDArray[np.float32], free: NDArray[np.bool_], rng: np.random.Generator) -> None:

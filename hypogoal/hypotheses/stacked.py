@@ -25,7 +25,7 @@ class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
     The first convolution's filters stand side by side, later ones are grouped, dense layers are batched products.
-    Up to rounding the same as each ensemble's ``predict`` (a test asserts it). Own networks with layers of other kinds
+    Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Own networks with layers of other kinds
     are not joined: each ensemble predicts by itself.
 
     Args:
@@ -44,7 +44,6 @@ class StackedMembers:
         self.device = ensembles[0].thresholds.device
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
         self._one_view = all(isinstance(ensemble.view, FullView) for ensemble in ensembles)
-        self._thresholds = np.concatenate([ensemble.thresholds.cpu().numpy() for ensemble in ensembles])
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
         self.count = len(networks)
         self.joined = _can_be_joined(networks[0])
@@ -58,25 +57,19 @@ class StackedMembers:
         self._known = KnownWindows(partial(self._apply, 0, split[0]), *split[1:]) if split else None
         self._first = split[0] if split else 0  # of the layers behind the windows
 
-    def predict(
+    def log_odds(
         self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
     ) -> NDArray[np.float32]:
-        """P(sub-goal reached): float32 (N, G*K), ensemble by ensemble; arguments as of :meth:`Ensemble.predict`."""
+        """Of every member, float32 (N, G*K), ensemble by ensemble; as of :meth:`Ensemble.log_odds`."""
         if not self.joined:
-            return np.concatenate([ensemble.predict(observations, positions) for ensemble in self.ensembles], axis=1)
+            return np.concatenate([ensemble.log_odds(observations, positions) for ensemble in self.ensembles], axis=1)
         seen = self._see(observations, positions)
-        rows = []
+        rows = [np.empty((0, self.count), dtype=np.float32)]
         with torch.inference_mode():
             for start in range(0, len(seen), CHUNK):
-                rows.append(self._logits(seen[start : start + CHUNK]).softmax(-1)[..., 1].T.cpu().numpy())
-        return np.concatenate(rows) if rows else np.empty((0, self.count), dtype=np.float32)
-
-    def verdicts(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.bool_]:
-        """Whether each member says that its sub-goal is reached: bool (N, G*K)."""
-        says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self._thresholds
-        return says_yes
+                logits = self._logits(seen[start : start + CHUNK])
+                rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
+        return np.concatenate(rows)
 
     def _see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None) -> NDArray[np.uint8]:
         """What the ensembles see, uint8 (N, h, w, C), or (N, h, w, G*C) where each sees with its own localiser."""

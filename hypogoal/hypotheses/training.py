@@ -21,7 +21,7 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Pixels
-from hypogoal.hypotheses.thresholds import PAPER, thresholds
+from hypogoal.hypotheses.thresholds import NEED_UNLABELLED, PAPER, thresholds
 from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 
 OnStep = Callable[[int, dict[str, float]], None]
@@ -93,7 +93,7 @@ def fit(
     if len(unlabelled) == 0:
         if _diverse(config):
             raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
-        if config.threshold != PAPER:
+        if config.threshold in NEED_UNLABELLED:
             raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
@@ -124,7 +124,8 @@ def fit(
         networks[0],
         torch.device(device),
         ladders=ladders,
-        grey=config.augment == "grey",
+        grey=config.augment != "none",
+        context=config.augment == "grey-context",
         jitter=config.jitter,
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]

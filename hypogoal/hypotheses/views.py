@@ -118,6 +118,9 @@ def view_of(
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
+        if config.augment == "grey-context":
+            do = "Set view=agent-crop or augment=grey."
+            raise UserError("nobody says what is around the agent", f"augment={config.augment}", do)
         return FullView(shape)
     if agent_pixels is None:
         raise UserError("nobody says where in these observations the agent is", "view=agent-crop", "Set view=full.")

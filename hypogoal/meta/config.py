@@ -75,9 +75,9 @@ class PlayConfig(OptionConfig):
     )
     termination: str = setting(
         "learned",
-        "members' verdicts, or the true sub-goals (upper bound)",
-        source="ours: a control",
-        choices=("learned", "oracle"),
+        "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
+        "hardly ever gets there; dwell:N, N yes on end; or oracle, the true sub-goals (upper bound)",
+        source="paper: learned; the others ours",
     )
     save_visited: int = setting(
         0,

@@ -75,9 +75,11 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1) -> OptionLoop
     }
     domain = load_domain(artefact.config["domain"])
     loop = assemble(domain, source.path, source.config, TrainMetaConfig(**settings), seed)
-    parts = {"options": loop.learner, "meta": loop.chooser, "initiation": loop.initiation}
-    for name, part in parts.items():
-        if part is not None and (name == "options" or f"{name}.safetensors" in files):
+    learned = load_tensors(artefact.path / "options.safetensors")
+    loop.learner.load(learned)
+    loop.terminations.load(learned)
+    for name, part in (("meta", loop.chooser), ("initiation", loop.initiation)):
+        if part is not None and f"{name}.safetensors" in files:
             part.load(load_tensors(artefact.path / f"{name}.safetensors"))
     return loop
 

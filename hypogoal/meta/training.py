@@ -26,7 +26,7 @@ from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.termination import learned_terminations, oracle_terminations
+from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
 from hypogoal.options.visited import Visited
 
 LOG_INTERVAL = 2_000  # environment steps
@@ -61,7 +61,8 @@ def assemble(
     else:
         ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in sub_goals]
         alone = config.experience == "own" and not config.mask_reached
-        terminations = learned_terminations(engine, ensembles, running_only=alone)
+        terminations = learned_terminations(engine, ensembles, running_only=alone, rule=config.termination)
+        _check_rule(terminations, config)
         if (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
     gamma, rng = 1.0, rng_for(seed, "random-choice")
@@ -93,6 +94,16 @@ def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -
             known = ", ".join(domain.engine_settings) or "none"
             raise UserError(f"{domain.name} has no such setting of its world", f"world={name}", f"It has {known}.")
     return about["domain_config"] | domain.world(changed)
+
+
+def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
+    """Whether the options can be learned that end so."""
+    given = f"termination={config.termination}"
+    if not terminations.SHARED and config.experience != "own":
+        what = "whether an execution has reached its sub-goal cannot be said of states that others visit"
+        raise UserError(what, f"{given}, experience={config.experience}", "Give --set experience=own.")
+    if config.network == "planned" and type(terminations) is not Terminations:
+        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
 
 
 def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
@@ -191,7 +202,7 @@ def write_trained(
     loop.recorder.write(folder)
     if loop.visited:
         loop.visited.write(folder, domain, about, seed)
-    save_tensors(folder / "options.safetensors", loop.learner.state())
+    save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
     if loop.initiation:
         save_tensors(folder / "initiation.safetensors", loop.initiation.state())
     if chooser := loop.chooser.state():

@@ -33,6 +33,7 @@ class Transitions:
         options: the options that were running.
         terminated: the task is over.
         timed_out: the option's time was up without reaching its sub-goal.
+        reached: it reached its sub-goal.
         ended: the option stopped here for whatever reason.
     """
 
@@ -43,6 +44,7 @@ class Transitions:
     options: NDArray[np.int64]
     terminated: NDArray[np.bool_]
     timed_out: NDArray[np.bool_]
+    reached: NDArray[np.bool_]
     ended: NDArray[np.bool_]
 
 

@@ -1,9 +1,9 @@
 """Options at work: many environments, each running one option at a time (Spec A3, A4, D1, D6, E1, E5).
 
 The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. An option runs at least
-one step and its termination is tested on the state it arrives at; it ends when its own classifier says yes, when its
-time is up, or when the episode ends. Where every option begins at a start state (Spec D4), the end of an option is
-also that of its episode.
+one step and its termination is tested on the state it arrives at; it ends when its sub-goal is reached (see
+:mod:`.termination`), when its time is up, or when the episode ends. Where every option begins at a start state (Spec
+D4), the end of an option is also that of its episode.
 """
 
 from collections.abc import Mapping
@@ -91,13 +91,15 @@ class OptionLoop(Resumable):
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=explore)
         step = step_of(self.engine, actions)
-        reached = self.terminations.of_running(step.next_ids, option)
+        reached = self.terminations.reached(step.next_ids, option, self.age)
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
         timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
         ended = reached | timed_out | over
-        moved = Transitions(ids, actions, step.next_ids, step.rewards, option, step.terminated, timed_out, ended)
+        moved = Transitions(
+            ids, actions, step.next_ids, step.rewards, option, step.terminated, timed_out, reached, ended
+        )
         self.learner.observe(moved)
         if self.config.restart_options:
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
@@ -148,6 +150,7 @@ class OptionLoop(Resumable):
             out_of_time = (outcome.durations >= self.config.option_timeout) & ~outcome.terminated
             judged = done[outcome.reached | out_of_time]  # of those that the episode's end cut short nobody knows
             self.initiation.record(self.began[judged], self.option[judged], reached[judged])
+        self.terminations.finished(done, outcome.options, outcome.reached)
         self.recorder.finished(outcome)
         self.chooser.record(outcome)
         self.option[done] = NONE

@@ -25,7 +25,7 @@ from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import PaperQNetwork
 
 FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
+    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
     "place": np.int16,  # steps since the option began
     "execution": np.int32,
 }  # fmt: skip
@@ -67,7 +67,7 @@ class RecurrentLearner(Learner):
         count = len(self.actions)
         self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
-        self.running: list[list[tuple[int, int, int, bool, bool]]] = [[] for _ in range(self.engine.count)]
+        self.running: list[list[tuple[int, int, int, bool, bool, bool]]] = [[] for _ in range(self.engine.count)]
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
@@ -96,19 +96,18 @@ class RecurrentLearner(Learner):
     def observe(self, moved: Transitions) -> None:
         """Collect each execution; store it in its member's replay when it ends."""
         chosen = self._index[moved.actions]
-        columns = (moved.ids, chosen, moved.next_ids, moved.terminated, moved.timed_out)
+        columns = (moved.ids, chosen, moved.next_ids, moved.terminated, moved.timed_out, moved.reached)
         for e, row in enumerate(zip(*(values.tolist() for values in columns), strict=True)):
             self.running[e].append(row)
             if moved.ended[e]:
                 self._store(int(moved.options[e]), self.running[e])
                 self.running[e] = []
 
-    def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool]]) -> None:
+    def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool, bool]]) -> None:
         member = self.members[option]
-        s, a, following, end, timeout = (np.array(column) for column in zip(*steps, strict=True))
-        reached = self.terminations.of_running(following, np.full(len(following), option))
+        s, a, following, end, timeout, reached = (np.array(column) for column in zip(*steps, strict=True))
         member.replay.add(
-            s=s, a=a, next=following, terminal=reached | end, timeout=timeout,
+            s=s, a=a, next=following, end=end, timeout=timeout, reached=reached,
             place=np.arange(len(s)), execution=np.full(len(s), member.executions),
         )  # fmt: skip
         member.executions += 1
@@ -156,11 +155,12 @@ class RecurrentLearner(Learner):
             next_target = member.target(member.target.embed(images)[places])[0]
         here, after = self.tensor(place), self.tensor(place + 1)
         pick = torch.arange(len(indices), device=self.device)
-        terminal = data["terminal"][indices]
+        of = np.full(len(indices), option)
+        following = data["next"][indices].astype(np.int64)
+        reached = self.terminations.judged(of, states[rows, place], following, data["reached"][indices])[1]
+        terminal = reached | data["end"][indices]
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]
-        following = data["next"][indices].astype(np.int64)
-        reached = self.terminations.of_running(following, np.full(len(following), option))
         goal = double_q_targets(
             self.tensor(reached).float(),
             self.tensor(terminal),

@@ -63,7 +63,7 @@ def agents_of(run: Path) -> list[Artefact]:
     found = [
         artefact
         for artefact in find_artefacts(run, "meta")
-        if artefact.config["chooser"] != "random" and artefact.config["termination"] == "learned"
+        if artefact.config["chooser"] != "random" and artefact.config["termination"] != "oracle"
     ]
     if not found:
         needed = "Videos need a meta artefact with learned terminations: train-meta."

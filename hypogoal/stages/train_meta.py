@@ -51,7 +51,9 @@ def train_meta(
     loop = assemble(domain, source.path, source.config, config, seed, device)
     recorder = loop.recorder
     if trained:
-        loop.learner.load(load_tensors(trained.path / "options.safetensors"))
+        learned = load_tensors(trained.path / "options.safetensors")
+        loop.learner.load(learned)
+        loop.terminations.load(learned)
         if loop.initiation and "initiation.safetensors" in trained.manifest["files"]:
             loop.initiation.load(load_tensors(trained.path / "initiation.safetensors"))
         recorder.episodes[:] = read_episodes(trained.path / "episodes.csv")

@@ -79,7 +79,7 @@ class _Network:
         images = self.images(300)
         images[40:] = images[:260]  # repeated pictures take a way of their own
         many, few = ensemble.predict(images), np.concatenate([ensemble.predict(images[i : i + 1]) for i in range(40)])
-        stacked = StackedMembers([ensemble]).predict(images[:40])
+        stacked = 1 / (1 + np.exp(-StackedMembers([ensemble]).log_odds(images[:40])))
         for other, way in ((few, "one by one"), (stacked, "all members at once")):
             worst = float(np.abs(many[:40] - other).max())
             text = f"probabilities asked {way} differ by {worst:.2g}"

@@ -124,7 +124,10 @@ def test_verdicts_are_above_each_members_threshold() -> None:
     assert (ensemble.verdicts(observations).sum(axis=0) == 10).all()
     stacked = StackedMembers([ensemble, ensemble_of(1)])
     expected = np.concatenate([probabilities > chosen, ensemble_of(1).predict(observations) > 0.5], axis=1)
-    assert (stacked.verdicts(observations) == expected).mean() > 0.95  # up to rounding, at the median itself
+    taus = np.concatenate([ensemble.thresholds_as_log_odds(), ensemble_of(1).thresholds_as_log_odds()])
+    assert (taus[len(chosen) :] == 0).all()
+    above = stacked.log_odds(observations) > taus
+    assert (above == expected).mean() > 0.95  # up to rounding, at the median itself
 
 
 def test_ensembles_from_before_thresholds_and_views_still_load(tmp_path: Path) -> None:

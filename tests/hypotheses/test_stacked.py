@@ -25,11 +25,11 @@ def test_stacked_members_equal_each_ensemble(network: str, shape: tuple[int, ...
         for member in ensemble.members:
             member(torch.from_numpy(states[:16]).permute(0, 3, 1, 2).float() / 255)
         ensemble.eval()
-    plain = np.concatenate([ensemble.predict(states) for ensemble in ensembles], axis=1)
-    stacked = StackedMembers(ensembles).predict(states)
+    plain = np.concatenate([ensemble.log_odds(states) for ensemble in ensembles], axis=1)
+    stacked = StackedMembers(ensembles).log_odds(states)
     np.testing.assert_allclose(stacked, plain, atol=1e-5)
     assert np.ptp(plain) > 1e-3
-    assert StackedMembers(ensembles).predict(states[:0]).shape == (0, 4)
+    assert StackedMembers(ensembles).log_odds(states[:0]).shape == (0, 4)
 
 
 def grid_worlds(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -45,13 +45,13 @@ def test_known_windows_equal_whole_images() -> None:
     generator = torch.Generator().manual_seed(0)
     ensembles = [Ensemble("doorkey", (64, 64, 3), 2, generator).eval() for _ in range(2)]
     states = grid_worlds(60, rng)
-    plain = StackedMembers(ensembles).predict(states)
+    plain = StackedMembers(ensembles).log_odds(states)
     windows = StackedMembers(ensembles, repeats=True)
     assert windows._known is not None
     for most in (16_384, 500):
         windows._known.most = most
         for start in range(0, 60, 7):
-            found = windows.predict(states[start : start + 7])
+            found = windows.log_odds(states[start : start + 7])
             np.testing.assert_allclose(found, plain[start : start + 7], atol=1e-6)
             assert 0 < len(windows._known) <= most
     assert np.ptp(plain) > 1e-3
@@ -64,11 +64,11 @@ def test_a_window_s_numbers_do_not_depend_on_its_company() -> None:
     states = grid_worlds(40, rng)
     learned = StackedMembers(ensembles, repeats=True)
     with Uneven():
-        learned.predict(states[rng.permutation(40)])
+        learned.log_odds(states[rng.permutation(40)])
         for start in range(0, 40, 3):
             some = states[start : start + 3]
             fresh = StackedMembers(ensembles, repeats=True)
-            np.testing.assert_array_equal(fresh.predict(some), learned.predict(some))
+            np.testing.assert_array_equal(fresh.log_odds(some), learned.log_odds(some))
 
 
 def test_networks_without_windows_are_judged_whole() -> None:
@@ -111,7 +111,7 @@ def test_own_networks_of_other_layers_predict_the_same(name: str, monkeypatch: p
     states = np.random.default_rng(0).integers(0, 256, size=(10, 16, 16, 3), dtype=np.uint8)
     stacked = StackedMembers(ensembles, repeats=True)
     assert stacked.joined == (name == "joined after all")
-    plain = np.concatenate([ensemble.predict(states) for ensemble in ensembles], axis=1)
-    np.testing.assert_allclose(stacked.predict(states), plain, atol=1e-5)
-    assert stacked.verdicts(states).shape == (10, 4)
+    plain = np.concatenate([ensemble.log_odds(states) for ensemble in ensembles], axis=1)
+    np.testing.assert_allclose(stacked.log_odds(states), plain, atol=1e-5)
+    assert stacked.log_odds(states).shape == (10, 4)
     assert np.ptp(plain) > 1e-4

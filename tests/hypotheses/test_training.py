@@ -18,6 +18,7 @@ from hypogoal.core.seeding import seed_for, torch_generator
 from hypogoal.diversity import OBJECTIVES, Objective, dbat
 from hypogoal.hypotheses import batches, training
 from hypogoal.hypotheses.batches import TrainingStates
+from hypogoal.hypotheses.changes import grey_maps
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.thresholds import RULES, thresholds
@@ -346,7 +347,7 @@ def test_every_rule_is_a_setting() -> None:
 
 def test_grey_maps_rise() -> None:
     """Beyond the paper: 256 shades to 0..1, each brighter than the one before, every map another."""
-    maps = batches.grey_maps(50, np.random.default_rng(0))
+    maps = grey_maps(50, np.random.default_rng(0))
     assert maps.shape == (50, 256)
     assert maps.dtype == np.float32
     assert (np.diff(maps, axis=1) > 0).all()

@@ -41,7 +41,7 @@ def test_another_device_trains_the_same(case: str, monkeypatch: pytest.MonkeyPat
         far = train(device=FAR, checkpoints=Checkpoints(tmp_path / "far"))
         assert all(isinstance(weight, FarTensor) for weight in far.parameters())
         state = far.state()
-        np.testing.assert_allclose(far.predict(images), near.predict(images), atol=1e-6)  # in batches of other sizes
+        np.testing.assert_allclose(far.log_odds(images), near.log_odds(images), atol=1e-6)  # in batches of other sizes
         again = train(device=FAR, checkpoints=Checkpoints(tmp_path / "far"))  # finished: nothing is left to do
     for name, value in near.state().items():
         assert torch.equal(value, state[name]), name
@@ -61,14 +61,14 @@ def test_another_device_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
         Ensemble("doorkey", engine.observation_shape, 2, torch.Generator().manual_seed(g)).eval() for g in (0, 1)
     ]
     images = np.random.default_rng(0).integers(256, size=(300, *engine.observation_shape), dtype=np.uint8)
-    wanted = StackedMembers(ensembles).predict(engine.images(ids))
+    wanted = StackedMembers(ensembles).log_odds(engine.images(ids))
     running = learned_terminations(engine, ensembles, running_only=True).of_running(ids, options)
-    many = ensembles[0].predict(images)
+    many = ensembles[0].log_odds(images)
     with far_device(monkeypatch):
         for ensemble in ensembles:
             ensemble.to(FAR)
-        np.testing.assert_array_equal(StackedMembers(ensembles).predict(engine.images(ids)), wanted)
+        np.testing.assert_array_equal(StackedMembers(ensembles).log_odds(engine.images(ids)), wanted)
         np.testing.assert_array_equal(
             learned_terminations(engine, ensembles, running_only=True).of_running(ids, options), running
         )
-        np.testing.assert_allclose(ensembles[0].predict(images), many, rtol=1e-5)
+        np.testing.assert_allclose(ensembles[0].log_odds(images), many, rtol=1e-5)

@@ -83,9 +83,9 @@ def test_an_oracle_asks_for_positions() -> None:
     ensemble = ensemble_of(AgentView(SHAPE, 24, 32, RamLocaliser(observed_pixel)))
     assert ensemble.needs_positions
     with pytest.raises(UserError, match="localiser=ram: it needs the agent's positions: none"):
-        ensemble.predict(observations_of(2))
+        ensemble.log_odds(observations_of(2))
     with pytest.raises(UserError, match=r"int64 \(3, 3\)"):
-        ensemble.predict(observations_of(2), np.zeros((3, 3), dtype=np.int64))
+        ensemble.log_odds(observations_of(2), np.zeros((3, 3), dtype=np.int64))
 
 
 @pytest.mark.parametrize("localisers", ["ram", "learned"])
@@ -99,8 +99,8 @@ def test_stacked_members_of_several_views(localisers: str) -> None:
     observations, positions = observations_of(5), np.array([[1, 20 * x, 235] for x in range(1, 6)])
     stacked = StackedMembers(ensembles)
     assert stacked.needs_positions == (localisers == "ram")
-    expected = np.concatenate([ensemble.predict(observations, positions) for ensemble in ensembles], axis=1)
-    np.testing.assert_allclose(stacked.predict(observations, positions), expected, atol=1e-5)
+    expected = np.concatenate([ensemble.log_odds(observations, positions) for ensemble in ensembles], axis=1)
+    np.testing.assert_allclose(stacked.log_odds(observations, positions), expected, atol=1e-5)
     assert np.ptp(expected) > 1e-3
 
 

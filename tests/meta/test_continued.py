@@ -44,7 +44,9 @@ def walk(learner: Any, steps: int) -> None:
     for _ in range(steps):
         ids, actions = engine.ids.copy(), rng.integers(2, size=2)  # it only turns
         step = engine.step(actions)
-        learner.observe(Transitions(ids, actions, step.next_ids, step.rewards, options, nothing, nothing, ends))
+        learner.observe(
+            Transitions(ids, actions, step.next_ids, step.rewards, options, nothing, nothing, nothing, ends)
+        )
         learner.learn()
 
 
