@@ -80,6 +80,11 @@ _ALL = (
         ("ensemble", "options"),
     ),
     Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
+    Stage(
+        "audit",
+        ("audit", "{ensemble}:open-red-door/0", *_set("steps=800", "environments=8", "random_steps=80", *QUICK[:2])),
+        ("ensemble",),
+    ),
     Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),
     Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=1600", *QUICK[1:]))),
 )

@@ -171,6 +171,54 @@ def train_baseline(
 
 
 @app.command()
+def audit(
+    classifier: Annotated[
+        str, typer.Argument(help="ENSEMBLE:SUB_GOAL/MEMBER, or module:function: uint8 (N, H, W, C) -> probabilities.")
+    ],
+    out: Out,
+    domain: Annotated[
+        str | None, typer.Option(help="Where it is played: a name or module:object; a member's own where left out.")
+    ] = None,
+    sub_goal: Annotated[
+        str, typer.Option(help="Of the domain, whose truth counts; a member's own where left out.")
+    ] = "",
+    layout_seed: LayoutSeed = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train a policy against a success classifier: how often is it fooled, and where?
+
+    An option is learned that ends where the classifier says yes. Of its last
+    executions the truth is asked. The same again with a mend (--set mend).
+    """
+    from hypogoal.core import own_code
+    from hypogoal.core.errors import UserError
+    from hypogoal.evaluation.audit import lines_of, member_in
+    from hypogoal.settings import configuration
+    from hypogoal.stages.audit import audit as stage
+
+    member, given = member_in(classifier), {"layout_seed": layout_seed}
+    if domain is None and member is None:
+        raise UserError("where is this classifier to be played?", classifier, "Give --domain.")
+    with own_code.given(classifier, *([domain] if domain else [])):
+        world = domain or domain_of(member[0] if member else Path(), "ensemble")
+        config = configuration("audit", world, preset, set_, given)
+        report = stage(
+            classifier, config, out, domain=world, sub_goal=sub_goal, seed=seed, force=force, resume=resume,
+            quiet=quiet, device=device,
+        )  # fmt: skip
+    if not quiet:
+        for line in lines_of(report):
+            say(line)
+    give(out)
+
+
+@app.command()
 def evaluate(
     run: Annotated[Path, typer.Argument(help="A run: a folder with artefacts in it.")],
     out: Annotated[Path | None, typer.Option("--out", help="Default: RUN/evaluation.")] = None,

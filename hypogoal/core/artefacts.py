@@ -71,7 +71,7 @@ class Artefact:
 
     @property
     def kind(self) -> str:
-        """ensemble, options, meta, baseline, evaluation or report."""
+        """ensemble, options, meta, baseline, evaluation, report, comparison or audit."""
         return str(self.manifest["kind"])
 
     @property
@@ -240,7 +240,7 @@ def create_artefact(
 
     Args:
         out: the artefact's final folder.
-        kind: ensemble, options, meta, baseline, evaluation or report.
+        kind: see ``Artefact.kind``.
         config: the resolved configuration, a dataclass or a dict.
         seed: the seed that makes it.
         inputs: artefact folders or data files that were read.

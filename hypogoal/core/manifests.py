@@ -135,4 +135,5 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
         "evaluation": {"metrics.json", NUMBERS, "arrays.h5"},
         "report": {"index.html"},
         "comparison": {"index.html", "metrics.json"},
+        "audit": {LOG, "audit.json", "executions.csv"},
     }.get(kind)

@@ -52,7 +52,6 @@ LEARNING: Mapping[str, Any] = {
     "exploration": "persistent",
     "epsilon_steps": 10_000,
     "epsilon_final": 0.01,
-    "random_episodes": 0,
 }
 
 
@@ -151,6 +150,7 @@ class MontezumaDomain(Domain):
             },
             "train-options": {
                 **LEARNING,
+                "random_episodes": 0,
                 "max_episode_steps": MAX_STEPS,
                 "restart_options": True,
                 "mask_reached": False,
@@ -158,7 +158,8 @@ class MontezumaDomain(Domain):
                 "steps": 40_000,
                 "steps_for": "each",
             },
-            "train-meta": LEARNING,
+            "train-meta": {**LEARNING, "random_episodes": 0},
+            "audit": {**LEARNING, "max_episode_steps": MAX_STEPS},
         }
     )
 

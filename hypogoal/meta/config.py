@@ -45,8 +45,8 @@ class MetaConfig:
 
 
 @dataclass(frozen=True)
-class PlayConfig(OptionConfig):
-    """Where options are played, and for how long."""
+class WorldConfig(OptionConfig):
+    """Where options are played."""
 
     start: str = setting(
         "", "where episodes begin, in a domain that names several such places", source="paper, policy learning"
@@ -73,6 +73,12 @@ class PlayConfig(OptionConfig):
         "what is otherwise in the world than where the states were collected: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
+
+
+@dataclass(frozen=True)
+class PlayConfig(WorldConfig):
+    """When options end there, and what is kept of it."""
+
     termination: str = setting(
         "learned",
         "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
@@ -121,4 +127,35 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
         "the meta-policy, uniform choice among those offered, or a bandit that sees no state (thompson, exp3)",
         source="ours: controls; Thompson 1933; Auer et al. 2002",
         choices=("ppo", "random", "thompson", "exp3"),
+    )
+
+
+@dataclass(frozen=True)
+class AuditConfig(WorldConfig):
+    """How the policy is trained that is to fool a classifier, what is kept of it, and what is tried against it."""
+
+    option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
+    restart_options: bool = setting(True, "every execution begins a new episode, where the domain's engine can do that")
+    steps: int = setting(40_000, "environment steps of each policy, all environments together", unit="steps", low=1)
+    random_steps: int = setting(
+        4_000, "steps of random play, on whose states the classifier's accuracy is taken", unit="steps", low=1
+    )
+    executions: int = setting(100, "the last executions, which are counted", low=1, high=10_000)
+    threshold: float = setting(
+        0.0,
+        "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers",
+        low=0.0,
+        high=1.0,
+    )
+    mend: str = setting(
+        "threshold:0.95",
+        "tried with a policy learned anew: threshold:P; positives-median, of a member, the median of its own "
+        "probabilities on the labelled positives; or none",
+    )
+    alike: float = setting(
+        0.1,
+        "states are one kind of false positive where at most this share of their pixels differs, and the same other "
+        "sub-goals hold (of engines that know positions: the same cell of 8 by 8 instead)",
+        low=0.0,
+        high=1.0,
     )

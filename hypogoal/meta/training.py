@@ -14,7 +14,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
+from hypogoal.meta.config import AuditConfig, MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, WorldConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
@@ -50,12 +50,7 @@ def assemble(
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = _columns(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
-    arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
-    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
-    if config.cap:
-        if (shortest := engine.shortest_path()) is None:
-            raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
-        engine.max_steps = math.ceil(config.cap * shortest)
+    engine = make_engine(domain, about, config, options, seed)
     if oracle:
         terminations = oracle_terminations(engine, columns)
     else:
@@ -86,7 +81,18 @@ def assemble(
     )
 
 
-def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -> dict[str, Any]:
+def make_engine(domain: Domain, about: Mapping[str, Any], config: WorldConfig, options: int, seed: int) -> Engine:
+    """The environments of one layout; ``about`` says in which world, ``seed`` is of several start states."""
+    arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
+    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
+    if config.cap:
+        if (shortest := engine.shortest_path()) is None:
+            raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
+        engine.max_steps = math.ceil(config.cap * shortest)
+    return engine
+
+
+def played_world(domain: Domain, about: Mapping[str, Any], config: WorldConfig) -> dict[str, Any]:
     """The domain's settings that an ensemble's states were collected with, but for what ``config.world`` changes."""
     changed = parse_assignments(config.world)
     for name in changed:
@@ -118,7 +124,7 @@ def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 
-def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
+def start_arguments(domain: Domain, config: WorldConfig, options: int, seed: int) -> dict[str, Any]:
     """Spec D4: what an engine of a domain with named starts is told; nothing where there is one place only.
 
     Where the domain has no such start, or has several and none is given, it is a ``UserError``.
@@ -135,9 +141,10 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
 
-def frames_kept(config: PlayConfig, options: int) -> int:
-    """How many states back an engine must remember: what the replays hold, and the meta-policy's open decisions."""
+def frames_kept(config: WorldConfig, options: int) -> int:
+    """How many states back an engine must remember: what the replays hold, and open decisions or kept executions."""
     decisions = config.decisions if isinstance(config, MetaConfig) else 0
+    decisions = config.executions if isinstance(config, AuditConfig) else decisions
     asked = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
     return max(LEARNERS[config.network].reach(config, options), asked)
 

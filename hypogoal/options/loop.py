@@ -7,7 +7,7 @@ D4), the end of an option is also that of its episode.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class OptionLoop(Resumable):
     ``visited`` is shown every state (B7).
     """
 
-    CHANGING = (
+    CHANGING: ClassVar[tuple[str, ...]] = (
         *("terminations", "learner", "chooser", "recorder", "initiation", "visited"),
         *("option", "began", "age", "inside", "returns", "counted"),
     )
