@@ -82,7 +82,7 @@ _ALL = (
     Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
     Stage(
         "audit",
-        ("audit", "{ensemble}:open-red-door/0", *_set("steps=800", "environments=8", "random_steps=80", *QUICK[:2])),
+        ("audit", "{ensemble}:open-red-door/0", *_set("steps=800", "environments=8", *QUICK[:2])),
         ("ensemble",),
     ),
     Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),

@@ -20,14 +20,14 @@ from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import open_dataset
-from hypogoal.domains.base import Domain, Engine, step_of
+from hypogoal.domains.base import Engine, step_of
 from hypogoal.evaluation.pictures import episode_gif
 from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.hypotheses.thresholds import thresholds
 from hypogoal.hypotheses.views import positions_of
 from hypogoal.meta.config import AuditConfig
 from hypogoal.meta.episodes import Frame
-from hypogoal.meta.training import LEARNERS, make_engine
+from hypogoal.meta.training import LEARNERS
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.learner import Transitions
 from hypogoal.options.loop import OptionLoop
@@ -36,20 +36,17 @@ from hypogoal.options.termination import Terminations
 
 CHUNK = 256  # observations that own code is given at once
 CELL = 8  # of positions that count as one place
-NOTICED = 25  # grey levels by which a pixel differs noticeably
+ALIKE, NOTICED = 0.1, 25  # share of numbers in which pictures of one kind differ at the most, by so many grey levels
 FILMS = 4  # kinds that are shown
+RANDOM_STEPS = 4_000  # of random play
 COLUMNS = ("mended", "step", "steps", "said_yes", "holds", "yes_at_start", "terminated", "kind")
 
 
 @dataclass(frozen=True)
 class Classifier:
-    """What is audited.
+    """What is audited: ``predict`` is of an engine and state ids (n,), probabilities (n,); yes is above ``threshold``.
 
-    Attributes:
-        name: in films.
-        predict: an engine and state ids (n,) -> probabilities (n,).
-        threshold: above it is a yes.
-        sub_goal, source, positives_median: of an ensemble's member; the last is a threshold, see the rule of that name.
+    A member's: the sub-goal it was trained for, its ensemble, and the threshold that the rule of that name sets.
     """
 
     name: str
@@ -158,16 +155,8 @@ class Adversary(OptionLoop):
     CHANGING = (*OptionLoop.CHANGING, "paths", "executions")
 
     def __init__(
-        self,
-        domain: Domain,
-        about: Mapping[str, Any],
-        config: AuditConfig,
-        classifier: Classifier,
-        threshold: float,
-        seed: int,
-        device: str,
+        self, engine: Engine, classifier: Classifier, threshold: float, config: AuditConfig, seed: int, device: str
     ):
-        engine = make_engine(domain, about, config, 1, seed)
         edge = log_odds(threshold)[None]
         terminations = Terminations(lambda ids: log_odds(classifier.predict(engine, ids))[:, None], 1, thresholds=edge)
         learner = LEARNERS[config.network](engine, terminations, config, seed, device)
@@ -193,10 +182,10 @@ class Adversary(OptionLoop):
         super().restore(snapshot)
         self.executions = deque((Execution(*row) for row in self.executions), self.executions.maxlen)
 
-    def random_play(self, column: int, steps: int, rng: np.random.Generator) -> dict[str, Any]:
-        """How often the classifier is right on the states that random play meets in so many steps, each once."""
+    def random_play(self, column: int, rng: np.random.Generator) -> dict[str, Any]:
+        """How often the classifier is right on the states that random play meets, each once."""
         engine, met = self.engine, [self.engine.ids.copy()]
-        for _ in range(-(-steps // engine.count)):
+        for _ in range(-(-RANDOM_STEPS // engine.count)):
             met.append(step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids)
         ids = np.unique(np.concatenate(met))
         ids = ids[engine.remembers(ids)]
@@ -211,7 +200,7 @@ class Adversary(OptionLoop):
 
 
 def findings(
-    loop: Adversary, domain: Domain, column: int, config: AuditConfig, classifier: Classifier, prefix: str
+    loop: Adversary, sub_goals: Sequence[str], column: int, classifier: str, prefix: str
 ) -> tuple[dict[str, Any], list[tuple[int, ...]], dict[str, bytes]]:
     """How the last executions ended, held against sub-goal number ``column``.
 
@@ -222,18 +211,18 @@ def findings(
     engine = loop.engine
     rows = [row for row in loop.executions if engine.remembers(np.array(row.path)).all()]
     fooled = [row for row in rows if row.said_yes and not row.holds[column]]
-    kind_of = kinds_of(engine, fooled, config.alike)
+    kind_of = kinds_of(engine, fooled)
     kinds, films = [], {}
     for number in range(max(kind_of, default=-1) + 1):
         alike = [row for row, kind in zip(fooled, kind_of, strict=True) if kind == number]
         shown = min(alike, key=lambda row: len(row.path))
-        holds = [name for name, there in zip(domain.sub_goals, shown.holds, strict=True) if there]
+        holds = [name for name, there in zip(sub_goals, shown.holds, strict=True) if there]
         at = engine.positions(np.array(shown.path[-1:]))[0].tolist() if engine.position_names else []
         position = dict(zip(engine.position_names, at, strict=True))
         film = f"{prefix}-{number + 1}.gif" if number < FILMS else None
         kinds.append({"executions": len(alike), "holds": holds, "position": position, "film": film})
         if film:
-            films[film] = _film(loop, shown, classifier.name, domain.sub_goals[column])
+            films[film] = _film(loop, shown, classifier, sub_goals[column])
     said_yes, told = sum(row.said_yes for row in rows), iter(kind_of)
     numbers = {
         "steps": loop.recorder.steps,
@@ -252,8 +241,11 @@ def findings(
     return numbers, table, films
 
 
-def kinds_of(engine: Engine, fooled: Sequence[Execution], alike: float) -> list[int]:
-    """Of which kind each false yes is, numbered from 0, the most frequent first (see :class:`AuditConfig`)."""
+def kinds_of(engine: Engine, fooled: Sequence[Execution], alike: float = ALIKE) -> list[int]:
+    """Of which kind each false yes is, numbered from 0, the most frequent first.
+
+    Of one kind the same sub-goals hold, and the pictures are alike; of engines that know positions, the cell is one.
+    """
     ids, placed = np.array([row.path[-1] for row in fooled], dtype=np.int64), bool(engine.position_names)
     shown = engine.positions(ids) // CELL if placed else engine.images(ids).astype(np.int16)
     least, alike = (1, 0.0) if placed else (NOTICED, alike)

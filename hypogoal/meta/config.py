@@ -137,25 +137,12 @@ class AuditConfig(WorldConfig):
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, where the domain's engine can do that")
     steps: int = setting(40_000, "environment steps of each policy, all environments together", unit="steps", low=1)
-    random_steps: int = setting(
-        4_000, "steps of random play, on whose states the classifier's accuracy is taken", unit="steps", low=1
-    )
     executions: int = setting(100, "the last executions, which are counted", low=1, high=10_000)
     threshold: float = setting(
-        0.0,
-        "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers",
-        low=0.0,
-        high=1.0,
+        0.0, "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers", low=0.0, high=1
     )
     mend: str = setting(
         "threshold:0.95",
         "tried with a policy learned anew: threshold:P; positives-median, of a member, the median of its own "
         "probabilities on the labelled positives; or none",
-    )
-    alike: float = setting(
-        0.1,
-        "states are one kind of false positive where at most this share of their pixels differs, and the same other "
-        "sub-goals hold (of engines that know positions: the same cell of 8 by 8 instead)",
-        low=0.0,
-        high=1.0,
     )

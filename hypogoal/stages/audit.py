@@ -16,7 +16,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.evaluation.audit import COLUMNS, Adversary, findings, load_classifier, mended_threshold
 from hypogoal.meta.config import AuditConfig
-from hypogoal.meta.training import train
+from hypogoal.meta.training import make_engine, train
 from hypogoal.needs import play_needs
 
 
@@ -60,18 +60,18 @@ def audit(
     with create_artefact(
         out, kind="audit", config=settings, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:
-        chance = Adversary(world, about, config, found, threshold, seed, device)
-        report["random_play"] = chance.random_play(column, config.random_steps, rng_for(seed, "random-play"))
+        chance = Adversary(make_engine(world, about, config, 1, seed), found, threshold, config, seed, device)
+        report["random_play"] = chance.random_play(column, rng_for(seed, "random-play"))
         rows: list[tuple[int, ...]] = []
         for number, (name, edge) in enumerate((("before", threshold), ("mended", higher))):
             report[name] = None
             if edge is None:
                 continue
-            loop = Adversary(world, about, config, found, edge, seed, device)
+            loop = Adversary(make_engine(world, about, config, 1, seed), found, edge, config, seed, device)
             log = MetricsLog(folder / f"metrics{'-mended' * number}.jsonl")
             with Progress(f"audit, {name}", total=config.steps, quiet=quiet) as progress:
                 train(loop, config.steps, log, progress, checkpoints_of(folder, name))
-            numbers, table, films = findings(loop, world, column, config, found, name)
+            numbers, table, films = findings(loop, world.sub_goals, column, found.name, name)
             report[name] = {"threshold": edge, **numbers}
             rows += [(number, *row) for row in table]
             for film, gif in films.items():

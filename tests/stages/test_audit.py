@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from corridor import Corridor
+from corridor import Corridor, LongCorridor
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -18,7 +18,7 @@ from hypogoal.core.own_code import OF_FILE
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
-from hypogoal.evaluation.audit import Execution, kinds_of, lines_of
+from hypogoal.evaluation.audit import CELL, Execution, kinds_of, lines_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.stages.collect import collect
@@ -79,13 +79,15 @@ def setting(*pairs: str) -> list[str]:
 def corridor(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The words for a small audit in the corridor."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
-    few = setting("steps=1500", "environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10")
+    few = setting(
+        "steps=1500", "environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10", "option_batch=24"
+    )
     return ["--domain", "own_domain:DOMAIN", "--sub-goal", "left-end", *few]
 
 
 def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Path) -> None:
     """Spec H5: on the shortest ways, where all can be said: the planted kind, its film, and that the mend ends it."""
-    shortest = setting("network=planned", "steps=320", "executions=20", "random_steps=160")
+    shortest = setting("network=planned", "steps=320", "executions=20")
     where = ["--domain", "doorkey", "--sub-goal", "collect-red-key", "--layout-seed", BLUE_FIRST, *shortest]
     report, rows = audited(tmp_path / "audit", "takes_blue_for_red", *where)
     before, mended = report["before"], report["mended"]
@@ -149,7 +151,7 @@ def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_member_is_audited_in_its_domain(ensemble: Path, tmp_path: Path) -> None:
     """Spec H5: its sub-goal, its domain, its threshold; the mend of the labelled positives."""
-    few = setting("steps=640", "warm_up=100", "random_steps=160")
+    few = setting("steps=640", "warm_up=100")
     source = open_artefact(ensemble)
     members = read_ensemble(ensemble, source.config, "open-red-door")
     before = float(members.thresholds[1])
@@ -175,6 +177,22 @@ def test_kinds_of_false_yes() -> None:
     assert kinds_of(engine, fooled(1, 3, 3), 0.0) == [1, 0, 0]
     assert kinds_of(engine, fooled(1, 3, 3, 0), 1.0) == [0, 0, 0, 1]
     assert kinds_of(engine, [], 0.1) == []
+
+
+class Wide(LongCorridor):
+    """A cell of the corridor is as wide as a place."""
+
+    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        return super().positions(ids) * CELL
+
+
+def test_kinds_are_places_where_positions_are_known() -> None:
+    """Whatever else the pictures show: states 0 and 2 are in the same cell, 1 in another."""
+    engine = Wide(1)
+    for action in (3, 2):  # right, and back
+        engine.step(np.array([action]))
+    rows = [Execution(0, [0, state], True, [False, False], False, False) for state in (1, 0, 2)]
+    assert kinds_of(engine, rows, 1.0) == [1, 0, 0]
 
 
 @pytest.mark.parametrize(
