@@ -34,16 +34,35 @@ from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
 
-METHODS: dict[str, dict[str, Any]] = {
-    "dbat": {"diversity": "dbat"},
-    "none": {"diversity": "none"},
-    "cnn": {"members": 1, "diversity": "none"},
-    "oracle": {},  # ends at the true base, whatever the ensemble
+Settings = dict[str, Any]
+# What looks at the window around the agent, taught in room 1, and is made to hold in rooms nobody labelled.
+WINDOW: Settings = {
+    "network": "montezuma-crop",
+    "view": "agent-crop",
+    "batch_kind": "per-ladder",
+    "augment": "grey-context",
+    "jitter": 3,
+    "threshold": "positives-median",
+    "steps": 600,
 }
-TITLES = {"dbat": "D-BAT", "none": "no diversity", "cnn": "single CNN", "oracle": "true sub-goal"}
+HOLDS: Settings = {"termination": "patience:10000"}
+METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of the ensemble and of its options
+    "dbat": ("D-BAT", {"diversity": "dbat"}, {}),
+    "none": ("no diversity", {"diversity": "none"}, {}),
+    "cnn": ("single CNN", {"members": 1, "diversity": "none"}, {}),
+    "holds-dbat": ("D-BAT", WINDOW, HOLDS),
+    "holds-none": ("no diversity", WINDOW | {"diversity": "none"}, HOLDS),
+    "holds-ram": ("true position", WINDOW | {"localiser": "ram"}, HOLDS),
+    "no-context": ("without other surroundings", WINDOW | {"augment": "grey"}, HOLDS),
+    "no-median": ("threshold .5", WINDOW | {"threshold": "0.5"}, HOLDS),
+    "no-patience": ("without patience", WINDOW, {}),
+    "oracle": ("true sub-goal", {}, {"termination": "oracle"}),  # whatever the ensemble
+}
+ENSEMBLES = {"no-patience": "holds-dbat", "oracle": "dbat"}  # of another method
 MEMBERS, STEPS = 3, 40_000
-# The paper's Figure 4 has twelve; the tops of 4-10, 11-19 and 13-21 are bases themselves.
-LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13")
+# The paper's Figure 4 has twelve; the tops of the last three are bases themselves.
+LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13", "4-10", "11-19", "13-21")
+RUN_ON = ("0-4", "5-11", "7-13")  # their bases are tops of the next ladder
 KEYS = ("groups", "method", "seed", "ladder", "step", "member")
 NUMBERS = ("distance", "reached_base", "inside_at_start", "timed_out", "died", "duration")
 COLUMNS = (*KEYS, "ensemble_steps", *NUMBERS)
@@ -61,17 +80,17 @@ def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
     """Where the ensemble is; trained if it is not there."""
     out = work / f"{method}-{groups}-{seed}"
     if not (out / "manifest.json").exists():
-        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, **METHODS[method], "workers": 1}
-        config = TrainEnsembleConfig(**settings | {"steps": length(groups, method)})
+        own = METHODS[method][1]
+        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1, **own}
+        config = TrainEnsembleConfig(**{"steps": own.get("steps") or length(groups, method), **settings})
         train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
     return out
 
 
 def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> list[Row]:
     """Learn the options of one ensemble on one ladder; of each member the last executions' numbers."""
-    ensemble = ensemble_of(work, groups, "dbat" if method == "oracle" else method, seed)
-    ending = "oracle" if method == "oracle" else "members"
-    settings = {**DOMAIN.defaults["train-options"], "start": ladder, "steps": STEPS, "termination": ending}
+    ensemble = ensemble_of(work, groups, ENSEMBLES.get(method, method), seed)
+    settings = {**DOMAIN.defaults["train-options"], "start": ladder, "steps": STEPS, **METHODS[method][2]}
     out = work / f"options-{groups}-{method}-{seed}-{ladder}"
     train_options(ensemble, TrainOptionsConfig(**settings), out, seed=seed, force=True, quiet=True)
     executions, members = read_executions(out / "executions.csv"), open_artefact(out, "options").config["members"]
@@ -114,7 +133,7 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
     yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member, mean over seeds."
     yield ""
     yield from table(
-        ["ladder", "seeds", *(TITLES[method] for method in methods)],
+        ["ladder", "seeds", *(METHODS[method][0] for method in methods)],
         (
             [
                 ladder,
@@ -137,7 +156,7 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
         ],
         (
             [
-                TITLES[method],
+                METHODS[method][0],
                 interval(over(found, method, whole, seeds, np.min), 1),
                 interval(over(found, method, whole, seeds, np.mean), 1),
                 interval(over(reached, method, whole, seeds, np.max), 2),
@@ -179,7 +198,8 @@ def main() -> None:
         "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
     )
     parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
-    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--methods", default="dbat,none,cnn,oracle", help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--ladders", default=",".join(LADDERS[:9]), help=f"of {', '.join(LADDERS)}")
     parser.add_argument("--seeds", type=parse_integers, default=(10,), help="10-12 or 10,12")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
@@ -191,7 +211,7 @@ def main() -> None:
     for groups in arguments.groups:
         if not (work / f"groups-{groups}.h5").exists():
             collect(DOMAIN, MontezumaConfig(groups=groups, workers=1), work / f"groups-{groups}.h5", quiet=True)
-    trained = {"dbat" if method == "oracle" else method for method in methods}
+    trained = {ENSEMBLES.get(method, method) for method in methods}
     ensembles = [
         partial(ensemble_of, work, groups, method, seed)
         for groups in arguments.groups
@@ -203,7 +223,7 @@ def main() -> None:
         (str(groups), method, str(seed), ladder): partial(run_cell, work, groups, method, seed, ladder)
         for groups in arguments.groups
         for seed in arguments.seeds
-        for ladder in LADDERS
+        for ladder in arguments.ladders.split(",")
         for method in methods
     }
     run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, lambda _: (STEPS,), arguments.workers)
