@@ -92,6 +92,10 @@ def train_ensemble(
 def train_options(
     ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
     out: Out,
+    options: Annotated[
+        Path | None,
+        typer.Option(help="Go on with these options of the same ensemble, from another start or elsewhere."),
+    ] = None,
     layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
@@ -108,7 +112,10 @@ def train_options(
     given = {"layout_seed": layout_seed}
     config = configuration("train-options", domain_of(ensemble, "ensemble"), preset, set_, given)
     print_outcome(
-        stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
+        stage(
+            ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
+        ),
+        quiet,
     )
     give(out)
 

@@ -236,6 +236,7 @@ class Domain(ABC):
             that name is kept until all are there.
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
+        many_starts: it takes some of them, too, comma-separated.
         measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has
             :meth:`agent_pixels`.
     """
@@ -249,6 +250,7 @@ class Domain(ABC):
     resumes = False
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
+    many_starts: bool = False
     measures = pictures = sees_agent = False
 
     @property

@@ -133,6 +133,7 @@ class MontezumaDomain(Domain):
     config_class = MontezumaConfig
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(ladder.name for ladder in LADDERS)
+    many_starts = True
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
     distance = staticmethod(distance_to_base)

@@ -6,6 +6,8 @@ frames of older ones are forgotten.
 
 import json
 from collections.abc import Mapping
+from itertools import chain
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -37,10 +39,10 @@ class MontezumaEngine(TurnEngine):
     newest ``memory`` of these can be had, positions, labels and who is alive of all.
 
     Args:
-        start: the ladder, see ``montezuma_ladders.LADDERS``.
+        start: the ladder, see ``montezuma_ladders.LADDERS``; or some, comma-separated.
         count: environments (E).
         max_steps: agent steps after which an episode is truncated.
-        start_states: S; see ``montezuma_env.make_starts``.
+        start_states: of each ladder; of one, S. See ``montezuma_env.make_starts``.
         along: the share of episodes that begin somewhere on the way down instead of at the top.
         end_at_death: an episode terminates when the agent begins to die; False, when the game is over.
         memory: states whose images are kept; 7 kB each, taken when first needed.
@@ -75,7 +77,12 @@ class MontezumaEngine(TurnEngine):
             [start, count, max_steps, start_states, along, end_at_death, memory, seed]
         ).encode()
         self._emulators = [Emulator(seed + number) for number in range(count)]
-        self.starts: list[Start] = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
+        of_ladders = [
+            make_starts(self._emulators[0], ladder_named(name), start_states, seed, along=along)
+            for name in start.split(",")
+        ]
+        # draw_start counts on those at the top to come first.
+        self.starts: list[Start] = sorted(chain(*of_ladders), key=attrgetter("on_the_way"))
         self._rng = rng_for(seed, "start-of-episode")
         self._seen: list[Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))

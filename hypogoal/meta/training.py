@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hypogoal.core.artefacts import Artefact, sha256_of
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
@@ -28,6 +29,7 @@ from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
 from hypogoal.options.visited import Visited
+from hypogoal.options.windows import AgentWindows, localiser_of
 
 LOG_INTERVAL = 2_000  # environment steps
 LEARNERS: dict[str, type[Learner]] = {"light": LightLearner, "paper": RecurrentLearner, "planned": PlannedLearner}
@@ -65,6 +67,12 @@ def assemble(
         _check_rule(terminations, config)
         if (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
+    seen = None
+    if config.policy_view == "agent-crop":
+        if config.network != "light":
+            given = f"policy_view=agent-crop, network={config.network}"
+            raise UserError("only the light network sees windows", given, "Give --set network=light.")
+        seen = AgentWindows(engine, localiser_of(read_ensemble(ensemble, dict(about), sub_goals[0])))
     gamma, rng = 1.0, rng_for(seed, "random-choice")
     chooser: Chooser = EvenChooser(options, rng) if config.chooser == "even" else RandomChooser(rng)
     if isinstance(config, TrainMetaConfig):
@@ -76,7 +84,7 @@ def assemble(
     return OptionLoop(
         engine,
         terminations,
-        LEARNERS[config.network](engine, terminations, config, seed, device),
+        LEARNERS[config.network](engine, terminations, config, seed, device, seen),
         chooser,
         Recorder(options, engine),
         config,
@@ -128,9 +136,10 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
             given = f"start={config.start}" if config.start else f"along={config.along}"
             raise UserError(f"{domain.name} has no named starts", given, "Leave it out.")
         return {}
-    if config.start not in domain.starts:
-        what = "unknown start" if config.start else "where are episodes to begin?"
-        raise UserError(what, config.start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
+    for start in config.start.split(",") if domain.many_starts else [config.start]:
+        if start not in domain.starts:
+            what = "unknown start" if start else "where are episodes to begin?"
+            raise UserError(what, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
@@ -179,6 +188,21 @@ def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, che
                 )
                 progress.update(min(recorder.steps - begin, steps), **shown)
             checkpoints.offer(state)
+
+
+def check_fit(
+    trained: Artefact, source: Artefact, config: TrainOptionsConfig | TrainMetaConfig, fixed: Sequence[str]
+) -> None:
+    """Whether options can be trained further: they are of this ensemble (``source``), and alike in these settings."""
+    made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
+    if sha256_of(source.path / "manifest.json") not in made_from:
+        what = "these options were trained with another ensemble"
+        raise UserError(what, trained.path, f"Train them from {source.path}.")
+    before = as_dict(type(config)()) | trained.config  # of settings from before there were any, the default
+    for key in fixed:
+        if before[key] != getattr(config, key):
+            what = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
+            raise UserError(what, trained.path, f"Give --set {key}={before[key]}.")
 
 
 def description(
