@@ -236,8 +236,8 @@ class Domain(ABC):
             that name is kept until all are there.
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
-        measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has
-            :meth:`agent_pixels`.
+        measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
+        pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
     name: str
@@ -250,6 +250,7 @@ class Domain(ABC):
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
     measures = pictures = sees_agent = False
+    near = 0
 
     @property
     @abstractmethod

@@ -135,6 +135,7 @@ class MontezumaDomain(Domain):
     starts = tuple(ladder.name for ladder in LADDERS)
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
+    near = 12
     distance = staticmethod(distance_to_base)
     pixel = staticmethod(pixel)
     agent_pixels = staticmethod(observed_pixel)

@@ -2,9 +2,12 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
@@ -73,7 +76,7 @@ def assemble(
             chooser = MetaPolicy(engine, options, config, seed, device)
         elif config.chooser in BANDITS:
             chooser = BANDITS[config.chooser](options, engine.count, rng)
-    return OptionLoop(
+    loop = OptionLoop(
         engine,
         terminations,
         LEARNERS[config.network](engine, terminations, config, seed, device),
@@ -84,6 +87,30 @@ def assemble(
         initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
+    if near := nearness(domain, engine, about, config):
+        near(engine.ids, np.zeros_like(engine.ids))  # own labels that fail are told now, not when all is learned
+    return loop
+
+
+def nearness(
+    domain: Domain, engine: Engine, about: Mapping[str, Any], config: PlayConfig
+) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None:
+    """Spec H5: of states (n,) and options (n,) whether these options' true sub-goals hold there, or nearly.
+
+    None where the domain has not all of the ensemble's sub-goals, or options end where they are true.
+    """
+    sub_goals = about["sub_goals"]
+    if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
+        return None
+    columns = np.repeat(_columns(domain, sub_goals), about["members"])
+
+    def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
+        told = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
+        if not (domain.measures and engine.position_names):
+            return told
+        return told | (domain.distance(engine.positions(ids)) <= domain.near)
+
+    return near
 
 
 def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -> dict[str, Any]:
@@ -200,6 +227,8 @@ def write_trained(
 ) -> None:
     """Into an artefact's folder: what was learned and what happened meanwhile."""
     loop.recorder.write(folder)
+    if near := nearness(domain, loop.engine, about, config):
+        loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
         loop.visited.write(folder, domain, about, seed)
     save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
