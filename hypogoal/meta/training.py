@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
@@ -88,7 +89,7 @@ def assemble(
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
     if near := nearness(domain, engine, about, config):
-        near(engine.ids, np.zeros_like(engine.ids))  # own labels that fail are told now, not when all is learned
+        near(np.repeat(engine.ids[:1], options), np.arange(options))  # labels that fail do so before all is learned
     return loop
 
 
@@ -105,7 +106,8 @@ def nearness(
     columns = np.repeat(_columns(domain, sub_goals), about["members"])
 
     def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
-        told = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
+        with UsersCode("the engine's labels", engine, "labels"):
+            told = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
         if not (domain.measures and engine.position_names):
             return told
         return told | (domain.distance(engine.positions(ids)) <= domain.near)
