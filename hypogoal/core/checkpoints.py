@@ -35,7 +35,7 @@ FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART, SUM_PART = "json-2", "crc32"  # the number rises with what stages keep
+JSON_PART, SUM_PART = "json-3", "crc32"  # the number rises with what stages keep
 ARRAY, TENSOR = "$array", "$tensor"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -120,7 +120,8 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
 def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
     """The files that an artefact must have by its kind and settings, besides its manifest; None of an unknown kind.
 
-    What it may have and its settings do not say (figures, videos, ``executions.csv``) only its manifest knows.
+    What it may have and its settings do not say (figures, videos, ``executions.csv``, ``exploits.csv``) only its
+    manifest knows.
     """
     if kind in ("options", "meta"):
         played = {LOG, EPISODES, LAYOUT, OPTIONS, "choices.csv", "terminations.h5"}

@@ -237,8 +237,8 @@ class Domain(ABC):
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
         many_starts: it takes some of them, too, comma-separated.
-        measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has
-            :meth:`agent_pixels`.
+        measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
+        pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
     name: str
@@ -252,6 +252,7 @@ class Domain(ABC):
     starts: tuple[str, ...] = ()
     many_starts: bool = False
     measures = pictures = sees_agent = False
+    near = 0
 
     @property
     @abstractmethod

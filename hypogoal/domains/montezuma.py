@@ -136,6 +136,7 @@ class MontezumaDomain(Domain):
     many_starts = True
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
+    near = 12
     distance = staticmethod(distance_to_base)
     pixel = staticmethod(pixel)
     agent_pixels = staticmethod(observed_pixel)

@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from hypogoal.evaluation import choosing, curves, distance, explorer, hypotheses, ranking, rooms, saliency, selection
+from hypogoal.evaluation import (
+    choosing,
+    curves,
+    distance,
+    exploits,
+    explorer,
+    hypotheses,
+    ranking,
+    rooms,
+    saliency,
+    selection,
+)
 from hypogoal.evaluation.numbers import QUANTITIES, Metrics
 from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
 from hypogoal.evaluation.provenance import domains_of, provenance_section
@@ -19,6 +30,7 @@ QUESTIONS: list[Question] = [
     curves.QUESTION,
     rooms.QUESTION,
     distance.QUESTION,
+    exploits.QUESTION,
     hypotheses.QUESTION,
     ranking.QUESTION,
     explorer.QUESTION,

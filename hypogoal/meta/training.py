@@ -2,14 +2,18 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, sha256_of
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
@@ -81,7 +85,7 @@ def assemble(
             chooser = MetaPolicy(engine, options, config, seed, device)
         elif config.chooser in BANDITS:
             chooser = BANDITS[config.chooser](options, engine.count, rng)
-    return OptionLoop(
+    loop = OptionLoop(
         engine,
         terminations,
         LEARNERS[config.network](engine, terminations, config, seed, device, seen),
@@ -92,6 +96,31 @@ def assemble(
         initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
+    if near := nearness(domain, engine, about, config):
+        near(np.repeat(engine.ids[:1], options), np.arange(options))  # labels that fail do so before all is learned
+    return loop
+
+
+def nearness(
+    domain: Domain, engine: Engine, about: Mapping[str, Any], config: PlayConfig
+) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None:
+    """Spec H5: of states (n,) and options (n,) whether these options' true sub-goals hold there, or nearly.
+
+    None where the domain has not all of the ensemble's sub-goals, or options end where they are true.
+    """
+    sub_goals = about["sub_goals"]
+    if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
+        return None
+    columns = np.repeat(_columns(domain, sub_goals), about["members"])
+
+    def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
+        with UsersCode("the engine's labels", engine, "labels"):
+            told = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
+        if not (domain.measures and engine.position_names):
+            return told
+        return told | (domain.distance(engine.positions(ids)) <= domain.near)
+
+    return near
 
 
 def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -> dict[str, Any]:
@@ -224,6 +253,8 @@ def write_trained(
 ) -> None:
     """Into an artefact's folder: what was learned and what happened meanwhile."""
     loop.recorder.write(folder)
+    if near := nearness(domain, loop.engine, about, config):
+        loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
         loop.visited.write(folder, domain, about, seed)
     save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())

@@ -129,7 +129,7 @@ def test_options_are_learned_that_were_out_of_reach() -> None:
     assert np.mean([row.reached for row in last]) > 0.9
     assert loop.terminations.thresholds.tolist() == [2.25, 3.0]
     ends = {
-        option: {row.state for row in list(rows)[-20:] if row.reached}
+        option: {row.states[-1] for row in list(rows)[-20:] if row.reached}
         for option, rows in enumerate(loop.recorder.executions)
     }
     assert ends == {0: {0}, 1: {5}}

@@ -52,6 +52,7 @@ def test_an_agent_of_own_labels_is_evaluated(run: Path) -> None:
     assert goal["sub_goal"] == "at-the-door" and [member["match"] for member in goal["members"]] == [None, None]
     assert sum(member["chosen"] for member in goal["members"]) > 0
     assert "no truth of at-the-door in its domain, to match members with" in metrics["missing"]
+    assert not (run / "meta" / "exploits.csv").exists() and metrics["exploits"]["over_runs"] == []
     assert main(["report", str(run)]) == 0
     assert "no truth of at-the-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
 
