@@ -4,8 +4,6 @@ Its environments are registered with Gymnasium. The heavy parts (torch, the envi
 first use, so that ``import hypogoal`` and the command line's ``--help`` stay fast.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 import gymnasium

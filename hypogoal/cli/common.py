@@ -1,7 +1,5 @@
 """What all commands share: the application, its options, and how outcomes are printed."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterable, Iterator, Mapping

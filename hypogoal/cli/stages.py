@@ -1,7 +1,5 @@
 """The commands that make something: one stage each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

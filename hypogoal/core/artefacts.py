@@ -4,8 +4,6 @@ What has a manifest is complete (Spec A8). The manifest says what made the artef
 resolved configuration, the seed, the sha256 of every file and of every input's manifest, package versions.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -15,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import (
@@ -84,7 +82,7 @@ class Artefact:
         """The seed that made it."""
         return int(self.manifest["seed"])
 
-    def whole(self) -> Artefact:
+    def whole(self) -> Self:
         """This artefact, asked for before a stage starts (some ms per MB): its files are as the manifest says, or
         UserError.
         """

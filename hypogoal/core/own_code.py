@@ -10,8 +10,6 @@ process that runs it is told so (:func:`environment_of_children`), and in it not
 Whatever such code does, raises or gives back ends as one line that says where it is: :class:`UsersCode`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import inspect
@@ -26,7 +24,7 @@ from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Self
 
 from hypogoal.core.errors import Complete, NumericalError, UserError
 
@@ -146,7 +144,7 @@ class UsersCode:
     def __init__(self, what: str, of: object = None, method: str = "", *, failed: str = "raised"):
         self.what, self.of, self.method, self.failed = what, of, method, failed
 
-    def __enter__(self) -> UsersCode:
+    def __enter__(self) -> Self:
         _running.blocks += 1
         return self
 

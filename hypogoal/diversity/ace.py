@@ -1,7 +1,5 @@
 """ACE: confident disagreement on the few states where members disagree most easily (Daniels et al. 2025)."""
 
-from __future__ import annotations
-
 import math
 from itertools import permutations
 

@@ -1,7 +1,5 @@
 """A control for D-BAT that pairs no members: each member's term is with itself."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from hypogoal.diversity import Context

@@ -1,7 +1,5 @@
 """DivDis: diversity by statistical independence (Lee et al. 2022), with its ratio term."""
 
-from __future__ import annotations
-
 import math
 
 import torch

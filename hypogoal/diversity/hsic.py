@@ -1,7 +1,5 @@
 """Independent features: the Hilbert-Schmidt independence criterion between members' last hidden layers."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import torch

@@ -1,7 +1,5 @@
 """Members that look at different pixels: orthogonal gradients of their logits by the input (Teney et al. 2022)."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import torch

@@ -1,7 +1,5 @@
 """No diversity: members differ by their initial weights alone."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 

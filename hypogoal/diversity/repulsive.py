@@ -1,7 +1,5 @@
 """A repulsive ensemble in function space (D'Angelo and Fortuin 2021)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

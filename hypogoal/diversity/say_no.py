@@ -1,7 +1,5 @@
 """A control for D-BAT that pairs no members: unlabelled states are weak negatives."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -2,13 +2,11 @@
 are kept, of what kind they are, and their labels (Spec B4, B5, B7).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -108,13 +106,13 @@ class RoomStates:
     actions: NDArray[np.int64]
 
     @classmethod
-    def empty(cls, count: int) -> RoomStates:
+    def empty(cls, count: int) -> Self:
         """Room for ``count`` states, to be ``put`` there."""
         shapes = OBSERVATION_SHAPE, (RAM_BYTES,)
         observations, ram = (np.zeros((count, *shape), np.uint8) for shape in shapes)
         return cls(observations, ram, np.zeros((count, 2), np.int64))
 
-    def put(self, begin: int, states: RoomStates) -> None:
+    def put(self, begin: int, states: Self) -> None:
         """Write other states here, from index ``begin`` on."""
         part = slice(begin, begin + len(states.ram))
         self.observations[part], self.ram[part], self.actions[part] = states.observations, states.ram, states.actions

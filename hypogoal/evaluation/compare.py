@@ -1,7 +1,5 @@
 """Several evaluated runs side by side: whether they can be compared, what differs, and who wins (Spec F5, F7)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

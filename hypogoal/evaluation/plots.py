@@ -1,7 +1,5 @@
 """The kit of figures: their look, and how they are written. Colours are Okabe and Ito's, told apart by all readers."""
 
-from __future__ import annotations
-
 import io
 import re
 import textwrap

@@ -1,7 +1,5 @@
 """What everything was made from and with (Spec A8)."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Mapping

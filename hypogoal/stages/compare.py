@@ -1,7 +1,5 @@
 """Spec F5, F7: several evaluated runs side by side, as one page and its numbers."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

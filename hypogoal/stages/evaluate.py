@@ -1,7 +1,5 @@
 """Spec A5, F: every number of the report, from whatever artefacts a run has; what is missing is named."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The contract of a domain, as a test that its author runs (Spec B6; see ``hypogoal.domains.base``)."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import warnings

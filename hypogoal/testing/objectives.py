@@ -1,7 +1,5 @@
 """The laws of a diversity objective, as a test that its author runs (Spec C1, C2; see ``hypogoal.diversity``)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

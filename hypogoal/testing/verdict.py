@@ -1,7 +1,5 @@
 """What one check found, and how checks are run: one that fails ends those that build on it, not the program."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

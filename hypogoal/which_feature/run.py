@@ -1,7 +1,5 @@
 """Spec H1: entries of the benchmark, the cells they are scored in, and the folder that keeps cell by cell."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
