@@ -35,25 +35,15 @@ LARGEST = 1e300  # of what is drawn
 
 @dataclass(frozen=True)
 class Progressing:
-    """One artefact that is made, or was.
+    """One artefact that is made, or was."""
 
-    Attributes:
-        name: its path within the run.
-        sub_goal: that an ensemble is at; empty for others.
-        seconds: since its log was written; None when it is complete.
-        step: the last logged.
-        watched: what is followed (one of ``WATCHED``), empty where there is nothing to follow.
-        series: its values so far.
-        lines: its log so far, of an ensemble of all sub-goals.
-    """
-
-    name: str
-    sub_goal: str
-    seconds: float | None
-    step: int
-    watched: str
-    series: tuple[float, ...]
-    lines: list[dict[str, Any]]
+    name: str  # its path within the run
+    sub_goal: str  # that an ensemble is at; empty for others
+    seconds: float | None  # since its log was written; None when it is complete
+    step: int  # the last logged
+    watched: str  # what is followed (one of ``WATCHED``), empty where there is nothing to follow
+    series: tuple[float, ...]  # its values so far
+    lines: list[dict[str, Any]]  # its log so far, of an ensemble of all sub-goals
 
     @property
     def title(self) -> str:

@@ -52,21 +52,14 @@ def sub_goals_reached(
 
 @dataclass(frozen=True)
 class Layout:
-    """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x.
+    """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x."""
 
-    Attributes:
-        walls: the cells of walls (the door's cell is not among them).
-        door, goal: their cells.
-        start, direction: where the agent begins (0 right, 1 down, 2 left, 3 up).
-        keys: the cells of the blue, the green and the red key.
-    """
-
-    walls: frozenset[int]
+    walls: frozenset[int]  # cells; the door's is not among them
     door: int
     goal: int
-    start: int
-    direction: int
-    keys: tuple[int, int, int]
+    start: int  # where the agent begins
+    direction: int  # 0 right, 1 down, 2 left, 3 up
+    keys: tuple[int, int, int]  # the cells of the blue, the green and the red key
 
     @property
     def grid(self) -> tuple[frozenset[int], int, int, tuple[int, int, int]]:

@@ -74,17 +74,11 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of the emulator and what was seen before it, which is no part of the emulator's own state.
+    """A state of the emulator and what was seen before it, which is no part of the emulator's own state."""
 
-    Attributes:
-        state: an ``ALEState``.
-        seen: the frames of its observation.
-        screen: uint8 (210, 160), the last of them before it was made small.
-    """
-
-    state: Any
-    seen: Frames
-    screen: NDArray[np.uint8]
+    state: Any  # an ``ALEState``
+    seen: Frames  # of its observation
+    screen: NDArray[np.uint8]  # (210, 160), the last of them before it was made small
 
     @property
     def stack(self) -> NDArray[np.uint8]:

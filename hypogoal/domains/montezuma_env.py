@@ -35,19 +35,12 @@ FRAMES_PER_SECOND = 60
 
 @dataclass(frozen=True)
 class Start:
-    """Where an episode begins.
-
-    Attributes:
-        snapshot: the state.
-        position: of the agent.
-        on_the_way: on the way down, not at the top.
-        picture: the console's, uint8 (210, 160, 3): a restored emulator has none to show before its first step.
-    """
+    """Where an episode begins."""
 
     snapshot: Snapshot
-    position: Position
-    on_the_way: bool
-    picture: NDArray[np.uint8]
+    position: Position  # of the agent
+    on_the_way: bool  # down, not at the top
+    picture: NDArray[np.uint8]  # the console's, (210, 160, 3): a restored emulator has none before its first step
 
 
 def make_starts(emulator: Emulator, ladder: Ladder, count: int, seed: int, *, along: float = 0.0) -> list[Start]:

@@ -93,17 +93,11 @@ LAVA_BELOW = 220  # y; nobody stands on lava, unless put there
 
 @dataclass(frozen=True)
 class RoomStates:
-    """States of a room or of several.
+    """States of a room or of several."""
 
-    Attributes:
-        observations: uint8 (n, 84, 84, 4).
-        ram: uint8 (n, 128), the console's memory.
-        actions: int64 (n, 2), the last one and the one before it.
-    """
-
-    observations: NDArray[np.uint8]
-    ram: NDArray[np.uint8]
-    actions: NDArray[np.int64]
+    observations: NDArray[np.uint8]  # (n, 84, 84, 4)
+    ram: NDArray[np.uint8]  # (n, 128), the console's memory
+    actions: NDArray[np.int64]  # (n, 2), the last one and the one before it
 
     @classmethod
     def empty(cls, count: int) -> Self:
@@ -255,19 +249,13 @@ def choose(
 
 
 class Placing(NamedTuple):
-    """Where a rollout begins.
-
-    Attributes:
-        x, y: the agent is put there.
-        action, steps: then it plays that for so many agent steps, unseen.
-        hold: while the stack fills, it goes back to the base that it is near, instead of doing nothing.
-    """
+    """Where a rollout begins: the agent is put there, then plays ``action`` for so many agent steps, unseen."""
 
     x: int
     y: int
     action: int = NOOP
     steps: int = 0
-    hold: bool = False
+    hold: bool = False  # while the stack fills, it goes back to the base that it is near, instead of doing nothing
 
 
 class Shown(NamedTuple):

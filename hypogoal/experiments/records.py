@@ -30,21 +30,13 @@ GIVE = "Give the command that began it, of 'run' with --resume and without --for
 
 @dataclass(frozen=True)
 class Record:
-    """How a cell went so far.
+    """How a cell went so far."""
 
-    Attributes:
-        attempts: how often it was started.
-        seconds: that it ran, all attempts that ended together.
-        code: its exit code, minus the signal that ended it; None: it runs, or died with whoever ran it.
-        started: when the last attempt began, seconds of the clock since 1970; for people only.
-        host: where.
-    """
-
-    attempts: int = 0
-    seconds: float = 0.0
-    code: int | None = None
-    started: float = 0.0
-    host: str = ""
+    attempts: int = 0  # how often it was started
+    seconds: float = 0.0  # that it ran, all attempts that ended together
+    code: int | None = None  # its exit code, minus the signal that ended it; None: it runs, or died with whoever ran it
+    started: float = 0.0  # when the last attempt began, seconds of the clock since 1970; for people only
+    host: str = ""  # where
 
 
 def log_of(run: Path, cell: Cell) -> Path:

@@ -27,20 +27,12 @@ MOST_SHOWN = 20
 
 @dataclass(frozen=True)
 class State:
-    """Where one cell is.
-
-    Attributes:
-        cell: which.
-        state: done, running, failed, stopped (it goes on with the next start), waiting (not begun), held (it waits
-            for one that failed).
-        record: how it went so far.
-        text: of one that runs or failed, what it said last.
-    """
+    """Where one cell is."""
 
     cell: Cell
-    state: str
+    state: str  # one of those above: stopped ones go on with the next start, held ones wait for one that failed
     record: Record
-    text: str = ""
+    text: str = ""  # of one that runs or failed, what it said last
 
 
 @dataclass(frozen=True)

@@ -282,17 +282,11 @@ FALLBACK = tuple("0123456789bcfghijkotvxyz")
 
 
 class Source:
-    """A state at a time.
+    """A state at a time."""
 
-    Attributes:
-        state: the one that is shown, uint8 (H, W, C).
-        note: where it is from.
-        help: which keys do what, in lines.
-    """
-
-    state: NDArray[np.uint8]
-    note: str
-    help: tuple[str, ...]
+    state: NDArray[np.uint8]  # the one that is shown, (H, W, C)
+    note: str  # where it is from
+    help: tuple[str, ...]  # which keys do what, in lines
 
     def press(self, key: str, held: Set[str]) -> bool:
         """What a key does, of those ``held`` down; false where nothing."""

@@ -22,22 +22,14 @@ RARE = 0.05  # share of a class, below which one is warned
 
 @dataclass(frozen=True)
 class Parts:
-    """States as they were found, not yet looked at.
+    """States as they were found, not yet looked at. Where none are held out, a share of the labelled ones is."""
 
-    Attributes:
-        observations: (N, H, W, C) or (N, H, W), with labels.
-        labels: (N,) or (N, G).
-        unlabelled: (M, H, W, C) or (M, H, W).
-        heldout_observations, heldout_labels: as the first two; None, a share of the labelled states is held out.
-        sub_goals: their names, where they were found with them.
-    """
-
-    observations: NDArray[Any]
-    labels: NDArray[Any]
-    unlabelled: NDArray[Any]
-    heldout_observations: NDArray[Any] | None = None
+    observations: NDArray[Any]  # (N, H, W, C) or (N, H, W), with labels
+    labels: NDArray[Any]  # (N,) or (N, G)
+    unlabelled: NDArray[Any]  # (M, H, W, C) or (M, H, W)
+    heldout_observations: NDArray[Any] | None = None  # as the first two
     heldout_labels: NDArray[Any] | None = None
-    sub_goals: tuple[str, ...] = ()
+    sub_goals: tuple[str, ...] = ()  # their names, where they were found with them
 
 
 def collected_of(

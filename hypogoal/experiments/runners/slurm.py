@@ -34,27 +34,16 @@ GATHER = "gather"
 
 @dataclass(frozen=True)
 class Options:
-    """What is asked of Slurm for every cell; what is empty is left to Slurm, or estimated (memory, cpus).
-
-    Attributes:
-        partition: where.
-        time: limit of a cell, as ``sbatch --time`` takes it.
-        memory: of a cell, as ``sbatch --mem`` takes it.
-        gpus: of a cell.
-        cpus: of a cell; 0: as many processes as it can use.
-        cap: cells of an array that run at once, at most; 0: no limit.
-        warn: seconds before the time limit at which a cell saves, to be queued again.
-        extra: further options of ``sbatch``.
-    """
+    """What is asked of Slurm for every cell; what is empty is left to Slurm, or estimated (memory, cpus)."""
 
     partition: str = ""
-    time: str = ""
-    memory: str = ""
-    gpus: int = 0
-    cpus: int = 0
-    cap: int = 0
-    warn: int = 120
-    extra: tuple[str, ...] = ()
+    time: str = ""  # limit of a cell, as ``sbatch --time`` takes it
+    memory: str = ""  # of a cell, as ``sbatch --mem`` takes it
+    gpus: int = 0  # of a cell
+    cpus: int = 0  # of a cell; 0: as many processes as it can use
+    cap: int = 0  # cells of an array that run at once, at most; 0: no limit
+    warn: int = 120  # seconds before the time limit at which a cell saves, to be queued again
+    extra: tuple[str, ...] = ()  # further options of ``sbatch``
 
 
 @dataclass(frozen=True)
