@@ -53,9 +53,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
-    """What ``metrics.json`` holds of an evaluation, or of a run's own; None where there is none, damaged a
-    ``UserError``.
-    """
+    """What ``metrics.json`` of an evaluation or of a run's holds; None where there is none, damaged a ``UserError``."""
     from hypogoal.evaluation.run import read_numbers
 
     for folder in (path, path / EVALUATION):
@@ -66,9 +64,7 @@ def numbers_of(path: Path) -> Mapping[str, Any] | None:
 
 
 def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
-    """The headline numbers of an evaluation, from :func:`numbers_of`, as tables; a ``UserError`` where they are
-    damaged.
-    """
+    """The headline numbers, from :func:`numbers_of`, as tables; a ``UserError`` where they are damaged."""
     from hypogoal.evaluation.questions import summary_table
 
     try:

@@ -83,18 +83,14 @@ class Artefact:
         return int(self.manifest["seed"])
 
     def whole(self) -> Self:
-        """This artefact, asked for before a stage starts (some ms per MB): its files are as the manifest says, or
-        UserError.
-        """
+        """This artefact; a ``UserError`` where its files are not as the manifest says. Costs some ms per MB."""
         faults = check_files(self)
         if faults:
             raise UserError(f"the artefact is damaged ({faults[0]})", self.path, AGAIN)
         return self
 
     def input(self, kind: str) -> Path:
-        """The input of ``kind``: beside this artefact, else as recorded; gone, changed since, or never read is a
-        ``UserError``.
-        """
+        """The input of ``kind``, beside this artefact, else as recorded; gone or changed since, it is a ``UserError``."""
         for entry in self.manifest["inputs"]:
             if entry["kind"] == kind:
                 path, fault = find_input(self.path, entry)

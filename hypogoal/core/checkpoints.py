@@ -96,9 +96,7 @@ class Checkpoints:
         return self.path is not None and self.path.is_file()
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Called where the state is whole: saves it if it is time to, or if a signal came, which then is a
-        ``KeyboardInterrupt``.
-        """
+        """Where the state is whole: save it if it is time to, or if a signal came: then a ``KeyboardInterrupt``."""
         if self._signal is None and time.monotonic() < self._next:
             return
         begun = time.monotonic()

@@ -63,9 +63,7 @@ def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
-    """Refuse (``UserError``), before any work is done, to write what another process writes, or to lose what is
-    unfinished.
-    """
+    """Refuse (``UserError``), before any work, to write what another process writes, or to lose what is unfinished."""
     folder = draft_folder(out)
     if folder.is_dir() and os.access(folder, os.W_OK):
         with sole_writer(out):

@@ -61,9 +61,7 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
 
 
 def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
-    """A regular file of at most ``limit`` bytes; see :func:`require_file`. Larger or not readable, it is a
-    ``UserError``.
-    """
+    """A regular file, see :func:`require_file`; of more than ``limit`` bytes, or not readable, a ``UserError``."""
     with open_file(path, what, do) as file:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -113,10 +111,7 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
-    """TOML, else a ``UserError``.
-
-    Keys in hundreds of parts (``a.a.a``), for which the parser takes the square of their number, are refused.
-    """
+    """TOML, else a ``UserError``; so are keys in hundreds of parts (``a.a.a``), whose time is their number squared."""
     try:
         for number, line in enumerate(text.split("\n"), 1):
             if line.count(".") > MOST_DOTS:

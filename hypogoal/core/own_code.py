@@ -37,10 +37,7 @@ _own: set[str] = set()  # top-level modules that were loaded by name and are not
 
 
 def given(*names: str) -> contextlib.AbstractContextManager[None]:
-    """Within the block these names are the user's own words: ``module:object`` among them may be loaded.
-
-    Without effect where the command is a file's.
-    """
+    """Within the block ``module:object`` among these names may be loaded: the user's own words, if no file's."""
     return vouched(*([] if os.environ.get(OF_FILE) else names))
 
 

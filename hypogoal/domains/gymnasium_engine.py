@@ -30,9 +30,7 @@ def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
 
 
 def make_checked(make: MakeEnv) -> gymnasium.Env:
-    """An environment whose observations, uint8 images, and actions, ``Discrete``, hypogoal can use; else a
-    ``UserError``.
-    """
+    """An environment whose observations are uint8 images, and actions ``Discrete``; else a ``UserError``."""
     env = made(make)
     with UsersCode("the environment", env, failed="has no spaces:"):
         space, actions = env.observation_space, env.action_space
@@ -68,9 +66,7 @@ def with_channels(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """An environment's observation as uint8 (H, W, C), in memory of its own; a ``UserError`` where its space says
-    other.
-    """
+    """An observation as uint8 (H, W, C), in memory of its own; a ``UserError`` where its space says other."""
     code = UsersCode("the environment", env, "step")
     if not isinstance(observation, np.ndarray):
         with code:

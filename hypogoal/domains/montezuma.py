@@ -90,9 +90,7 @@ class MontezumaConfig:
 
 
 class _Task(NamedTuple):
-    """``wanted`` states of a room for the set called ``name``, there from index ``begin`` on: gathered, and kept till
-    all are there.
-    """
+    """``wanted`` states of a room for the set ``name``, from index ``begin`` on: gathered, kept till all are there."""
 
     name: str
     begin: int
@@ -123,9 +121,7 @@ def _states_of(states: RoomStates) -> States:
 
 
 class MontezumaDomain(Domain):
-    """Spec B6: the ladders of Montezuma's Revenge; by default Table 1, and for options what lets them learn on a
-    laptop.
-    """
+    """Spec B6: Montezuma's ladders; by default Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"
     sub_goals = SUB_GOALS

@@ -92,9 +92,7 @@ def row_of(room: int) -> int:
 
 
 def load_ale(seed: int) -> Any:
-    """A raw emulator with the game's ROM in it, deterministic, one frame per act; a ``UserError`` where it is not
-    there.
-    """
+    """A raw emulator with the game's ROM, deterministic, one frame per act; a ``UserError`` where it is not there."""
     try:
         import cv2  # noqa: F401
         from ale_py import ALEInterface, LoggerMode

@@ -233,9 +233,7 @@ def gather(
 def choose(
     kinds: NDArray[np.int64], positions: NDArray[np.int64], wanted: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """The indices, in order, of ``wanted`` of states (n,): of each kind its share, spread over positions (n, 3), others
-    at random.
-    """
+    """Indices, in order, of ``wanted`` of n states: of each kind its share, spread over positions; others at random."""
     order = rng.permutation(len(kinds))
     latest: dict[tuple[int, ...], int] = {}  # kind and position -> turn of the last state so far
     turns = np.empty(len(kinds), np.int64)  # of those of its kind and position, the how manyth a state is

@@ -77,9 +77,7 @@ def pick_to_browse(
 
 
 def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The states of ``order``, indices (n,) with the better first, reordered so that groups take turns: the first of
-    each, then the second of each, ... ``groups`` (N,) says each state's.
-    """
+    """Indices (n,), better ones first, reordered so that ``groups`` (N,) take turns: each one's first, second, ..."""
     groups = groups[order]
     turn = np.zeros(len(order), dtype=np.int64)
     for group in np.unique(groups):

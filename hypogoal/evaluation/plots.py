@@ -125,10 +125,7 @@ def slug(text: str) -> str:
 
 
 def to_svg(figure: Figure, name: str) -> str:
-    """The figure as an SVG document, the same bytes each time.
-
-    The :func:`slug` of ``name`` makes the ids inside unique among several on one page.
-    """
+    """The figure as SVG, the same bytes each time, its ids unique on a page by the :func:`slug` of ``name``."""
     name = slug(name)
     buffer = io.StringIO()
     with styled({"svg.hashsalt": name}):

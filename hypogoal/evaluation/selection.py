@@ -158,9 +158,7 @@ def match_on_layout(path: Path, layout_seed: int) -> NDArray[np.float64]:
 
 
 def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
-    """The states of a fresh engine's layout: those that can be reached, or, where nobody knows them, what so many
-    steps of random play meet; each once.
-    """
+    """Of a fresh engine's layout the states that can be reached, else those that random play meets; each once."""
     if (reachable := engine.reachable()) is not None:
         return reachable
     rng = rng_for(0, "states-of-layout")

@@ -190,9 +190,7 @@ def made_anew(run: Path, cell: Cell) -> None:
 
 
 def check_same(run: Path, cells: Sequence[Cell]) -> None:
-    """Refuse (``UserError``) cells that do not go on with what the folder has: all of before, with the same command and
-    presets.
-    """
+    """Refuse (``UserError``) cells without all that the folder has, with the same commands and presets."""
     if not (run / PLAN).is_file():
         return
     do = "Give the settings it was begun with, or choose another --out."

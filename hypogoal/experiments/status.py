@@ -50,9 +50,7 @@ class Status:
 
 
 def read_status(run: Path) -> Status:
-    """Look at every cell (``UserError``: there is no sweep); done is as of :func:`done_of`, which the next start checks
-    file by file.
-    """
+    """Look at every cell; done is as of :func:`done_of`, which the next start checks file by file."""
     plan, factor = read_plan(run)
     states: list[State] = []
     done = done_of(plan)
@@ -193,10 +191,7 @@ def is_finished(cell: Cell) -> bool:
 
 
 def stamp_of(cell: Cell) -> tuple[int, int] | None:
-    """Which output of a cell is there: its file's number, and when that was written, in ns; None where none is.
-
-    It gets its name when it is whole.
-    """
+    """Which whole output of a cell is there: its file's number, and when that was written, in ns; None: none."""
     place = cell.out if cell.stage == "collect" else cell.out / MANIFEST
     try:
         found = place.stat()
@@ -206,9 +201,7 @@ def stamp_of(cell: Cell) -> tuple[int, int] | None:
 
 
 def left_of(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells that are not :func:`is_finished`; of evaluation and report also those that read what is still to be
-    made.
-    """
+    """The cells that are not :func:`is_finished`, and evaluation and report of what is still to be made."""
     left: list[Cell] = []
     pending: set[Path] = set()
     for cell in cells:

@@ -60,9 +60,7 @@ class Marks:
         return file.parent.name if file else None
 
     def mark(self, state: NDArray[np.uint8], kind: str) -> None:
-        """Mark a state, uint8 (H, W, C), of the shape of those before (else a ``UserError``); another mark of it is
-        taken back.
-        """
+        """Mark a state, uint8 (H, W, C), or mark it anew; a ``UserError`` where those before have another shape."""
         name, before = _name(state), self.of(state)
         if before is not None:
             self._move(name, kind)

@@ -87,9 +87,7 @@ def require_memory(size: int, where: Path) -> None:
 def _apart(
     states: States, others: Sequence[NDArray[np.uint8]], kind: str, of: str, do: str, warned: list[str]
 ) -> States:
-    """Those of a kind of states that look like none of the others, which are ``of`` another kind; none left: a
-    ``UserError``.
-    """
+    """States of a ``kind`` that look like none of the others, which are ``of`` another; none left: a ``UserError``."""
     kept = leave_out(states, *others)
     count = len(states.labels)
     if len(kept.labels) < count:
@@ -173,9 +171,7 @@ def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.b
 
 
 def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], warned: list[str]) -> None:
-    """Each sub-goal (G,) must hold in some labelled states (N, G) and not in others (else a ``UserError``); where few
-    do, one is warned.
-    """
+    """Refuse (``UserError``) a sub-goal that all or none of the labels (N, G) say is reached; warn where few do."""
     for column, goal in enumerate(goals):
         positives, among = int(labels[:, column].sum()), f"among {len(labels)} labelled states"
         fewest, which = min((positives, "positives"), (len(labels) - positives, "negatives"), key=itemgetter(0))

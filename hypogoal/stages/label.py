@@ -51,9 +51,7 @@ def label(
 
 
 def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
-    """An environment by its id (``ALE/Freeway-v5``), of a domain, or by the function that makes it; else a
-    ``UserError``.
-    """
+    """An environment by its id, of a domain, or by the function that makes it; none such is a ``UserError``."""
     import ale_py
     import minigrid  # noqa: F401 - registers its environments when it is loaded
 

@@ -53,9 +53,7 @@ AGAIN = "give the same command again to go on"
 
 
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
-    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment. Else a
-    ``UserError``.
-    """
+    """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
     if stage == "collect":
         return load_domain(domain, given=True).config_class
     if stage == "run":
@@ -110,9 +108,7 @@ def _short(out: Path, *, wanted: bool) -> bool:
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
-    """Spec A6: :func:`sweep` with the manners of a stage: what is there is refused (``UserError``) unless resumed or
-    forced.
-    """
+    """Spec A6: :func:`sweep`, but what is there is refused (``UserError``) unless resumed or forced."""
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
     sweep(planned, out, force=force and not (resume and _begun(out, planned)), quiet=quiet, go_on=GO_ON)
@@ -252,9 +248,7 @@ def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str],
 
 
 def gather(out: Path) -> Path:
-    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former. No sweep, a
-    damaged artefact: a ``UserError``.
-    """
+    """Write ``results.csv`` of what is done, which it returns, and where that is all, ``run.json``; or UserError."""
     planned, _ = read_plan(out)
     results = write_results(planned, out)
     if len(done_of(planned)) == len(planned.cells):

@@ -66,11 +66,7 @@ def run(tests: Iterable[Test]) -> Iterator[Verdict]:
 
 
 def require(verdicts: Iterable[Verdict]) -> None:
-    """For a test-suite: pass where all promises are kept.
-
-    Raises:
-        AssertionError: one is not; it says which.
-    """
+    """For a test-suite: pass where all promises are kept, else an ``AssertionError`` that says which is not."""
     for verdict in verdicts:
         if not verdict.ok:
             raise AssertionError("\n".join(verdict.lines))

@@ -215,9 +215,7 @@ def queued(run: Path) -> list[str]:
 
 
 def cancel(run: Path) -> int:
-    """Have Slurm end every job of a run (else a ``UserError``); cells that run save where they are. Returns how many
-    there were.
-    """
+    """Have Slurm end all jobs of a run (none: a ``UserError``), running cells save first; returns how many."""
     alive = queued(run)
     if not alive:
         raise UserError("no jobs in Slurm's queue", run, "A sweep on this machine is ended with Ctrl-C or SIGTERM.")
