@@ -115,8 +115,7 @@ def write_dataset(
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole.
 
-    Raises:
-        UserError: see :func:`require_names`, an origin's name is none, labels are no truth values, or the file exists.
+    Names that cannot be names of files, labels that are no truth values, or a file that exists are a ``UserError``.
     """
     require_names(collected.sub_goals)
     for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
@@ -314,11 +313,7 @@ class Dataset:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file written by ``collect`` (or by the user in the same schema).
-
-    Raises:
-        UserError: missing, truncated, not HDF5, not ours, incomplete, or of a newer format.
-    """
+    """Open a data file written by ``collect`` (or by the user in the same schema), a ``UserError`` where it is none."""
     if path.is_dir():
         raise UserError(
             "a folder where a data file is needed", path, "Give the .h5 file that 'hypogoal collect' wrote."

@@ -90,7 +90,7 @@ class Artefact:
         return self
 
     def input(self, kind: str) -> Path:
-        """The input of ``kind``, beside this artefact, else as recorded; gone or changed since, it is a ``UserError``."""
+        """The input of ``kind``, beside this artefact, else as recorded; gone or changed since, a ``UserError``."""
         for entry in self.manifest["inputs"]:
             if entry["kind"] == kind:
                 path, fault = find_input(self.path, entry)
@@ -129,19 +129,11 @@ def versions() -> dict[str, str]:
 
 
 def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
-    """Check, before any work is done, that ``out`` may be written; nothing is made yet.
+    """Check, before any work is done, that ``out`` may be written, an artefact's kind, ``data`` or ``arrays``.
 
-    Args:
-        out: the output.
-        kind: what it is to be: that of an artefact, ``data`` or ``arrays``.
-        inputs: what is read to make it.
-        force: replace what is there.
-        resume: go on with what is unfinished; what is complete is left to ``create_artefact``.
-
-    Raises:
-        UserError: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
-            exists and is of another kind; another process writes it; something unfinished is there and neither
-            ``force`` nor ``resume`` says what to do with it.
+    A ``UserError``: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
+    exists and is of another kind; another process writes it; something unfinished is there and neither ``force`` nor
+    ``resume`` says what to do with it. What is there complete is with ``resume`` left to ``create_artefact``.
     """
     place = out.resolve()
     if len(os.fsencode(place.name)) > MAX_NAME_BYTES:  # the draft's name is longer
@@ -232,22 +224,12 @@ def create_artefact(
 ) -> Iterator[Path]:
     """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
 
-    Args:
-        out: the artefact's final folder.
-        kind: ensemble, options, meta, baseline, evaluation or report.
-        config: the resolved configuration, a dataclass or a dict.
-        seed: the seed that makes it.
-        inputs: artefact folders or data files that were read.
-        force: replace an existing artefact, begin anew what is unfinished.
-        resume: go on with what is unfinished, where there is something.
-
-    Yields:
-        The folder to write into; ``checkpoints_of`` knows where the checkpoints beside it are. When the block raises,
-        ``out`` is as it was, and the folder is removed unless it has a checkpoint.
+    ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are artefact folders or data files that
+    were read. ``checkpoints_of`` knows where the checkpoints beside the folder are. When the block raises, ``out`` is
+    as it was, and the folder is removed unless it has a checkpoint.
 
     Raises:
-        UserError: as of ``claim``, or what is there, unfinished or complete, was begun with another configuration,
-            seed or inputs.
+        UserError: see :func:`claim`, or what is there was begun with another configuration, seed or inputs.
         Complete: with ``resume``, it was made with these.
     """
     inputs = [Path(path) for path in inputs]

@@ -49,16 +49,11 @@ def setting(
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
-    """The differences from the defaults that preset ``name`` asks for in ``stage``.
+    """The differences from the defaults that preset ``name`` asks for in ``stage``, a command: its table ``[stage]``.
 
-    Args:
-        name: a preset shipped with the package (``demo``, ``paper``), the path of an own TOML file, or None.
-        stage: the command's name; the TOML table read is ``[stage]``.
-        domain: whose presets are meant; those of a domain that has none are DoorKey's.
-        tables: what a preset may have; anything where empty.
-
-    Raises:
-        UserError: unknown preset, unreadable file, not TOML, or with what belongs to no stage.
+    The name is that of a preset of the package (``demo``, ``paper``), of ``domain`` or, if it has none, of DoorKey, or
+    the path of an own TOML file. An unknown preset, one that is not TOML, or with other tables than ``tables`` (none:
+    any) is a ``UserError``.
     """
     if name is None:
         return {}
@@ -120,19 +115,11 @@ def resolve(
     defaults: Mapping[str, Any] | None = None,
     tables: Collection[str] = (),
 ) -> T:
-    """The configuration of a stage from its preset, its options and its ``--set`` pairs.
+    """The configuration of a stage, a frozen dataclass of :func:`setting` fields.
 
-    Args:
-        config_class: frozen dataclass of :func:`setting` fields.
-        stage: the command's name, for presets and messages.
-        preset, tables: see :func:`load_preset`.
-        options: command-line options; those that are None were not given.
-        assignments: ``key=value`` texts.
-        domain: whose presets are meant.
-        defaults: the domain's own, before which the class's stand back.
-
-    Raises:
-        UserError: unknown key, wrong type, or a value out of range.
+    From its preset (see :func:`load_preset`), the command line's ``options``, those that are not None, its ``--set``
+    ``assignments`` and the domain's own ``defaults``, before which the class's stand back. An unknown key, a wrong
+    type, or a value out of range is a ``UserError``.
     """
     values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})

@@ -129,11 +129,7 @@ class UsersCode:
     Args:
         what: whose code it is ("the label function of won").
         of: the function, or the object that has ``method``; or a text, what the user calls it.
-        method: see ``of``.
         failed: between ``what`` and the exception.
-
-    Raises:
-        UserError: when leaving the block by another exception than a UserError or Ctrl-C.
     """
 
     __slots__ = ("failed", "method", "of", "what")

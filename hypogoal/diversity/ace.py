@@ -18,9 +18,6 @@ def ensemble_loss(context: Context) -> Tensor:
     members as they are disagree most, and for certainty there; of the rest nothing is asked. Mixed directions: a says
     yes where b says no on some states, and the other way round on others.
 
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
-
     Returns:
         float (), at least 0, in nats; 0 for no states or no pairs.
 

@@ -12,9 +12,6 @@ def ensemble_loss(context: Context) -> Tensor:
     It is lowest where every member is undecided (p = 1/2) on every unlabelled state, so it asks for no difference
     between members. What D-BAT gains over it comes from pairing. One member alone has a weight of 1.
 
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
-
     Returns:
         float (), at least 0, in nats; 0 for no states.
     """

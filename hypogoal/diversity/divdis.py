@@ -18,9 +18,6 @@ def ensemble_loss(context: Context) -> Tensor:
     positives. The second term is what keeps a member from saying the same of all unlabelled states, where the first is
     0 without a gradient.
 
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
-
     Returns:
         float (), in nats, at least 0 up to rounding; 0 for no states.
 

@@ -18,9 +18,6 @@ def ensemble_loss(context: Context) -> Tensor:
     what the other does. Divided so that features cannot escape it by becoming small. Frozen members have no features
     and do not count.
 
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; features of unlabelled states are used.
-
     Returns:
         float (), from 0 to K (K - 1); 0 for fewer than two states or members.
 

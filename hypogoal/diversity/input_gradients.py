@@ -18,9 +18,6 @@ def ensemble_loss(context: Context) -> Tensor:
     that opposite gradients, which use the same features, are no way out. No unlabelled states are needed. Frozen
     members do not count.
 
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; ``input_gradients`` is called.
-
     Returns:
         float (), from 0 to K (K - 1); 0 for one member.
 

@@ -18,9 +18,6 @@ def ensemble_loss(context: Context) -> Tensor:
     from where the others are. Repulsion falls off with distance, unlike D-BAT's, which goes on until members contradict
     each other.
 
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
-
     Returns:
         float (), from -K log K to 0; 0 for one member or no states.
 

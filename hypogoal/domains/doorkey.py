@@ -150,18 +150,10 @@ class DoorKeyDomain(Domain):
         keys picked up a layout can look like another. In the regime ``shuffled`` as many states as the layout has as
         it lies are kept, at random.
 
-        Args:
-            config: see ``DoorKeyConfig``.
-            seed: of the key placements and of the choice among their states; ``fixed`` does not depend on it.
-            progress: told how many layouts there are, and of each that is done.
-
-        Returns:
-            Labels of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each:
-            layout_seed, draw (0: keys as the seed has them), agent_x, agent_y, direction, door_state (0 open,
-            1 closed, 2 locked), keys_held (bit 0 blue, 1 green, 2 red).
-
-        Raises:
-            UserError: the labelled states have one class only of some sub-goal, or too many draws are asked for.
+        ``seed`` is of the key placements and of the choice among their states; ``fixed`` does not depend on it. Labels
+        are of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each: layout_seed, draw
+        (0: keys as the seed has them), and those of ``DoorKeyEngine.origins``. Labelled states of one class only of
+        some sub-goal, or too many draws, are a ``UserError``.
         """
         labelled = _labelled_layouts(config, seed)
         unlabelled = [(layout_seed, 0, layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]

@@ -87,14 +87,7 @@ def tiles() -> NDArray[np.uint8]:
 class DoorKeyEngine(Engine):
     """Many environments of one layout, stepped together; ids are stable, and START is the id of the start state.
 
-    Args:
-        layout: the layout, or the seed of that of ``DoorKeyEnv(layout_seed=...)``.
-        count: environments (E).
-        keyring, door_label, wrong_key: see ``DoorKeyEnv``.
-        max_steps: steps after which an episode is truncated.
-
-    Attributes:
-        changes: of configurations that have been worked out, by configuration, cell and action.
+    Arguments are those of ``DoorKeyEnv``, but for ``layout``, one or the seed of one, and ``count``, of environments.
     """
 
     n_actions = N_ACTIONS
@@ -115,7 +108,7 @@ class DoorKeyEngine(Engine):
         self.harsh = wrong_key == "ends"
         self.layout = layout if isinstance(layout, Layout) else layout_of(layout)
         self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
-        self.changes: dict[int, int] = {}
+        self.changes: dict[int, int] = {}  # of configurations, worked out so far, by configuration, cell and action
         self._numbers: dict[Configuration, int] = {}
         # Of each configuration: its door and keys; what it shows without the agent, twice; the ids by pose.
         self._places = np.zeros((16, 4), np.uint8)
@@ -290,11 +283,7 @@ class DoorKeyEngine(Engine):
         }
 
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of the same layout and count, of states that were met in the order of these.
-
-        Raises:
-            ValueError: another count or layout, or states were met that the snapshot does not begin with.
-        """
+        """Continue from a ``snapshot`` of this layout and count, its states met in this order; else a ``ValueError``."""
         if snapshot["ids"].shape != (self.count,):
             raise ValueError(f"the snapshot is of {len(snapshot['ids'])} environments, not {self.count}")
         configurations, sites = snapshot["configurations"], snapshot["sites"]

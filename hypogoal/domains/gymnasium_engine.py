@@ -129,13 +129,8 @@ class GymnasiumEngine(TurnEngine):
     the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
     Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
 
-    Args:
-        make: makes an environment.
-        labels: G functions, see :func:`labels_of`.
-        layout_seed: the seed of every reset.
-        count: environments (E).
-        max_steps: steps after which an episode is truncated, where the environment does not do so earlier.
-        memory: distinct states, see above.
+    ``labels`` are G functions, see :func:`labels_of`. Episodes are truncated after ``max_steps`` steps, where the
+    environment does not do so earlier.
     """
 
     def __init__(
@@ -227,10 +222,9 @@ class GymnasiumEngine(TurnEngine):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments: episodes are played up to there.
+        """Continue from a ``snapshot`` of an engine made alike: episodes are played up to there.
 
-        Raises:
-            UserError: they did not lead to the same states, so the environment is not the same for the same seed.
+        Where they lead to other states, the environment is not the same for the same seed, it is a ``UserError``.
         """
         width, size = len(self._label_functions), 2 * self.memory
         self._labels = bytearray(snapshot["labels"].tobytes())

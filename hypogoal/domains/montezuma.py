@@ -177,19 +177,11 @@ class MontezumaDomain(Domain):
         stack of the held-out set is in another one, and none is twice in one room of a set. Nothing depends on how
         many processes play.
 
-        Args:
-            config: see ``MontezumaConfig``.
-            seed: of the rollouts; each room of each set has a stream of its own.
-            progress: told how many states there will be, and of each room that is done.
-            kept: by name, where each room's states are kept until all are there; what is there is not gathered again.
-
-        Returns:
-            Labels of all three sets (those of the unlabelled are for tests only). Origins: see
-            ``montezuma_states.origins_of``; of held-out states also ``seen``: 0 the room is in no training set, 1 it is
-            among the unlabelled rooms, 2 among the labelled ones.
-
-        Raises:
-            UserError: there is no such room, or no emulator, or a room does not show so many different states.
+        ``seed`` is of the rollouts; each room of each set has a stream of its own. ``kept`` says by name where each
+        room's states are kept until all are there; what is there is not gathered again. Labels are of all three sets
+        (those of the unlabelled are for tests only). Origins: see ``montezuma_states.origins_of``; of held-out states
+        also ``seen``: 0 the room is in no training set, 1 it is among the unlabelled rooms, 2 among the labelled ones.
+        No such room, no emulator, or a room that does not show so many different states is a ``UserError``.
         """
         labelled, unlabelled = labelled_rooms(config.groups), unlabelled_rooms(config)
         tasks: list[_Task] = []

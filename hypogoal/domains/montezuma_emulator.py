@@ -116,9 +116,6 @@ def load_ale(seed: int) -> Any:
 class Emulator:
     """One game: agent steps of four frames, stacks of four steps, RAM, and the agent put anywhere.
 
-    Args:
-        seed: of the emulator; without sticky actions nothing depends on it.
-
     Attributes:
         seen, screen: as in ``Snapshot``. Never written to again: each step makes new ones.
         screens: False, nothing is looked at and ``seen`` stays as it is: half the time, where only RAM is wanted.
@@ -127,7 +124,7 @@ class Emulator:
     def __init__(self, seed: int = 0):
         import cv2
 
-        self.ale = load_ale(seed)
+        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed
         self.actions = list(self.ale.getLegalActionSet())
         self.screens = True
         self._resize, self._area, self._brighter = cv2.resize, cv2.INTER_AREA, cv2.max
@@ -218,15 +215,8 @@ class Emulator:
         """Spec B5: the agent at (x, y) of a room, with the torch, its enemies ``phase`` frames old.
 
         The room is entered through its side, as if the agent came from the neighbour: writing the room's number alone
-        draws half a room. Of places in the air the agent falls.
-
-        Args:
-            room, x, y: where, in the RAM's units.
-            phase: frames to wait before the agent is put at its place.
-            settle: agent steps to wait afterwards; four or more fill the stack with what the place looks like.
-
-        Returns:
-            The state; None where the agent did not live to see it, or left the room.
+        draws half a room. Of places in the air the agent falls. Afterwards it waits for ``settle`` agent steps; four or
+        more fill the stack with what the place looks like. None where it did not live to see that, or left the room.
         """
         if room not in self._entered:
             self._entered[room] = self._enter(room)

@@ -36,18 +36,12 @@ class MontezumaEngine(TurnEngine):
     Ids 0 .. S-1 are the S start states, for ever; every step of every environment gets a new one. The images of the
     newest ``memory`` of these can be had, positions, labels and who is alive of all.
 
+    Arguments are those of ``MontezumaLadder``, and ``count``, of environments (E). No such ladder, too few start
+    states, too small a memory, or no emulator is a ``UserError``.
+
     Args:
-        start: the ladder, see ``montezuma_ladders.LADDERS``.
-        count: environments (E).
-        max_steps: agent steps after which an episode is truncated.
-        start_states: S; see ``montezuma_env.make_starts``.
-        along: the share of episodes that begin somewhere on the way down instead of at the top.
-        end_at_death: an episode terminates when the agent begins to die; False, when the game is over.
         memory: states whose images are kept; 7 kB each, taken when first needed.
         seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
-
-    Raises:
-        UserError: no such ladder, too few start states, too small a memory, or no emulator.
     """
 
     n_actions = N_ACTIONS

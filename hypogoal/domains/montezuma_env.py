@@ -49,19 +49,9 @@ def make_starts(emulator: Emulator, ladder: Ladder, count: int, seed: int, *, al
     They differ in the phase of what moves, drawn from ``seed``. No two look the same if ``TRIES`` phases for each of
     them offer so many looks. The top of 14-22 has one only: its states differ in what is out of sight.
 
-    Args:
-        emulator: is left in some other state.
-        ladder: the ladder.
-        count: how many states.
-        seed: of the phases and of the places on the way. Same seed, same states, whatever was played before.
-        along: the share of the states that are on the way down, at random steps of the scripted descent; between 0
-            and 1 there is at least one of each kind.
-
-    Returns:
-        The states, those at the top first.
-
-    Raises:
-        UserError: there are fewer such states, or ``along`` is no share.
+    The same seed gives the same states, those at the top first, whatever was played before; the emulator is left in
+    some other state. ``along`` is the share of those on the way down, at random steps of the scripted descent; between
+    0 and 1 there is at least one of each kind. Fewer such states, or no share, is a ``UserError``.
     """
     if not 0.0 <= along <= 1.0 or count < (2 if 0.0 < along < 1.0 else 1):
         do = "Give along a share, 0 to 1, and one state or more of each kind."

@@ -177,18 +177,11 @@ def emulator_of_process() -> Emulator:
 def gather(
     room: int, wanted: int, seed: int, stream: tuple[str | int, ...], *, play: str, held_out: bool, runs_on: bool
 ) -> RoomStates:
-    """States of a room that are all different: rollouts until there are enough, and of what they show a choice.
+    """``wanted`` states of a room, all different: rollouts until there are enough, and of what they show a choice.
 
-    Args:
-        room: 0..23.
-        wanted: how many states.
-        seed, stream: of everything that is random here, see ``rng_for``.
-        play: how the agent plays: a name in ``PLAYS``.
-        held_out: which side of ``may_be_held_out``.
-        runs_on: whether to keep states at bases of ladders that run on through the floor.
-
-    Raises:
-        UserError: the room does not show so many different states.
+    ``seed`` and ``stream`` are of everything that is random here, see ``rng_for``; ``play``, a name in ``PLAYS``, is
+    how the agent plays; ``held_out``, which side of ``may_be_held_out``; ``runs_on``, whether to keep states at bases
+    of ladders that run on through the floor. A room that does not show so many different states is a ``UserError``.
     """
     rng = rng_for(seed, *stream, room)
     bases = [(index, ladder.base) for index, ladder in enumerate(LADDERS) if ladder.base.room == room]

@@ -12,19 +12,9 @@ from hypogoal.evaluation.run import fitting, read_evaluation
 
 
 def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
-    """Compare evaluated runs: seeds, methods or settings.
+    """Compare evaluated runs, the others with the first, in an artefact with ``figures/*.svg``; returns its page.
 
-    Args:
-        runs: folders with an evaluation in each; the others are compared with the first.
-        out: the artefact to write: ``index.html``, ``metrics.json`` and ``figures/*.svg``.
-        force: replace an existing comparison.
-
-    Returns:
-        The page.
-
-    Raises:
-        UserError: fewer than two runs, one twice, one that was not evaluated, runs that cannot be compared, or ``out``
-            exists.
+    Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
     from hypogoal.evaluation import compare as beside
     from hypogoal.evaluation.page import Material, draw_page

@@ -35,16 +35,8 @@ LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # setting
 def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
     """Compute every number of the report and write an artefact: ``metrics.json``, ``numbers.csv``, ``arrays.h5``.
 
-    Args:
-        run: a folder with ensemble, options, meta and baseline artefacts, any of them.
-        out: the artefact to write.
-        force, resume, quiet: as for every stage.
-
-    Returns:
-        What ``metrics.json`` holds, see its ``quantities``.
-
-    Raises:
-        UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
+    ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them; none, or a damaged one, is a
+    ``UserError``. Returns what ``metrics.json`` holds, see its ``quantities``.
     """
     prepare()
     out = claim(out, kind="evaluation", force=force, resume=resume)

@@ -46,20 +46,9 @@ def train_ensemble(
 ) -> list[dict[str, Any]]:
     """Train the ensembles of every sub-goal of a data file and write the artefact ``out``.
 
-    Args:
-        data: the data file.
-        config: see :class:`TrainEnsembleConfig`.
-        out: the artefact to write.
-        unlabelled: spec B7: data files, or artefacts with visited states, whose unlabelled states are taken instead
-            of those of ``data``.
-        seed, force, resume, quiet, device: as for every stage.
-
-    Returns:
-        Per sub-goal, the last losses.
-
-    Raises:
-        UserError: unknown sub-goal, unusable data, or ``out`` exists.
-        NumericalError: a loss became NaN or Inf.
+    Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
+    of those of ``data``. Returns the last losses per sub-goal. An unknown sub-goal, unusable data, or an ``out`` that
+    exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
     """
     device = prepare(device)
     load_objective(config.diversity)
@@ -104,8 +93,7 @@ def train_ensemble(
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:
     """Spec B7: the data file whose unlabelled states to take: ``path``, or that of an artefact with visited states.
 
-    Raises:
-        UserError: there is none, or it is of another domain or shape than ``dataset``.
+    None, or one of another domain or shape than ``dataset``, is a ``UserError``.
     """
     file = path / VISITED if path.is_dir() else path
     if path.is_dir() and VISITED not in open_artefact(path, ("options", "meta")).whole().manifest["files"]:
@@ -143,13 +131,10 @@ def score_rows(
 ) -> Iterator[dict[str, Any]]:
     """What members know of the held-out states, one row a member and scope.
 
-    ``all`` states, and those of the ``first`` and of the ``second`` half of their contexts (layouts or rooms: see
-    :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one and scored on the other.
-
-    Yields:
-        ``scope``, ``member``, ``states``, ``positives``, ``ranking`` (area under the ROC curve), and balanced accuracy
-        at 0.5 (``balanced_accuracy``, with ``precision`` and ``recall``), above the 95th percentile of unlabelled
-        states (``at_q95``) and at the best threshold that there is (``at_best``).
+    Scopes: ``all`` states, and those of the ``first`` and of the ``second`` half of their contexts (layouts or rooms:
+    see :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one and scored on the other.
+    Balanced accuracy is at 0.5, above the 95th percentile of unlabelled states (``at_q95``) and at the best threshold
+    that there is (``at_best``).
     """
     probabilities = ensemble.predict(split.observations, positions_of(split.origins))
     elsewhere = ensemble.predict(unlabelled, positions)

@@ -43,12 +43,7 @@ class RoomsEngine(Engine):
     The right room has the true feature, none of the others has; every other feature is drawn evenly. Going into a room
     ends the episode, with a reward of 1 if it is the right one. Before them the agent sees a scene in which no feature
     holds. States are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck.
-
-    Args:
-        layout_seed: draws the rooms.
-        count: environments (E).
-        max_steps: an episode has one step, so it is never cut.
-        factors, truth, rooms: see ``RoomsConfig``.
+    ``layout_seed`` draws the rooms. An episode has one step, so it is never cut.
     """
 
     resumes = True

@@ -18,12 +18,8 @@ CELL = 8  # pixels; the first convolution's kernel and stride
 class BlockConvolution(nn.Module):
     """A convolution whose stride is its kernel size, as one matrix product: ``nn.Conv2d(c, out, size, stride=size)``.
 
-    On images as small as these that takes half the time of a convolution routine (a CPU thread).
-
-    Args:
-        channels: of the input (N, H, W, channels).
-        out: of the output (N, H / size, W / size, out).
-        size: kernel and stride; what is left over at the lower and the right edge is not looked at.
+    On images as small as these that takes half the time of a convolution routine (a CPU thread). (N, H, W, channels)
+    to (N, H / size, W / size, out); what is left over at the lower and the right edge is not looked at.
     """
 
     def __init__(self, channels: int, out: int, size: int):
