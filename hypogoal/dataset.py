@@ -159,28 +159,24 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
             _write_origins(group, states.origins)
             first = group
         else:
-            group["observations"] = first["observations"]
-            if "origin" in first:
-                group["origin"] = first["origin"]
+            group.update({name: first[name] for name in ("observations", "origin") if name in first})
         _write_column(group, "labels", labels[:, index])
 
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
     """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
-    if not len(observations):
-        group.create_dataset("observations", data=observations)  # no chunk is as small as that
-        return
-    chunk = (min(64, len(observations)), *observations.shape[1:])
-    group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
+    _store(group, "observations", observations, 64, compression="gzip", compression_opts=1)
 
 
 def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
     """One value for each state, with checksums: unlike compressed states, a label that was flipped is still a label."""
-    if not len(values):
-        group.create_dataset(name, data=values)  # no chunk is as small as that
-        return
-    chunk = (min(COLUMN_CHUNK, len(values)), *values.shape[1:])
-    group.create_dataset(name, data=values, chunks=chunk, fletcher32=True)
+    _store(group, name, values, COLUMN_CHUNK, fletcher32=True)
+
+
+def _store(group: Any, name: str, values: NDArray[Any], most: int, **filters: Any) -> None:
+    """A dataset in chunks of ``most`` states."""
+    chunks = (min(most, len(values)), *values.shape[1:])
+    group.create_dataset(name, data=values, **({"chunks": chunks, **filters} if len(values) else {}))
 
 
 def _write_origins(group: Any, origins: Mapping[str, NDArray[np.int64]]) -> None:
@@ -291,15 +287,12 @@ class Dataset:
         return {name: values.astype(np.int64) for name, values in origins.items()}
 
     def _json(self, name: str, kind: type) -> Any:
-        value = self.attributes[name]
-        foreign = UserError(
-            "not a hypogoal data file", self.path, f"Its attribute {name!r} is no JSON {kind.__name__}."
-        )
-        if not isinstance(value, str):
-            raise foreign
-        parsed = parse_json(value, self.path, f"not a hypogoal data file, its attribute {name!r} is", AGAIN)
+        parsed = self.attributes[name]
+        if isinstance(parsed, str):
+            parsed = parse_json(parsed, self.path, f"not a hypogoal data file, its attribute {name!r} is", AGAIN)
         if not isinstance(parsed, kind):
-            raise foreign
+            do = f"Its attribute {name!r} is no JSON {kind.__name__}."
+            raise UserError("not a hypogoal data file", self.path, do)
         return parsed
 
     @contextlib.contextmanager
@@ -315,9 +308,8 @@ class Dataset:
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect`` (or by the user in the same schema), a ``UserError`` where it is none."""
     if path.is_dir():
-        raise UserError(
-            "a folder where a data file is needed", path, "Give the .h5 file that 'hypogoal collect' wrote."
-        )
+        do = "Give the .h5 file that 'hypogoal collect' wrote."
+        raise UserError("a folder where a data file is needed", path, do)
     if not path.exists():
         raise UserError("no such data file", path, "Make it with 'hypogoal collect'.")
     return Dataset(path)

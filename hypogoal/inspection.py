@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,13 +40,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        return {
-            "kind": "data",
-            "path": str(path),
-            **about,
-            "config": dataset.config,
-            "counts": dataset.counts(),
-        }
+        return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
     artefact = open_artefact(path)
     keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
     return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
@@ -82,11 +76,9 @@ def lines(about: dict[str, Any]) -> list[str]:
         if key in ("path", "kind") or value is None:
             continue
         if isinstance(value, dict):
-            text.append(f"{key}:")
-            text.extend(f"  {name}: {item}" for name, item in value.items())
+            text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
         elif key == "inputs" and value:
-            text.append(f"{key}:")
-            text.extend(f"  {item['kind']} {item['path']}" for item in value)
+            text += [f"{key}:", *(f"  {item['kind']} {item['path']}" for item in value)]
         else:
             text.append(f"{key}: {value}")
     return text
@@ -107,7 +99,8 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     dataset = open_dataset(path)
     if len(dataset.observation_shape) != 3:
         raise UserError("the states are no pictures", f"observation shape {dataset.observation_shape}")
-    kinds = kinds_of(dataset.domain)
+    domain = installed_domain(dataset.domain)
+    kinds = domain.kinds if domain else ()
     written = []
     for split in SPLITS:
         for sub_goal in dataset.sub_goals:
@@ -118,18 +111,10 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
                     place.mkdir(parents=True, exist_ok=True)
                     Image.fromarray(sheet).save(file)
                 except OSError as error:
-                    reason = error.strerror or str(error)
-                    raise UserError(
-                        f"the picture cannot be written ({reason})", file, "Choose another folder."
-                    ) from None
+                    what = f"the picture cannot be written ({error.strerror or error})"
+                    raise UserError(what, file, "Choose another folder.") from None
                 written.append(file)
     return written
-
-
-def kinds_of(domain: str) -> Sequence[str]:
-    """What the values of the origin ``kind`` mean in a domain; nothing where it is not installed or has no kinds."""
-    found = installed_domain(domain)
-    return found.kinds if found else ()
 
 
 def parts_of(run: Path) -> list[Path]:
@@ -246,12 +231,10 @@ def _read_table(path: Path) -> None:
 def _read_lines(path: Path) -> None:
     """JSON, one object a line; a number that was not there yet may be NaN."""
     for number, line in enumerate(read_text(path, "the log is", AGAIN).splitlines(), 1):
-        try:
-            fits = isinstance(json.loads(line), dict)
-        except (ValueError, RecursionError):
-            fits = False
-        if not fits:
-            raise UserError(f"line {number} is no JSON object", path, AGAIN)
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(json.loads(line), dict):
+                continue
+        raise UserError(f"line {number} is no JSON object", path, AGAIN)
 
 
 def _read_arrays(path: Path) -> None:

@@ -45,9 +45,8 @@ def import_(
 
     labels = dict(text.partition("=")[::2] for text in label or ())
     if not all(name and function for name, function in labels.items()):
-        raise UserError(
-            "--label needs name=module:function", " ".join(label or ()), "For example --label won=mine:won."
-        )
+        do = "For example --label won=mine:won."
+        raise UserError("--label needs name=module:function", " ".join(label or ()), do)
     with own_code.given(*labels.values()):
         counts = stage(
             source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,

@@ -105,9 +105,8 @@ def train_options(
 
     given = {"layout_seed": layout_seed}
     config = configuration("train-options", domain_of(ensemble, "ensemble"), preset, set_, given)
-    print_outcome(
-        stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
-    )
+    numbers = stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
+    print_outcome(numbers, quiet)
     give(out)
 
 
@@ -131,12 +130,10 @@ def train_meta(
 
     given = {"layout_seed": layout_seed}
     config = configuration("train-meta", domain_of(ensemble, "ensemble"), preset, set_, given)
-    print_outcome(
-        stage(
-            ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
-        ),
-        quiet,
+    numbers = stage(
+        ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
     )
+    print_outcome(numbers, quiet)
     give(out)
 
 

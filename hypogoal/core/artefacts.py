@@ -15,17 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
+from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
-from hypogoal.core.drafts import (
-    PARTIAL,
-    check_complete,
-    check_free,
-    check_replaceable,
-    draft,
-    place_of,
-    put_in_place,
-    unfinished,
-)
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json
 from hypogoal.core.hdf5 import Busy, open_hdf5
@@ -43,6 +34,7 @@ from hypogoal.core.manifests import (
 
 DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
+DEPTH = 3  # of folders, in which a run's artefacts lie
 FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
@@ -84,8 +76,7 @@ class Artefact:
 
     def whole(self) -> Self:
         """This artefact; a ``UserError`` where its files are not as the manifest says. Costs some ms per MB."""
-        faults = check_files(self)
-        if faults:
+        if faults := check_files(self):
             raise UserError(f"the artefact is damaged ({faults[0]})", self.path, AGAIN)
         return self
 
@@ -95,9 +86,8 @@ class Artefact:
             if entry["kind"] == kind:
                 path, fault = find_input(self.path, entry)
                 if path is None:
-                    raise UserError(
-                        f"the {kind} that {self.path} was made from is {fault}", entry["path"], "Restore it."
-                    )
+                    what = f"the {kind} that {self.path} was made from is {fault}"
+                    raise UserError(what, entry["path"], "Restore it.")
                 return path
         raise UserError(f"{self.path} was made from no {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
@@ -143,11 +133,11 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
             raise UserError("the output would replace an input", path, "Choose another --out.")
     if out.exists():
         if not resume:  # of what is complete only the stage knows whether it was made as asked
-            check_replaceable(out, force=force)
+            drafts.check_replaceable(out, force=force)
         check_kind(out, kind)
-    out = place_of(out)
+    out = drafts.place_of(out)
     check_parent(out)
-    check_free(out, force=force, resume=resume)
+    drafts.check_free(out, force=force, resume=resume)
     return out
 
 
@@ -234,35 +224,26 @@ def create_artefact(
     """
     inputs = [Path(path) for path in inputs]
     given, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
-    about = {
-        "kind": kind,
-        "format": FORMAT_VERSION,
-        "config": config if isinstance(config, dict) else as_dict(config),
-        "seed": seed,
-    }
+    config = config if isinstance(config, dict) else as_dict(config)
+    about = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
     entries = [_input_entry(path, out) for path in inputs]
     check_writable({**about, "inputs": entries, "files": {}}, out)
     identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
-    if resume and out.exists() and not unfinished(out):
+    if resume and out.exists() and not drafts.unfinished(out):
         manifest = open_artefact(out, kind).manifest
         hashes = [entry["sha256"] for entry in manifest["inputs"]]
-        raise check_complete({**manifest, "inputs": hashes}, identity, given)
-    with draft(out, identity, force=force, resume=resume) as work:
+        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
+    with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
-        files = {
-            file.relative_to(work.files).as_posix(): sha256_of(file)
-            for file in sorted(work.files.rglob("*"))
-            if file.is_file()
-        }
+        made = sorted(file for file in work.files.rglob("*") if file.is_file())
+        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
         manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
         (work.files / MANIFEST).write_bytes(sealed(manifest))
-        put_in_place(work.files, out)
+        drafts.put_in_place(work.files, out)
 
 
 def _input_entry(path: Path, out: Path) -> dict[str, str]:
-    folder = path.is_dir()
-    target = path / MANIFEST if folder else path
-    kind = open_artefact(path).kind if folder else "data"
+    kind, target = (open_artefact(path).kind, path / MANIFEST) if path.is_dir() else ("data", path)
     try:
         relative = os.path.relpath(path.absolute(), out.absolute())
     except ValueError:  # Windows: on another drive
@@ -283,26 +264,21 @@ def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefa
     manifest = read_manifest(manifest_path)
     kinds = (kind,) if isinstance(kind, str) else kind
     if kinds is not None and manifest["kind"] not in kinds:
-        raise UserError(
-            f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed",
-            path,
-            "Give the right folder.",
-        )
+        what = f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed"
+        raise UserError(what, path, "Give the right folder.")
     return Artefact(path, manifest)
 
 
-def find_artefacts(run: Path, kind: str, depth: int = 3) -> list[Artefact]:
+def find_artefacts(run: Path, kind: str) -> list[Artefact]:
     """All complete artefacts of ``kind`` below ``run`` (and ``run`` itself), sorted by path."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'hypogoal run' wrote.")
     found = []
     for manifest in sorted(run.rglob(MANIFEST)):
         parts = manifest.relative_to(run).parts
-        if len(parts) <= depth + 1 and not any(part.startswith(".") for part in parts):
-            artefact = open_artefact(manifest.parent)
-            if artefact.kind == kind:
-                found.append(artefact)
-    return found
+        if len(parts) <= DEPTH + 1 and not any(part.startswith(".") for part in parts):
+            found.append(open_artefact(manifest.parent))
+    return [artefact for artefact in found if artefact.kind == kind]
 
 
 def check_files(artefact: Artefact) -> list[str]:
@@ -325,11 +301,11 @@ def extra_files(artefact: Artefact) -> list[str]:
     """What lies in the artefact's folder and is none of its files; artefacts and drafts within are no part of it."""
     known, found = {MANIFEST, *artefact.manifest["files"]}, []
     for place, folders, names in os.walk(artefact.path):
-        folder = Path(place)
-        inner = [name for name in folders if not (folder / name / MANIFEST).exists() and not name.endswith(PARTIAL)]
-        folders[:] = sorted(name for name in inner if not (folder / name).is_symlink())
-        links = [name for name in inner if (folder / name).is_symlink()]
-        found += [(folder / name).relative_to(artefact.path).as_posix() for name in sorted([*names, *links])]
+        inner = [Path(place, name) for name in folders if not name.endswith(drafts.PARTIAL)]
+        inner = [path for path in inner if not (path / MANIFEST).exists()]
+        folders[:] = sorted(path.name for path in inner if not path.is_symlink())
+        files = [*(Path(place, name) for name in names), *(path for path in inner if path.is_symlink())]
+        found += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
     return [name for name in found if name not in known]
 
 

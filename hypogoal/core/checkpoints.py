@@ -17,7 +17,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -72,9 +72,7 @@ class Checkpoints:
                     self._handlers[number] = signal.signal(number, self._note)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         if self._signal is not None and kind is None:
@@ -118,7 +116,8 @@ class Checkpoints:
 
         if self.path is None:
             return
-        arrays, tensors = _Parts(), _Parts()
+        arrays: dict[str, NDArray[Any]] = {}
+        tensors: dict[str, NDArray[Any]] = {}
         tree = _taken_apart(state, "", arrays, tensors)
         if not all(np.isfinite(values).all() for values in tensors.values() if values.dtype.kind == "f"):
             return
@@ -154,14 +153,6 @@ class Checkpoints:
         return state
 
 
-class _Parts(dict[str, NDArray[Any]]):
-    """Arrays by their place in the state."""
-
-    def add(self, place: str, values: NDArray[Any]) -> str:
-        self[place] = values if values.flags.c_contiguous else values.copy(order="C")
-        return place
-
-
 def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
     """The CRC-32 of all that is saved: a byte that a disk changed would be other weights, and not be noticed."""
     value = 0
@@ -171,18 +162,20 @@ def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
     return np.array([value], np.uint32)
 
 
-def _taken_apart(value: Any, place: str, arrays: _Parts, tensors: _Parts) -> Any:
-    """``value`` as plain JSON values, its arrays and tensors put aside."""
+def _taken_apart(value: Any, place: str, arrays: State, tensors: State) -> Any:
+    """``value`` as plain JSON values, its arrays and tensors put aside by their place."""
     if isinstance(value, dict):
         return {key: _taken_apart(item, f"{place}/{key}", arrays, tensors) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_taken_apart(item, f"{place}/{number}", arrays, tensors) for number, item in enumerate(value)]
     if isinstance(value, np.ndarray):
-        return {ARRAY: arrays.add(place, value)}
+        arrays[place] = np.asarray(value, order="C")
+        return {ARRAY: place}
     if isinstance(value, np.generic):
         return value.item()
     if hasattr(value, "detach"):
-        return {TENSOR: tensors.add(place, value.detach().cpu().numpy())}
+        tensors[place] = np.asarray(value.detach().cpu().numpy(), order="C")
+        return {TENSOR: place}
     return value
 
 

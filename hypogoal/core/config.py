@@ -37,15 +37,8 @@ def setting(
     high: float | None = None,
 ) -> Any:
     """A dataclass field with its unit, meaning, source and allowed values."""
-    metadata = {
-        "meaning": meaning,
-        "unit": unit,
-        "source": source,
-        "choices": tuple(choices) if choices is not None else None,
-        "low": low,
-        "high": high,
-    }
-    return dataclasses.field(default=default, metadata=metadata)
+    allowed = {"choices": None if choices is None else tuple(choices), "low": low, "high": high}
+    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
@@ -169,10 +162,8 @@ def describe(config_class: type, defaults: Mapping[str, Any] | None = None) -> l
 def _allowed(meta: Mapping[str, Any]) -> str:
     if meta.get("choices"):
         return "|".join(str(choice) for choice in meta["choices"])
-    low, high = meta.get("low"), meta.get("high")
-    if low is None and high is None:
-        return ""
-    return f"{'' if low is None else low} .. {'' if high is None else high}".strip()
+    low, high = ("" if meta.get(bound) is None else meta[bound] for bound in ("low", "high"))
+    return "" if low == high == "" else f"{low} .. {high}".strip()
 
 
 def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -> Any:
@@ -227,9 +218,9 @@ def _parse(kind: Any, value: Any) -> Any:
         if isinstance(value, bool):
             return value
         return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[str(value).lower()]
+    if isinstance(value, bool):  # to Python an int
+        raise TypeError
     if kind is int:
-        if isinstance(value, bool):
-            raise TypeError
         if isinstance(value, str):
             value = value.replace("_", "")
         number = float(value)
@@ -237,11 +228,7 @@ def _parse(kind: Any, value: Any) -> Any:
             raise ValueError
         return int(value) if isinstance(value, (int, str)) and str(value).lstrip("+-").isdigit() else int(number)
     if kind is float:
-        if isinstance(value, bool):
-            raise TypeError
         return float(value)
-    if kind is str:
-        if not isinstance(value, str):
-            raise TypeError
+    if kind is str and isinstance(value, str):
         return value
-    raise TypeError(f"unsupported setting type {kind}")
+    raise TypeError(f"{value!r} is no {kind}")

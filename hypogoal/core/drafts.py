@@ -271,8 +271,7 @@ def _check_own(folder: Path) -> None:
 def try_lock(file: TextIO | BinaryIO, *, shared: bool = False) -> bool | None:
     """Take the kernel's lock on a file, which whoever inherits the file holds too, until the last of them closes it.
 
-    Returns:
-        Whether it was free; None where the system cannot lock, and nobody is kept out.
+    Whether it was free; None where the system cannot lock, and nobody is kept out.
     """
     if fcntl is None:
         return None if shared else _try_lock_byte(file)

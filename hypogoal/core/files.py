@@ -130,12 +130,8 @@ def _no_number(name: str) -> NoReturn:
 def _check_depth(value: Any) -> None:
     level = [value]
     for _ in range(MAX_JSON_DEPTH):
-        level = [
-            inner
-            for item in level
-            if isinstance(item, (dict, list))
-            for inner in (item.values() if isinstance(item, dict) else item)
-        ]
+        groups = (item for item in level if isinstance(item, (dict, list)))
+        level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
         if not level:
             return
     raise RecursionError

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, NoReturn, Self
 
 from hypogoal.core.errors import Complete, NumericalError, UserError
@@ -141,9 +141,7 @@ class UsersCode:
         _running.blocks += 1
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         _running.blocks -= 1
         if error is None or isinstance(error, KeyboardInterrupt):
             return

@@ -6,7 +6,6 @@ import os
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from hypogoal.core.terminal import printable, say, screen
@@ -41,9 +40,7 @@ class Progress:
             self._task = self._bar.add_task(printable(self.title), total=self.total, numbers="")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
         elif not self.quiet and kind is None:

@@ -283,7 +283,7 @@ class DoorKeyEngine(Engine):
         }
 
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of this layout and count, its states met in this order; else a ``ValueError``."""
+        """Continue from a ``snapshot`` of this layout and count, its states met in this order; else ``ValueError``."""
         if snapshot["ids"].shape != (self.count,):
             raise ValueError(f"the snapshot is of {len(snapshot['ids'])} environments, not {self.count}")
         configurations, sites = snapshot["configurations"], snapshot["sites"]
