@@ -6,7 +6,6 @@ the lock goes on to the cell's own processes, so it ends with the last of them. 
 """
 
 import json
-import socket
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -52,10 +51,8 @@ def last_line(log: Path) -> str:
 
 def read_record(run: Path, cell: Cell) -> Record:
     """How a cell went; an empty record where it was never started, or where what is there cannot be read."""
-    path = run / LOGS / f"{cell.name}.json"
     try:
-        values = read_json(path, "the record is", AGAIN)
-        record = Record(**values)
+        record = Record(**read_json(run / LOGS / f"{cell.name}.json", "the record is", AGAIN))
         numbers = (record.attempts, record.seconds, record.started, record.code or 0)
         return record if all(isinstance(number, int | float) for number in numbers) else Record()
     except (UserError, TypeError):
@@ -65,17 +62,6 @@ def read_record(run: Path, cell: Cell) -> Record:
 def write_record(run: Path, cell: Cell, record: Record) -> None:
     """Write down how a cell went."""
     replace_text(run / LOGS / f"{cell.name}.json", json.dumps(asdict(record)) + "\n")
-
-
-def begun(before: Record) -> Record:
-    """The record of a cell that is being started."""
-    return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
-
-
-def forget_records(run: Path, cells: Sequence[Cell]) -> None:
-    """Have no record of cells: as if none of them had ever been started."""
-    for cell in cells:
-        (run / LOGS / f"{cell.name}.json").unlink(missing_ok=True)
 
 
 def excuse(run: Path, cells: Sequence[Cell]) -> None:

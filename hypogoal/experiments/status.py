@@ -133,11 +133,8 @@ def lines(status: Status) -> list[str]:
     for state in (RUNNING, FAILED):
         shown = [row for row in status.states if row.state == state]
         for row in shown[:MOST_SHOWN]:
-            where = (
-                f" on {row.record.host}"
-                if state == RUNNING and row.record.host
-                else f" ({log_of(status.run, row.cell)})"
-            )
+            host = row.record.host if state == RUNNING else ""
+            where = f" on {host}" if host else f" ({log_of(status.run, row.cell)})"
             text.append(f"  {state} {row.cell.name}{where}: {row.text}")
         if len(shown) > MOST_SHOWN:
             text.append(f"  and {len(shown) - MOST_SHOWN} more {state}")
@@ -170,14 +167,9 @@ def is_finished(cell: Cell) -> bool:
     """Whether the cell's output is there, whole, and made of what is there now; asked when all that it needs is.
 
     An evaluation or report of less than what is there now, or of something else, is not finished. What a training stage
-    made is never replaced by itself: it may be weeks of work.
-
-    Raises:
-        UserError: something else is in the output's place, a file of it was changed, or an input was changed since.
+    made is never replaced by itself, it may be weeks of work: what is something else, or changed, is a ``UserError``.
     """
-    if not cell.out.exists():
-        return False
-    if cell.out.is_dir() and not any(cell.out.iterdir()):
+    if not cell.out.exists() or (cell.out.is_dir() and not any(cell.out.iterdir())):
         return False
     try:
         fault = _fault(cell)
@@ -217,18 +209,13 @@ def _fault(cell: Cell) -> str:
         open_dataset(cell.out)
         return ""
     artefact = open_artefact(cell.out)
-    damage = check_files(artefact)
-    if damage:
+    if damage := check_files(artefact):
         return damage[0]
     for entry in artefact.manifest["inputs"]:
-        fault = find_input(artefact.path, entry)[1]
-        if fault.startswith("changed"):
+        if find_input(artefact.path, entry)[1].startswith("changed"):
             return f"its input {entry['path']} was changed since"
-    return (
-        "it is of other artefacts"
-        if cell.stage == "evaluate" and not _of_all(artefact, Path(cell.arguments[1]))
-        else ""
-    )
+    others = cell.stage == "evaluate" and not _of_all(artefact, Path(cell.arguments[1]))
+    return "it is of other artefacts" if others else ""
 
 
 def is_current(cell: Cell) -> bool:

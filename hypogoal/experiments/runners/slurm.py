@@ -167,21 +167,16 @@ def _script(array: Array, run: Path, options: Options) -> str:
 
 
 def _sweep(run: Path, what: str) -> list[str]:
-    python = shlex.join(PYTHON)
-    return [
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
-        f"exec {python} -m hypogoal sweep --out {shlex.quote(str(run))} {what}",
-    ]
+    command = f"{shlex.join(PYTHON)} -m hypogoal sweep --out {shlex.quote(str(run))} {what}"
+    return [f"cd {shlex.quote(str(Path.cwd()))} || exit 1", f"exec {command}"]
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
     dependency = [f"--dependency=afterany:{':'.join(after)}"] if after else []
     done = _command("sbatch", "--parsable", *dependency, str(script))
     if done.returncode:
-        what = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
-        raise UserError(
-            f"Slurm refuses the array ({what})", script, "Change the options; nothing was left in the queue."
-        )
+        what = f"Slurm refuses the array ({' '.join(done.stderr.split()) or f'exit code {done.returncode}'})"
+        raise UserError(what, script, "Change the options; nothing was left in the queue.")
     return done.stdout.strip().partition(";")[0]
 
 
