@@ -18,20 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core import hdf5
 from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replace_file
-from hypogoal.core.hdf5 import (
-    Foreign,
-    attribute,
-    check_dataset,
-    create_hdf5,
-    find,
-    members,
-    open_hdf5,
-    read_array,
-    set_attribute,
-)
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
@@ -126,15 +116,15 @@ def write_dataset(
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
-        with create_hdf5(partial) as file:
-            set_attribute(file, "format", DATA_FORMAT)
-            set_attribute(file, "domain", domain)
-            set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
-            set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
-            set_attribute(file, "config", json.dumps(dict(config)))
-            set_attribute(file, "seed", seed)
-            set_attribute(file, "versions", json.dumps(versions()))
-            set_attribute(file, "complete", False)  # its place is in front: a file that is cut off keeps its attributes
+        with hdf5.create_hdf5(partial) as file:
+            hdf5.set_attribute(file, "format", DATA_FORMAT)
+            hdf5.set_attribute(file, "domain", domain)
+            hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
+            hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
+            hdf5.set_attribute(file, "config", json.dumps(dict(config)))
+            hdf5.set_attribute(file, "seed", seed)
+            hdf5.set_attribute(file, "versions", json.dumps(versions()))
+            hdf5.set_attribute(file, "complete", False)  # in front: a file that is cut off keeps its attributes
             for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
                 _write_split(file, split, states, collected.sub_goals)
             group = file.create_group("unlabelled")
@@ -191,16 +181,16 @@ class Dataset:
         self.path = path
         foreign = UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
         with self._file() as file:
-            version = attribute(file, "format")
+            version = hdf5.attribute(file, "format")
             if not isinstance(version, int) or isinstance(version, bool):
                 raise foreign
             if version > DATA_FORMAT:
                 raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
             if version < DATA_FORMAT:
                 raise UserError(f"format {version} is that of an earlier hypogoal", path, AGAIN)
-            if attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal saved what was whole of a cut file
+            if hdf5.attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal saved the rest of a cut file
                 raise UserError("a part of the data file was cut off", path, AGAIN)
-            self.attributes = {name: attribute(file, name) for name in ATTRIBUTES}
+            self.attributes = {name: hdf5.attribute(file, name) for name in ATTRIBUTES}
         if not self.attributes["complete"]:
             raise UserError("the data file is not complete", path, AGAIN)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
@@ -249,41 +239,41 @@ class Dataset:
             observations = self._observations(file, base)
             labels = self._labels(file, base)
             if labels.shape != (len(observations),):
-                raise Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
+                raise hdf5.Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
             return Split(observations, labels, self._origins(file, base, len(observations)))
 
     @staticmethod
     def _labels(file: Any, base: str) -> NDArray[np.bool_]:
-        labels = read_array(file, f"{base}/labels", "bui")
+        labels = hdf5.read_array(file, f"{base}/labels", "bui")
         if labels.ndim != 1:
-            raise Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
+            raise hdf5.Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
         return labels.astype(np.bool_)
 
     def _observations(self, file: Any, base: str) -> NDArray[np.uint8]:
         name = f"{base}/observations"
         found = self._found(file, name)
         if found.shape[1:] != self.observation_shape or found.dtype != np.uint8:
-            raise Foreign(f"{name!r} is {found.dtype} {found.shape}, not uint8 (N, {self.observation_shape})")
-        return read_array(file, name, "u")
+            raise hdf5.Foreign(f"{name!r} is {found.dtype} {found.shape}, not uint8 (N, {self.observation_shape})")
+        return hdf5.read_array(file, name, "u")
 
     @staticmethod
     def _found(file: Any, name: str) -> Any:
-        found = find(file, name)
+        found = hdf5.find(file, name)
         if found is None:
-            raise Foreign(f"no readable {name!r}")
-        check_dataset(found, "u")
+            raise hdf5.Foreign(f"no readable {name!r}")
+        hdf5.check_dataset(found, "u")
         if not found.shape:
-            raise Foreign(f"{name!r} is a single number")
+            raise hdf5.Foreign(f"{name!r} is a single number")
         return found
 
     @staticmethod
     def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:
-        group = find(file, f"{base}/origin")
-        names = members(group) if group is not None else []
-        origins = {name: read_array(file, f"{base}/origin/{name}", "iub") for name in names}
+        group = hdf5.find(file, f"{base}/origin")
+        names = hdf5.members(group) if group is not None else []
+        origins = {name: hdf5.read_array(file, f"{base}/origin/{name}", "iub") for name in names}
         for name, values in origins.items():
             if values.shape != (count,):
-                raise Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")
+                raise hdf5.Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")
         return {name: values.astype(np.int64) for name, values in origins.items()}
 
     def _json(self, name: str, kind: type) -> Any:
@@ -298,10 +288,10 @@ class Dataset:
     @contextlib.contextmanager
     def _file(self) -> Iterator[Any]:
         """The file, opened; what it should not hold becomes one line."""
-        with open_hdf5(self.path, "the data file", AGAIN) as file:
+        with hdf5.open_hdf5(self.path, "the data file", AGAIN) as file:
             try:
                 yield file
-            except Foreign as error:
+            except hdf5.Foreign as error:
                 raise UserError(f"the data file cannot be used: {error}", self.path, AGAIN) from None
 
 

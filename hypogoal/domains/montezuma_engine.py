@@ -13,21 +13,13 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.base import TurnEngine
-from hypogoal.domains.montezuma_emulator import (
-    N_ACTIONS,
-    OBSERVATION_SHAPE,
-    RAM,
-    Emulator,
-    Frames,
-    Snapshot,
-    stack_frames,
-)
 from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, draw_start, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import ladder_named
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and what is not yet in it
-ROOM, X, Y, DYING = (RAM[name] for name in ("room", "x", "y", "dying"))
+ROOM, X, Y, DYING = (game.RAM[name] for name in ("room", "x", "y", "dying"))
 
 
 class MontezumaEngine(TurnEngine):
@@ -44,8 +36,8 @@ class MontezumaEngine(TurnEngine):
         seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
     """
 
-    n_actions = N_ACTIONS
-    observation_shape = OBSERVATION_SHAPE
+    n_actions = game.N_ACTIONS
+    observation_shape = game.OBSERVATION_SHAPE
     position_names = ("room", "x", "y")
 
     def __init__(
@@ -68,10 +60,10 @@ class MontezumaEngine(TurnEngine):
         self._arguments = json.dumps(
             [start, count, max_steps, start_states, along, end_at_death, memory, seed]
         ).encode()
-        self._emulators = [Emulator(seed + number) for number in range(count)]
+        self._emulators = [game.Emulator(seed + number) for number in range(count)]
         self.starts: list[Start] = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
         self._rng = rng_for(seed, "start-of-episode")
-        self._seen: list[Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
+        self._seen: list[game.Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
@@ -120,7 +112,7 @@ class MontezumaEngine(TurnEngine):
             if fixed <= state < oldest:
                 raise ValueError(f"state {state} is forgotten; the oldest kept is {oldest}")
             seen = self.starts[state].snapshot.seen if state < fixed else self._seen[self._place(state)]
-            stack_frames(seen, image)
+            game.stack_frames(seen, image)
         return out
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -173,4 +165,4 @@ class MontezumaEngine(TurnEngine):
         states = np.split(snapshot["states"], np.cumsum(snapshot["state_sizes"])[:-1])
         now = zip(self._emulators, states, stacks[-self.count :], snapshot["screens"], strict=True)
         for emulator, state, seen, screen in now:
-            emulator.restore(Snapshot(ALEState(state.tobytes()), seen, screen.copy()))
+            emulator.restore(game.Snapshot(ALEState(state.tobytes()), seen, screen.copy()))

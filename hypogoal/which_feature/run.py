@@ -19,14 +19,7 @@ from hypogoal.evaluation.plots import slug
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
-from hypogoal.which_feature.states import (
-    FACTORS,
-    KNOWN,
-    States,
-    crossed_states,
-    labelled_states,
-    unlabelled_states,
-)
+from hypogoal.which_feature.states import FACTORS, KNOWN, States, crossed_states, labelled_states, unlabelled_states
 
 CNN, ORACLE = "cnn", "oracle"  # entries that are no objectives: one member, and one taught by each factor's truth
 DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other ones of
