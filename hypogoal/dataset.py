@@ -8,7 +8,6 @@ last, so a file without it was cut off.
 
 import contextlib
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from hypogoal.core import hdf5
 from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replace_file
+from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
@@ -68,9 +67,9 @@ class Split:
     origins: Mapping[str, NDArray[np.int64]]
 
 
-def digest(picture: NDArray[np.uint8]) -> bytes:
-    """What tells pictures of one shape apart: 16 bytes."""
-    return blake2b(picture.tobytes(), digest_size=16).digest()
+def digest(picture: NDArray[np.uint8], labels: bytes | bytearray = b"") -> bytes:
+    """What tells pictures of one shape, with these labels, apart: 16 bytes."""
+    return blake2b(picture.tobytes() + labels, digest_size=16).digest()
 
 
 def leave_out(states: States, *known: NDArray[np.uint8]) -> States:
@@ -114,26 +113,21 @@ def write_dataset(
     path = claim(path, kind=DATA, force=force)
     parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    try:
-        with hdf5.create_hdf5(partial) as file:
-            hdf5.set_attribute(file, "format", DATA_FORMAT)
-            hdf5.set_attribute(file, "domain", domain)
-            hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
-            hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
-            hdf5.set_attribute(file, "config", json.dumps(dict(config)))
-            hdf5.set_attribute(file, "seed", seed)
-            hdf5.set_attribute(file, "versions", json.dumps(versions()))
-            hdf5.set_attribute(file, "complete", False)  # in front: a file that is cut off keeps its attributes
-            for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
-                _write_split(file, split, states, collected.sub_goals)
-            group = file.create_group("unlabelled")
-            write_observations(group, collected.unlabelled.observations)
-            _write_origins(group, collected.unlabelled.origins)
-            file.attrs.modify("complete", True)
-        replace_file(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as fresh, hdf5.create_hdf5(fresh) as file:
+        hdf5.set_attribute(file, "format", DATA_FORMAT)
+        hdf5.set_attribute(file, "domain", domain)
+        hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
+        hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
+        hdf5.set_attribute(file, "config", json.dumps(dict(config)))
+        hdf5.set_attribute(file, "seed", seed)
+        hdf5.set_attribute(file, "versions", json.dumps(versions()))
+        hdf5.set_attribute(file, "complete", False)  # in front: a file that is cut off keeps its attributes
+        for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
+            _write_split(file, split, states, collected.sub_goals)
+        group = file.create_group("unlabelled")
+        write_observations(group, collected.unlabelled.observations)
+        _write_origins(group, collected.unlabelled.origins)
+        file.attrs.modify("complete", True)
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ...]) -> None:

@@ -4,6 +4,7 @@ Sizes are looked at before anything is read, names before anything is opened. De
 all that is not read by a library of its own is opened with :func:`open_file`, which never waits.
 """
 
+import contextlib
 import csv
 import io
 import json
@@ -11,7 +12,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, TypeGuard
@@ -139,9 +140,16 @@ def _check_depth(value: Any) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Write a file whole or not at all: a reader finds what was there before, or ``text``."""
+    with replacing(path) as fresh:
+        fresh.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to write, called ``path`` when the block ends; gone when it raises."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
-        fresh.write_text(text, encoding="utf-8")
+        yield fresh
         replace_file(fresh, path)
     finally:
         fresh.unlink(missing_ok=True)

@@ -252,10 +252,8 @@ class DoorKeyEngine(Engine):
         ids, actions = self.distances()[0], np.array([action for action in range(N_ACTIONS) if action != DROP])
         final = self._final[ids]
         following = np.repeat(ids[:, None], len(actions), axis=1)
-        origin = ids[~final]
-        following[~final] = self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))).reshape(
-            len(origin), -1
-        )
+        each = np.broadcast_to(actions, following.shape)[~final]
+        following[~final] = self.follow(following[~final].ravel(), each.ravel()).reshape(each.shape)
         return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:

@@ -116,16 +116,12 @@ class DoorKeyGrid(MiniGridEnv):
         self.door_label, self.wrong_key = door_label, wrong_key
         self.ring: list[Key] = []
         super().__init__(
-            mission_space=MissionSpace(mission_func=self._gen_mission),
+            mission_space=MissionSpace(mission_func=lambda: MISSION),
             grid_size=SIZE,
             max_steps=max_steps,
             render_mode=render_mode,
             highlight=False,
         )
-
-    @staticmethod
-    def _gen_mission() -> str:
-        return MISSION
 
     @property
     def held(self) -> tuple[str, ...]:

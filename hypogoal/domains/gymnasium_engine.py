@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from hashlib import blake2b
 from typing import Any
 
 import gymnasium
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
+from hypogoal.dataset import digest
 from hypogoal.domains.base import TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
@@ -95,14 +95,8 @@ def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, di
         if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_kinds(given)}", do)
-        observation, reward, over, cut, info = given
-        return (
-            observation,
-            code.number(reward, "the reward"),
-            code.truth(over, "terminated"),
-            code.truth(cut, "truncated"),
-            info,
-        )
+        number, over = code.number(given[1], "the reward"), code.truth(given[2], "terminated")
+        return given[0], number, over, code.truth(given[3], "truncated"), given[4]
 
 
 def _kinds(given: object) -> str:
@@ -179,9 +173,8 @@ class GymnasiumEngine(TurnEngine):
         """The id of what an environment is in now."""
         image = as_image(env, observation, self.observation_shape)
         labels = labels_of(env, self._label_functions).tobytes()
-        digest = _digest(image, labels)
-        new = self.n_states
-        known = self._ids.get(digest)
+        look, new = digest(image, labels), self.n_states
+        known = self._ids.get(look)
         if known is not None and known >= new - self.memory:
             return known
         if len(self._ring) < 2 * self.memory:
@@ -189,13 +182,13 @@ class GymnasiumEngine(TurnEngine):
         else:
             self._ring[new % (2 * self.memory)] = image
         self._labels += labels
-        self._file(digest, new)
+        self._file(look, new)
         return new
 
-    def _file(self, digest: bytes, identity: int) -> None:
+    def _file(self, look: bytes, identity: int) -> None:
         """The newest id of this digest; those of forgotten states go."""
-        self._ids[digest] = identity
-        self._ids.move_to_end(digest)
+        self._ids[look] = identity
+        self._ids.move_to_end(look)
         if self._ids[next(iter(self._ids))] < self.oldest:
             self._ids.popitem(last=False)
 
@@ -232,7 +225,7 @@ class GymnasiumEngine(TurnEngine):
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
-            self._file(_digest(self._ring[identity % size], labels), identity)
+            self._file(digest(self._ring[identity % size], labels), identity)
         for number, actions in enumerate(snapshot["played"]):
             env = self._envs[number]
             observation, _info = begun(env, seed=self.layout_seed)
@@ -244,8 +237,3 @@ class GymnasiumEngine(TurnEngine):
                 raise UserError(what, f"layout_seed={self.layout_seed}", "Begin anew with --force.")
         self._played = [list(actions) for actions in snapshot["played"]]
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
-
-
-def _digest(image: NDArray[np.uint8], labels: bytes | bytearray) -> bytes:
-    """What a state is known by: what is seen, and its labels."""
-    return blake2b(image.tobytes() + labels, digest_size=16).digest()

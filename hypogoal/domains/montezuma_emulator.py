@@ -98,9 +98,8 @@ def load_ale(seed: int) -> Any:
         from ale_py import ALEInterface, LoggerMode
         from ale_py.roms import get_rom_path
     except ImportError as error:
-        raise UserError(
-            f"Montezuma's Revenge cannot be played ({error})", GAME, "pip install ale-py opencv-python-headless."
-        ) from None
+        what = f"Montezuma's Revenge cannot be played ({error})"
+        raise UserError(what, GAME, "pip install ale-py opencv-python-headless.") from None
     rom = get_rom_path(GAME)
     if rom is None or not rom.is_file():
         raise UserError("the emulator has no ROM of the game", GAME, "Install ale-py 0.11 or newer: its wheel has it.")
@@ -174,12 +173,10 @@ class Emulator:
         for _ in range(count):
             self.ale.act(act)
 
-    def ram(self, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """The console's memory, uint8 (128,), into ``out``; where not given, overwritten by the next call."""
-        if out is None:
-            out = self._ram
-        self.ale.getRAM(out)
-        return out
+    def ram(self) -> NDArray[np.uint8]:
+        """The console's memory, uint8 (128,), overwritten by the next call."""
+        self.ale.getRAM(self._ram)
+        return self._ram
 
     def read(self, name: str) -> int:
         """One byte of ``RAM`` by name."""

@@ -57,9 +57,8 @@ class MontezumaEngine(TurnEngine):
             raise UserError("no such engine", f"count={count}, memory={memory}", do)
         self.count, self.max_steps, self.along, self.end_at_death = count, max_steps, along, end_at_death
         self.memory: int = memory
-        self._arguments = json.dumps(
-            [start, count, max_steps, start_states, along, end_at_death, memory, seed]
-        ).encode()
+        given = [start, count, max_steps, start_states, along, end_at_death, memory, seed]
+        self._arguments = json.dumps(given).encode()
         self._emulators = [game.Emulator(seed + number) for number in range(count)]
         self.starts: list[Start] = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
         self._rng = rng_for(seed, "start-of-episode")

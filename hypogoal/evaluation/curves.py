@@ -376,8 +376,18 @@ def summary_section(material: Material) -> Block:
         "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
         "hypotheses that are true there?"
     )
-    headline = [_headline(material)] if metrics["agents"] else []
-    return page.section("summary", "Summary", [*_answers(material), asked], headline, metrics["missing"])
+    headline = page.table(
+        (AGENT, *HEADLINE),
+        metrics["agents"],
+        main=lambda agent: bool(agent["name"] == LEARNED),
+        caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
+        "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
+        f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
+        "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
+        "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
+    )
+    blocks = [headline] if metrics["agents"] else []
+    return page.section("summary", "Summary", [*_answers(material), asked], blocks, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
@@ -439,19 +449,6 @@ def runs_of(agent: Entry) -> str:
     return (
         f"{len(runs)} run{'s' if len(runs) > 1 else ''}: layout seed{'s' if len(layouts) > 1 else ''} "
         f"{page.listed(layouts)}, run seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}"
-    )
-
-
-def _headline(material: Material) -> Block:
-    return page.table(
-        (AGENT, *HEADLINE),
-        material.metrics["agents"],
-        main=lambda agent: bool(agent["name"] == LEARNED),
-        caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
-        "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
-        f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
-        "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
-        "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
 
 

@@ -186,7 +186,8 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
 
 def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: str) -> dict[str, Any]:
     option = goal["members"][member]
-    chosen, expected = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
+    counts = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
+    parts = zip(*(count[:, option["option"]] for count in counts), strict=True)
     notes = [word for word in ("most", "least") if goal[word] == member]
     return {
         "name": f"layout {run['layout_seed']}, run seed {run['seed']}{f', {settings}' if settings else ''}",
@@ -198,14 +199,10 @@ def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: 
             ("mean steps", page.fixed(option["duration"], 1)),
             ("match on this layout", page.fixed(option["match"], 2)),
         ],
-        "over": _over(chosen[:, option["option"]], expected[:, option["option"]]),
+        # Preference in each part of training; None where it was not offered.
+        "over": [round(float(chosen / expected), 3) if expected > 0 else None for chosen, expected in parts],
         "png": _overlay(material, run["path"], option["option"]),
     }
-
-
-def _over(chosen: Any, expected: Any) -> list[float | None]:
-    """Preference in each part of training; None where it was not offered."""
-    return [round(float(c / e), 3) if e > 0 else None for c, e in zip(chosen, expected, strict=True)]
 
 
 def _stopped(material: Material, row: Entry, member: int) -> dict[str, Any]:

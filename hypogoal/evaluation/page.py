@@ -249,14 +249,14 @@ def noted(member: int, words: Mapping[str, int | None], most: int | None = None)
     return f"{member} ({', '.join(told)})" if told else str(member)
 
 
-def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "", opened: bool = False) -> Block:
+def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "") -> Block:
     """A list of names and texts, folded until asked for."""
-    return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading, "open": opened}
+    return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading}
 
 
-def cell(text: str, small: str = "", mark: str = "") -> dict[str, str]:
+def cell(text: str, small: str = "") -> dict[str, str]:
     """A cell with a small remark beside its text."""
-    return {"text": text, "small": small, "class": mark}
+    return {"text": text, "small": small, "class": ""}
 
 
 def listed(items: Sequence[Any]) -> str:

@@ -103,9 +103,8 @@ def _settings(about: Mapping[str, Any]) -> list[Block]:
         same = json.dumps([artefact["kind"], varying], sort_keys=True)
         if same not in shown:
             shown.add(same)
-            blocks.append(
-                page.facts(f"Settings of {artefact['path']} ({artefact['kind']})", _lines(artefact["config"]))
-            )
+            name = f"Settings of {artefact['path']} ({artefact['kind']})"
+            blocks.append(page.facts(name, _lines(artefact["config"])))
     return blocks
 
 

@@ -456,9 +456,8 @@ def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
 def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
     """What accuracy is worth here: that of a member that never says yes, by N."""
     found = {entry["groups"]: entry["always_no"][scope] for entry in rows if entry["always_no"][scope] is not None}
-    told = [
-        f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in sorted(found.items(), key=str)
-    ]
+    every = sorted(found.items(), key=str)
+    told = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
     return f"Never saying yes has accuracy {page.listed(told)}. " if told else ""
 
 
@@ -470,12 +469,6 @@ def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
         f"At N={page.listed(bare)} no unseen room has a ladder base left, so balanced accuracy on them is not defined "
         "(–) and accuracy there is the share of negatives called negative. "
     )
-
-
-def _seeds(material: Material, rows: Sequence[Mapping[str, Any]]) -> str:
-    names = {entry["method"] for entry in rows}
-    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in names})
-    return f"Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}."
 
 
 def figures(material: Material) -> Iterator[Drawn]:
@@ -491,11 +484,12 @@ def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
         for score in ("accuracy", "balanced_accuracy")
         for scope in ("all", "unseen")
     ]
-    name = f"figure3{_suffix(material, rows)}"
+    name, methods = f"figure3{_suffix(material, rows)}", {entry["method"] for entry in rows}
+    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
     caption = (
         "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
         f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
-        f"{_seeds(material, rows)} {_why_dashes(rows)}{PAPER}"
+        f"Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. {_why_dashes(rows)}{PAPER}"
     )
     nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
     title, drawn = "Figure 3: the best member against labelled ladder groups", scores_over_groups(rows, panels)

@@ -86,13 +86,9 @@ def selection_of_run(
     late = choices.since(end - LATE * (end - begin))
     duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
     counts = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")}
-    floats = {"expected": totals["expected"], "duration": duration, "match": match}
-    columns = {
-        **counts,
-        **floats,
-        "preference": preference(totals["chosen"], totals["expected"]),
-        "late_preference": preference(late.total("chosen", options), late.total("expected", options)),
-    }
+    columns = {**counts, "expected": totals["expected"], "duration": duration, "match": match}
+    columns["preference"] = preference(totals["chosen"], totals["expected"])
+    columns["late_preference"] = preference(late.total("chosen", options), late.total("expected", options))
     by_goal = []
     for index, sub_goal in enumerate(sub_goals):
         start = index * members
@@ -157,16 +153,14 @@ def match_on_layout(path: Path, layout_seed: int) -> NDArray[np.float64]:
     return np.concatenate(match)
 
 
-def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
+def states_of_layout(engine: Engine) -> NDArray[np.int64]:
     """Of a fresh engine's layout the states that can be reached, else those that random play meets; each once."""
     if (reachable := engine.reachable()) is not None:
         return reachable
-    rng = rng_for(0, "states-of-layout")
-    met = [
-        step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids
-        for _ in range(steps // engine.count)
-    ]
-    return np.unique(np.concatenate([engine.ids, *met]))
+    rng, met = rng_for(0, "states-of-layout"), [engine.ids]
+    for _ in range(2_000 // engine.count):
+        met.append(step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids)
+    return np.unique(np.concatenate(met))
 
 
 def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:

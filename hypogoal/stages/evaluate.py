@@ -52,10 +52,8 @@ def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False,
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:
-        with (
-            create_hdf5(folder / "arrays.h5") as arrays,
-            Progress("evaluate", total=len(inputs), quiet=quiet) as progress,
-        ):
+        steps = Progress("evaluate", total=len(inputs), quiet=quiet)
+        with create_hdf5(folder / "arrays.h5") as arrays, steps as progress:
             work = Work(contents, arrays, progress)
             judge_ensembles(work, cases, workers)
             for question in QUESTIONS:

@@ -31,6 +31,8 @@ from hypogoal.hypotheses.views import positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
+PARTS = {LOG: ".jsonl", SCORES: ".scores"}  # a sub-goal's, while others are trained: beside its checkpoint
+
 
 def train_ensemble(
     data: Path,
@@ -62,12 +64,8 @@ def train_ensemble(
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
     out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
-    about = as_dict(config) | {
-        "sub_goals": list(sub_goals),
-        "observation_shape": list(dataset.observation_shape),
-        "domain": dataset.domain,
-        "domain_config": dataset.config,
-    }
+    about = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
+    about |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, len(sub_goals), workers)
     preflight("train-ensemble", out, needs, resume=resume, quiet=quiet)
@@ -84,9 +82,9 @@ def train_ensemble(
                 progress.advance(1)
 
             in_processes(jobs, workers, done)
-        for log, part_of in ((LOG, _metrics), (SCORES, _scores))[: 2 if config.score_every else 1]:
-            parts = [part_of(folder, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
-            (folder / log).write_text("".join(parts), encoding="utf-8")
+        for log, part in [*PARTS.items()][: 2 if config.score_every else 1]:
+            parts = (folder.parent / FOLDER / f"{sub_goal}{part}" for sub_goal in sub_goals)
+            (folder / log).write_text("".join(path.read_text(encoding="utf-8") for path in parts), encoding="utf-8")
     return summaries
 
 
@@ -114,16 +112,6 @@ def joined_unlabelled(files: Sequence[Path]) -> tuple[NDArray[np.uint8], dict[st
     names = set.intersection(*(set(origins) for _, origins in found))
     joined = {name: np.concatenate([origins[name] for _, origins in found]) for name in sorted(names)}
     return np.concatenate([states for states, _ in found]), joined
-
-
-def _metrics(folder: Path, sub_goal: str) -> Path:
-    """Where a sub-goal's part of ``metrics.jsonl`` is while others are trained: beside its checkpoint."""
-    return folder.parent / FOLDER / f"{sub_goal}.jsonl"
-
-
-def _scores(folder: Path, sub_goal: str) -> Path:
-    """The same of ``scores.jsonl``."""
-    return folder.parent / FOLDER / f"{sub_goal}.scores"
 
 
 def score_rows(
@@ -209,7 +197,7 @@ def _train_one(
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
-    report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)), MetricsLog(_scores(folder, sub_goal)))
+    report = _Report(sub_goal, *(MetricsLog(folder.parent / FOLDER / f"{sub_goal}{part}") for part in PARTS.values()))
     if not checkpoints.saved:
         report.log.restore(0)
         report.scores.restore(0)

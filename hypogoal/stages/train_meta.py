@@ -66,12 +66,8 @@ def train_meta(
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             train(loop, config.steps, log, progress, checkpoints_of(folder))
         write_trained(folder, loop, domain, source.config, config, seed)
-    return {
-        "steps": recorder.steps,
-        "episodes": len(recorder.episodes),
-        "success": recorder.episodes.success(),
-        "length": recorder.episodes.length(),
-    }
+    counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
+    return counted | {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
 
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
@@ -84,15 +80,10 @@ def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
 def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> None:
     made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
     if sha256_of(source.path / "manifest.json") not in made_from:
-        raise UserError(
-            "these options were trained with another ensemble",
-            trained.path,
-            f"Train them from {source.path}.",
-        )
+        do = f"Train them from {source.path}."
+        raise UserError("these options were trained with another ensemble", trained.path, do)
     for key in ("network", "termination", "layout_seed", "start", "option_timeout"):
-        if trained.config[key] != getattr(config, key):
-            raise UserError(
-                f"these options were trained with {key}={trained.config[key]}, train-meta has {getattr(config, key)}",
-                trained.path,
-                f"Give --set {key}={trained.config[key]}.",
-            )
+        theirs, ours = trained.config[key], getattr(config, key)
+        if theirs != ours:
+            what = f"these options were trained with {key}={theirs}, train-meta has {ours}"
+            raise UserError(what, trained.path, f"Give --set {key}={theirs}.")

@@ -228,9 +228,8 @@ def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
     leaves = [context.labelled, context.unlabelled, context.labelled_features, context.unlabelled_features]
     leaves.append(context.input_gradients())
     found = torch.autograd.grad(loss, leaves, allow_unused=True) if loss.requires_grad else [None] * len(leaves)
-    return [
-        torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(leaves, found, strict=True)
-    ]
+    both = zip(leaves, found, strict=True)
+    return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in both]
 
 
 OF_ENSEMBLES = (

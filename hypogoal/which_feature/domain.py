@@ -6,7 +6,6 @@ of them the reward asks for only the reward can tell: ``truth`` of the world an 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,19 @@ from hypogoal.which_feature.states import FACTORS, KNOWN, MOVED, SIDE, crossed_s
 DECKS = 64  # sets of rooms of a layout; episodes go round them
 SUB_GOALS = ("right-room",)
 HELDOUT = 20  # layouts' worth of held-out states
+
+
+DEFAULTS: Mapping[str, Mapping[str, Any]] = {
+    "train-ensemble": {
+        "network": "tiles",
+        "schedule": "sequential",
+        "diversity_weight": 0.03,
+        "steps": 600,
+        "batch_size": 32,
+        "threshold": "unlabelled-split",
+    },
+    "train-meta": {"network": "planned", "steps": 10_000},
+}
 
 
 @dataclass(frozen=True)
@@ -109,25 +121,8 @@ class RoomsDomain(Domain):
     sub_goals = SUB_GOALS
     config_class = RoomsConfig
     engine_settings = ("factors", "truth", "rooms")
-    defaults = MappingProxyType(
-        {
-            "train-ensemble": MappingProxyType(
-                {
-                    "network": "tiles",
-                    "schedule": "sequential",
-                    "diversity_weight": 0.03,
-                    "steps": 600,
-                    "batch_size": 32,
-                    "threshold": "unlabelled-split",
-                }
-            ),
-            "train-meta": MappingProxyType({"network": "planned", "steps": 10_000}),
-        }
-    )
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        return (SIDE, SIDE, 3)
+    defaults = DEFAULTS
+    observation_shape = (SIDE, SIDE, 3)
 
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and fully crossed held-out states; ``layout_seed`` of the latter parts them in 20."""

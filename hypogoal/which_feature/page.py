@@ -121,9 +121,8 @@ def _members(material: page.Material, cell: Cell, names: Sequence[str]) -> list[
         axes.grid(visible=False)
         for member, factor in np.ndindex(members, factors):
             value = cell.ranking[member, factor]
-            axes.text(
-                factor, member, f"{value:.2f}", ha="center", va="center", color=INK if 0.2 < value < 0.8 else PAPER
-            )
+            colour = INK if 0.2 < value < 0.8 else PAPER
+            axes.text(factor, member, f"{value:.2f}", ha="center", va="center", color=colour)
     label = f"What members of {cell.entry} rank by"
     caption = "Area under the ROC curve of each feature on states in which all features are crossed; 0.5 is chance."
     drawn = page.Drawn(f"owned-{cell.entry}", label, figure, caption)
