@@ -1,6 +1,7 @@
 """What all commands share: the application, its options, and how outcomes are printed."""
 
 import contextlib
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -93,8 +94,6 @@ def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:
-    import json
-
     if as_json:
         give(json.dumps(value, indent=1))
     else:

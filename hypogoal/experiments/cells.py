@@ -11,6 +11,7 @@ from hypogoal.core.files import path_part
 
 DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
 SHORT = ("--members", "--diversity", "--layout-seed", "--agent")  # options that are settings, which --set goes before
+COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # of ``results.csv``, behind those of the cell
 Axes = tuple[tuple[str, str | int | float], ...]
 
 

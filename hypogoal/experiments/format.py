@@ -20,9 +20,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_cell
+from hypogoal.experiments.cells import COLUMNS, Cell, Cost, Plan, closing_cells, stage_cell
 from hypogoal.experiments.costs import Estimates
-from hypogoal.experiments.results import COLUMNS
 from hypogoal.settings import CONFIGS, STAGES, TABLES, configuration
 
 FORMAT_VERSION = 1

@@ -23,7 +23,6 @@ from hypogoal.experiments import records
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
 from hypogoal.experiments.format import Experiment, make_plan, read_experiment
-from hypogoal.experiments.results import write_results
 from hypogoal.experiments.runners import slurm
 from hypogoal.experiments.runners.local import run_cells
 from hypogoal.experiments.status import done_of, left_of, stamp_of
@@ -237,6 +236,8 @@ def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str],
 
 def gather(out: Path) -> Path:
     """Write ``results.csv`` of what is done, which it returns, and where that is all, ``run.json``; or UserError."""
+    from hypogoal.experiments.results import write_results  # with SciPy, which a plan needs not
+
     planned, _ = records.read_plan(out)
     results = write_results(planned, out)
     if len(done_of(planned)) == len(planned.cells):

@@ -1,6 +1,7 @@
 """The laws of a diversity objective, as a test that its author runs (Spec C1, C2; see ``hypogoal.diversity``)."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -161,15 +162,14 @@ def context_of(
 def rearranged(context: Context, members: Tensor, states: Tensor) -> Context:
     """The same batch with its members and its unlabelled states in another order."""
     gradients = context.input_gradients()
-    return Context(
-        context.labels,
-        context.labelled[members],
-        context.unlabelled[members][:, states],
-        context.labelled_features[members],
-        context.unlabelled_features[members][:, states],
-        context.frozen[:, states],
-        context.positives,
-        lambda: gradients[members],
+    return replace(
+        context,
+        labelled=context.labelled[members],
+        unlabelled=context.unlabelled[members][:, states],
+        labelled_features=context.labelled_features[members],
+        unlabelled_features=context.unlabelled_features[members][:, states],
+        frozen=context.frozen[:, states],
+        input_gradients=lambda: gradients[members],
     )
 
 

@@ -11,17 +11,10 @@ from hypogoal.core.terminal import printable
 Test = tuple[str, Callable[[], str]]
 
 
-class Broken(UserError):
-    """A promise that is not kept: what was found, and what to do about it."""
-
-    def __init__(self, what: str, do: str):
-        super().__init__(what, do=do)
-
-
 def promise(kept: bool, what: str, do: str) -> None:
-    """Raises ``Broken`` where a promise is not kept: what was found, and what to do about it."""
+    """A ``UserError`` where a promise is not kept: what was found, and what to do about it."""
     if not kept:
-        raise Broken(what, do)
+        raise UserError(what, do=do)
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,8 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
         progress.resume(sum(path.exists() for path in paths))
         for cell, path in zip(wanted, paths, strict=True):
             if not path.exists():
-                replace_text(path, _text(run_cell(*cell, config)))
+                made = vars(run_cell(*cell, config))
+                replace_text(path, json.dumps(made, default=lambda array: array.tolist()) + "\n")
                 progress.advance()
     cells = [_read(path, config.factors) for path in sorted((out / "cells").glob("*.json"))]
     write_table(out / "results.csv", COLUMNS, rows_of(cells, config.factors))
@@ -197,11 +198,6 @@ def _begin(out: Path, config: WhichFeatureConfig) -> None:
     elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):
         raise UserError("this benchmark was begun with other settings", out, "Give those, or choose another --out.")
     (out / "cells").mkdir(exist_ok=True)
-
-
-def _text(cell: Cell) -> str:
-    """A cell as JSON."""
-    return json.dumps(vars(cell), default=lambda array: array.tolist()) + "\n"
 
 
 def _read(path: Path, factors: Sequence[str]) -> Cell:
