@@ -49,10 +49,7 @@ class Checkpoints:
     """One state on disk, replaced by a later one now and then; the earlier stays until the later is whole.
 
     As a context, Ctrl-C and SIGTERM wait for the next :meth:`offer`, which saves and raises ``KeyboardInterrupt`` with
-    the signal's number. A second Ctrl-C does not wait.
-
-    Args:
-        path: the file; None, nothing is ever saved.
+    the signal's number. A second Ctrl-C does not wait. Where the ``path`` is None, nothing is ever saved.
     """
 
     def __init__(self, path: Path | None):
@@ -130,9 +127,8 @@ class Checkpoints:
             replace_file(fresh, self.path)
         except (OSError, SafetensorError) as error:
             fresh.unlink(missing_ok=True)
-            raise UserError(
-                f"a checkpoint cannot be written ({error})", self.path, "Make room, then give --resume to go on."
-            ) from None
+            what = f"a checkpoint cannot be written ({error})"
+            raise UserError(what, self.path, "Make room, then give --resume to go on.") from None
 
     def load(self) -> State | None:
         """The state last saved; None where none was. A damaged file is a ``UserError``."""
@@ -147,9 +143,8 @@ class Checkpoints:
                 raise ValueError
             state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
         except (SafetensorError, KeyError, ValueError, RecursionError):
-            raise UserError(
-                "the checkpoint is damaged, or of an earlier version", self.path, "Give --force to begin anew."
-            ) from None
+            what = "the checkpoint is damaged, or of an earlier version"
+            raise UserError(what, self.path, "Give --force to begin anew.") from None
         return state
 
 

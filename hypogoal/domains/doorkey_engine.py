@@ -162,8 +162,7 @@ class DoorKeyEngine(Engine):
     def _changed(self, configuration: int, front: int, action: int) -> int:
         """The configuration after ``pickup``, ``drop`` or ``toggle`` on cell ``front``; may be the same."""
         key = (configuration * CELLS + front) * N_ACTIONS + action
-        known = self.changes.get(key)
-        if known is not None:
+        if (known := self.changes.get(key)) is not None:
             return known
         door, *keys = self._places[configuration].tolist()
         held = sum(place >= HELD for place in keys)
@@ -318,8 +317,7 @@ class DoorKeyEngine(Engine):
         return new
 
     def _number_of(self, configuration: Configuration) -> int:
-        known = self._numbers.get(configuration)
-        if known is not None:
+        if (known := self._numbers.get(configuration)) is not None:
             return known
         new = self._numbers[configuration] = len(self._rows)
         if new == len(self._places):

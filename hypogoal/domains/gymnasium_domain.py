@@ -209,10 +209,8 @@ class _Sample:
         self.offered += 1
         if len(self.kept) < self.size:
             self.kept.append(state)
-        else:
-            place = int(rng.integers(self.offered))
-            if place < self.size:
-                self.kept[place] = state
+        elif (place := int(rng.integers(self.offered))) < self.size:
+            self.kept[place] = state
 
 
 def _shared_out(groups: list[_Sample], size: int, rng: np.random.Generator) -> list[_Met]:

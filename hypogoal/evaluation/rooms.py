@@ -77,18 +77,14 @@ def room_metrics(
     origins: Mapping[str, NDArray[np.int64]],
     kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Spec F1: one ensemble's members by whether training saw the room.
+    """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
 
-    Args:
-        probabilities: float (N, K), that held-out states are reached.
-        verdicts: bool (N, K), what was made of them.
-        labels: bool (N,), the truth.
-        origins: int (N,) each: ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``.
-        kinds: names of the values of ``kind``.
+    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there are,
+    ``room`` and ``kind``, whose values have the names ``kinds``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
-        of accuracy, balanced accuracy and ``ranking`` (see ``accuracy.ranking``); ``validated``: which member the rooms
+        of accuracy, balanced accuracy and ``ranking`` (area under the ROC curve); ``validated``: which member the rooms
         of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
     """
     seen, rooms = origins["seen"], origins.get("room")
@@ -192,10 +188,8 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
         entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
         entry["ensembles"] = len(goals)
         counts = {scope: (scopes[0][scope]["positives"], scopes[0][scope]["states"]) for scope in TABLED}
-        entry["positives"] = {scope: positives for scope, (positives, _) in counts.items()}
-        entry["always_no"] = {
-            scope: 1 - yes / states if states else math.nan for scope, (yes, states) in counts.items()
-        }
+        entry["positives"] = {scope: yes for scope, (yes, _) in counts.items()}
+        entry["always_no"] = {scope: 1 - yes / of if of else math.nan for scope, (yes, of) in counts.items()}
         entry["scores"] = {
             scope: {
                 score: _by_which([each[scope]["scores"][score] for each in scopes], score, cell, score, scope)

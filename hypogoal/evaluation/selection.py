@@ -67,18 +67,11 @@ def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[st
 def selection_of_run(
     choices: Choices, match: NDArray[np.float64], sub_goals: Sequence[str], members: int
 ) -> list[dict[str, Any]]:
-    """Spec F6: how often each member was offered and chosen, beside its match.
+    """Spec F6: how often each of K members of G sub-goals was offered and chosen, beside its ``match``, float (G*K,).
 
-    Args:
-        choices: the run's table of choices.
-        match: float (G*K,), each member's balanced accuracy on the layout's reachable states.
-        sub_goals: G names.
-        members: K.
-
-    Returns:
-        A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option,
-        offered, chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last
-        quarter of training). NaN where not defined.
+    A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option, offered,
+    chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last quarter of
+    training). NaN where not defined.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}

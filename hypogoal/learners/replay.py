@@ -139,13 +139,8 @@ class StepsAhead(Resumable):
     ) -> dict[str, NDArray[Any]]:
         """One step of every sequence, arrays (E,); returns the transitions that are complete now, arrays (m,).
 
-        Args:
-            s, a, following: state ids before, actions, state ids after.
-            ended: the sequence ends with this step.
-            columns: what else is known of the step; a transition gets that of its last step.
-
-        Returns:
-            ``s``, ``a``, ``next``, ``steps`` (how far the transition reaches, 1 .. n) and ``columns``.
+        Of a step state ids before, actions, state ids after, and ``columns`` are given; of a transition ``s``, ``a``,
+        ``next``, ``steps`` (how far it reaches, 1 .. n) and the ``columns`` of its last step.
         """
         if self.n == 1:
             return {"s": s, "a": a, "next": following, "steps": np.ones(len(s), dtype=np.int64), **columns}

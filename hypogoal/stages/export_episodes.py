@@ -12,7 +12,7 @@ from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.meta.episodes import Episode, agent_of, play_episodes
-from hypogoal.own_data import write_minari
+from hypogoal.own_data.minari import write_minari
 
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")
 

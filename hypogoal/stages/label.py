@@ -12,7 +12,7 @@ from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import require_names
 from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS, Domain
-from hypogoal.own_data import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
+from hypogoal.own_data.marking import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
 
 HELD_OUT = "heldout"
 

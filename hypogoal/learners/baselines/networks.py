@@ -38,16 +38,10 @@ class BlockConvolution(nn.Module):
 class CellNetwork(BaseFeaturesExtractor):
     """Convolutions that each see a block at a time, the first one an 8 x 8 cell, then dense layers.
 
-    Where the engine's images are made of tiles, observations are the cells' tile codes (N, cells) and the first
-    convolution is computed once per tile and looked up: the same function of the image, up to rounding, several times
-    faster. Otherwise observations are float images (N, C, H, W) in 0..1.
-
-    Args:
-        space: the observation space.
-        channels: of the convolutions; those after the first have kernel 2.
-        dense: how many dense layers follow.
-        tiles: uint8 (codes, 8, 8, C), what each code looks like; None where observations are images.
-        rows: of cells in an image, where ``tiles`` is given.
+    ``channels`` are of the convolutions, those after the first with kernel 2; ``dense`` layers follow. Observations are
+    float images (N, C, H, W) in 0..1 or, where the engine's images are made of ``tiles``, uint8 (codes, 8, 8, C), so
+    many ``rows`` of them, the cells' codes (N, cells). Then the first convolution is computed once per tile and looked
+    up: the same function of the image, up to rounding, several times faster.
     """
 
     tiles: Tensor | None
