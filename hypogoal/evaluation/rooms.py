@@ -392,7 +392,7 @@ def rooms_section(material: Material) -> Block:
     )
     blocks = []
     for rows in _by_sub_goal(material):
-        blocks += [page.shown(material, _best(material, rows)), page.shown(material, _four(material, rows))]
+        blocks += [page.shown(material, figure) for figure in _drawn(material, rows)]
         blocks += [*(_table(rows, scope) for scope in TABLED), *_over_seeds(rows)]
         blocks += kinds_tables(material, rows) + room_tables(material, rows)
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
@@ -468,18 +468,19 @@ def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
 def figures(material: Material) -> Iterator[Drawn]:
     """Figure 3, and what it leaves out."""
     for rows in _by_sub_goal(material):
-        yield _best(material, rows)
-        yield _four(material, rows)
+        yield from _drawn(material, rows)
 
 
-def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
+def _drawn(material: Material, rows: Sequence[Entry]) -> Iterator[Drawn]:
+    """Of one sub-goal the best member, then every way to pick one."""
+    suffix = f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
+    methods = {entry["method"] for entry in rows}
+    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
     panels = [
         (f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
         for score in ("accuracy", "balanced_accuracy")
         for scope in ("all", "unseen")
     ]
-    name, methods = f"figure3{_suffix(material, rows)}", {entry["method"] for entry in rows}
-    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
     caption = (
         "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
         f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
@@ -487,24 +488,15 @@ def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
     )
     nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
     title, drawn = "Figure 3: the best member against labelled ladder groups", scores_over_groups(rows, panels)
-    return Drawn(name, title, drawn, caption, nothing)
-
-
-def _four(material: Material, rows: Sequence[Entry]) -> Drawn:
+    yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
     panels = [(name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
-    name = f"unseen{_suffix(material, rows)}"
     caption = (
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
         f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
         "Only the second can be had without labels from the rooms it is for."
     )
     title, drawn = "Balanced accuracy on unseen rooms", scores_over_groups(rows, panels)
-    return Drawn(name, title, drawn, caption, "As above.", file=f"figure3-{name}")
-
-
-def _suffix(material: Material, rows: Sequence[Entry]) -> str:
-    """What a figure's name ends with where there are several sub-goals."""
-    return f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
+    yield Drawn(f"unseen{suffix}", title, drawn, caption, "As above.", file=f"figure3-unseen{suffix}")
 
 
 def bands(rows: Sequence[Mapping[str, Any]]) -> str:
