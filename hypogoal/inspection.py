@@ -4,14 +4,15 @@ To verify, everything is read: schema, sizes, sha256, numbers, and whether the i
 Nothing outside the folder that was asked for is looked at.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
@@ -21,10 +22,6 @@ from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
-
-if TYPE_CHECKING:
-    from rich.console import Group
-    from rich.table import Table
 
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 

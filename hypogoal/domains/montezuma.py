@@ -219,9 +219,8 @@ class MontezumaDomain(Domain):
         seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
         seen[np.isin(heldout.origins["room"], labelled)] = SEEN_LABELLED
         heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
-        return Collected(
-            OBSERVATION_SHAPE, SUB_GOALS, _states_of(whole["labelled"]), _states_of(whole["unlabelled"]), heldout
-        )
+        learnt, others = _states_of(whole["labelled"]), _states_of(whole["unlabelled"])
+        return Collected(OBSERVATION_SHAPE, SUB_GOALS, learnt, others, heldout)
 
     def make_engine(
         self,

@@ -19,14 +19,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Judgement, Work
     from hypogoal.evaluation.numbers import Row, Rows
 
@@ -165,8 +164,6 @@ def table(
 
 def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, sections: bool = False) -> Table:
     """The same table for a terminal, 79 columns wide; a line between groups of rows where ``sections``."""
-    from rich.table import Table
-
     drawn = table(columns, entries)
     found = Table(title=title, title_justify="left", width=79)
     for column in columns:

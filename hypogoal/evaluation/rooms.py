@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
@@ -39,8 +40,6 @@ from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, lege
 from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Judgement, Work
 
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or

@@ -133,8 +133,9 @@ class RoomsDomain(Domain):
             states.unlabelled_states(config.unlabelled, config.mix, seed, names),
             crossed_states(HELDOUT * 4, seed, names),
         ]
-        told = [States(one.observations, one.factors[:, [column]], _origins(len(one.factors))) for one in sets]
         progress.advance()
+        parts = [{"layout_seed": np.arange(len(one.factors)) % HELDOUT} for one in sets]
+        told = [States(one.observations, one.factors[:, [column]], of) for one, of in zip(sets, parts, strict=True)]
         return Collected(self.observation_shape, SUB_GOALS, *told)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
@@ -148,10 +149,6 @@ def _column(factors: tuple[str, ...], truth: str) -> int:
         what = "features are planted once each, the true one among them, and all are seen in one frame"
         raise UserError(what, f"factors={','.join(factors)}, truth={truth}", f"Choose of {', '.join(FACTORS)}.")
     return factors.index(truth)
-
-
-def _origins(count: int) -> dict[str, NDArray[np.int64]]:
-    return {"layout_seed": np.arange(count) % HELDOUT}
 
 
 DOMAIN = RoomsDomain()

@@ -1,14 +1,12 @@
 """Spec H1: the benchmark's table, and a page that shows what each member owns and the states it is surest of."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.core.artefacts import versions
 from hypogoal.core.files import replace_text
@@ -19,9 +17,6 @@ from hypogoal.evaluation.plots import INK, drawing, slug
 from hypogoal.which_feature import scores
 from hypogoal.which_feature.run import Cell, WhichFeatureConfig, copies, shared
 from hypogoal.which_feature.states import crossed_states
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 TITLE = "WhichFeature"
 PAPER = "white"  # text on dark colours of a heat map
