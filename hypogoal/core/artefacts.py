@@ -119,7 +119,7 @@ def versions() -> dict[str, str]:
 
 
 def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
-    """Check, before any work is done, that ``out`` may be written, an artefact's kind, ``data`` or ``arrays``.
+    """Check, before any work is done, that ``out`` may be written as a ``kind``: an artefact's, ``data`` or ``arrays``.
 
     A ``UserError``: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
     exists and is of another kind; another process writes it; something unfinished is there and neither ``force`` nor
