@@ -78,10 +78,6 @@ def _count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= MOST_INTEGER
 
 
-def _list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and all(map(fits, value))
-
-
 def _input(value: Any) -> bool:
     return isinstance(value, dict) and all(_is_text(value.get(key)) for key in ("path", "relative", "kind", "sha256"))
 
@@ -100,7 +96,7 @@ WANTED: dict[str, Callable[[Any], bool]] = {
     "format": lambda value: type(value) is int,
     "config": lambda value: isinstance(value, dict),
     "seed": _count,
-    "inputs": _list_of(_input),
+    "inputs": lambda value: isinstance(value, list) and all(map(_input, value)),
     "files": _files,
 }
 SETTINGS: dict[str, Callable[[Any], bool]] = {

@@ -45,21 +45,13 @@ class Step(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What follows in the states that can be reached from the start, as far as it can be told.
+    """What follows in the states that can be reached from the start, as far as it can be told."""
 
-    Attributes:
-        ids: int64 (N,), the states.
-        actions: int64 (A,), those that are followed.
-        following: int64 (N, A), the state after each of them, one of ``ids``.
-        final: bool (N,), an episode ends there, so nothing follows.
-        solved: bool (N,), it ends there with the task solved.
-    """
-
-    ids: NDArray[np.int64]
-    actions: NDArray[np.int64]
-    following: NDArray[np.int64]
-    final: NDArray[np.bool_]
-    solved: NDArray[np.bool_]
+    ids: NDArray[np.int64]  # (N,), the states
+    actions: NDArray[np.int64]  # (A,), those that are followed
+    following: NDArray[np.int64]  # (N, A), the state after each of them, one of ``ids``
+    final: NDArray[np.bool_]  # (N,), an episode ends there, so nothing follows
+    solved: NDArray[np.bool_]  # (N,), it ends there with the task solved
 
 
 class Engine(ABC):

@@ -67,12 +67,8 @@ def train_meta(
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             train(loop, config.steps, log, progress, checkpoints_of(folder))
         write_trained(folder, loop, domain, source.config, config, seed)
-    return {
-        "steps": recorder.steps,
-        "episodes": len(recorder.episodes),
-        "success": recorder.episodes.success(),
-        "length": recorder.episodes.length(),
-    }
+    counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
+    return counted | {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
 
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:

@@ -31,7 +31,7 @@ from hypogoal.meta.episodes import agent_of
 from hypogoal.options.env import Options
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.networks import LightQNetwork
-from hypogoal.own_data import Played
+from hypogoal.own_data.marking import Played
 
 TESTS = Path(__file__).parents[1]
 MEMBERS = 2
