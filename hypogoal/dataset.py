@@ -8,7 +8,7 @@ last, so a file without it was cut off.
 
 import contextlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -279,14 +279,8 @@ class Dataset:
             raise UserError("not a hypogoal data file", self.path, do)
         return parsed
 
-    @contextlib.contextmanager
-    def _file(self) -> Iterator[Any]:
-        """The file, opened; what it should not hold becomes one line."""
-        with hdf5.open_hdf5(self.path, "the data file", AGAIN) as file:
-            try:
-                yield file
-            except hdf5.Foreign as error:
-                raise UserError(f"the data file cannot be used: {error}", self.path, AGAIN) from None
+    def _file(self) -> contextlib.AbstractContextManager[Any]:
+        return hdf5.open_hdf5(self.path, "the data file", AGAIN)
 
 
 def open_dataset(path: Path) -> Dataset:

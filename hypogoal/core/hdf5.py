@@ -30,23 +30,29 @@ class Busy(UserError):
     """A file that may be whole, and cannot be read now."""
 
 
-def open_hdf5(path: Path, what: str, do: str) -> Any:
+@contextlib.contextmanager
+def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
     """An HDF5 file opened for reading, locked where the file system can.
 
-    Missing, truncated or another file is a ``UserError``; open in another program to write, or not to be read,
-    ``Busy``.
+    Missing, truncated or another file, or what is found ``Foreign`` in it, is a ``UserError``; open in another program
+    to write, or not to be read, ``Busy``.
     """
     import h5py
 
     require_file(path, f"{what} is", do)
     try:
-        return h5py.File(path, "r", locking="best-effort")
+        opened = h5py.File(path, "r", locking="best-effort")
     except (OSError, ValueError, RuntimeError, KeyError) as error:
         if "unable to lock" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
             raise Busy(f"{what} is open in another program", path, "Close it there first.") from None
         if isinstance(error, PermissionError):
             raise Busy(f"{what} may not be read (permission denied)", path, "Ask for permission.") from None
         raise UserError(f"{what} is truncated or not HDF5", path, do) from None
+    with opened as file:
+        try:
+            yield file
+        except Foreign as error:
+            raise UserError(f"{what} cannot be used: {error}", path, do) from None
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, read_array, size_of
+from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import write_observations
@@ -50,21 +50,18 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
 
 def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
     with open_hdf5(path, "the dataset", DO) as file:
-        try:
-            names = [name for name in members(file) if name.startswith("episode_")]
-            place = f"observations/{key}" if key else "observations"
-            if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
-                keys = ", ".join(members(find(file, f"{names[0]}/observations")))
-                raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
-            stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
-            if stored is not None and stored[1:] != shape:
-                what = "its images are not stored as they were seen, but as JPEG"
-                raise UserError(what, path, "Make it with jpeg_encoding=False.")
-            places = [f"{name}/{place}" for name in sorted(names, key=_number)]
-            require_memory(sum(size_of(file, name, "uif") for name in places), path)
-            episodes = [read_array(file, name, "uif") for name in places]
-        except Foreign as error:
-            raise UserError(f"the dataset cannot be used: {error}", path, DO) from None
+        names = [name for name in members(file) if name.startswith("episode_")]
+        place = f"observations/{key}" if key else "observations"
+        if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
+            keys = ", ".join(members(find(file, f"{names[0]}/observations")))
+            raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
+        stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
+        if stored is not None and stored[1:] != shape:
+            what = "its images are not stored as they were seen, but as JPEG"
+            raise UserError(what, path, "Make it with jpeg_encoding=False.")
+        places = [f"{name}/{place}" for name in sorted(names, key=_number)]
+        require_memory(sum(size_of(file, name, "uif") for name in places), path)
+        episodes = [read_array(file, name, "uif") for name in places]
     if len({episode.shape[1:] for episode in episodes}) > 1 or not all(episode.ndim for episode in episodes):
         raise UserError("its episodes have observations of different shapes", path, "Give those of one shape.")
     return episodes
