@@ -11,7 +11,8 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS
+from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.domains.doorkey_env import SUB_GOALS
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import assemble
 
