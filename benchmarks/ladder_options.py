@@ -34,16 +34,39 @@ from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
 
-METHODS: dict[str, dict[str, Any]] = {
-    "dbat": {"diversity": "dbat"},
-    "none": {"diversity": "none"},
-    "cnn": {"members": 1, "diversity": "none"},
-    "oracle": {},  # ends at the true base, whatever the ensemble
+Settings = dict[str, Any]
+# What looks at the window around the agent, taught in room 1, and is made to hold in rooms nobody labelled.
+WINDOW: Settings = {
+    "network": "montezuma-crop",
+    "view": "agent-crop",
+    "batch_kind": "per-ladder",
+    "augment": "grey-context",
+    "jitter": 3,
+    "threshold": "positives-median",
+    "steps": 600,
 }
-TITLES = {"dbat": "D-BAT", "none": "no diversity", "cnn": "single CNN", "oracle": "true sub-goal"}
+HOLDS: Settings = {"termination": "patience:10000"}
+CARRIED, HOME, MORE = "carried", "1L,1M,1R", 5_000  # learned at home, then as they are elsewhere, then so much further
+METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of the ensemble and of its options
+    "dbat": ("D-BAT", {"diversity": "dbat"}, {}),
+    "none": ("no diversity", {"diversity": "none"}, {}),
+    "cnn": ("single CNN", {"members": 1, "diversity": "none"}, {}),
+    "holds-dbat": ("D-BAT", WINDOW, HOLDS),
+    "holds-none": ("no diversity", WINDOW | {"diversity": "none"}, HOLDS),
+    "holds-ram": ("true position", WINDOW | {"localiser": "ram"}, HOLDS),
+    "no-context": ("without other surroundings", WINDOW | {"augment": "grey"}, HOLDS),
+    "no-median": ("threshold .5", WINDOW | {"threshold": "0.5"}, HOLDS),
+    "no-patience": ("without patience", WINDOW, {}),
+    CARRIED: ("carried over", WINDOW, HOLDS | {"policy_view": "agent-crop"}),
+    "oracle": ("true sub-goal", {}, {"termination": "oracle"}),  # whatever the ensemble
+}
+ENSEMBLES = {CARRIED: "holds-dbat", "no-patience": "holds-dbat", "oracle": "dbat"}  # of another method
 MEMBERS, STEPS = 3, 40_000
-# The paper's Figure 4 has twelve; the tops of 4-10, 11-19 and 13-21 are bases themselves.
-LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13")
+FEWEST = 8  # ladders of which a mean is shown
+# The paper's Figure 4 has twelve, the last three among them.
+LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13", "4-10", "11-19", "13-21")
+TOP_IS_BASE = ("4-10", "11-19", "13-21")
+RUN_ON = ("0-4", "5-11", "7-13")  # their bases are tops of the next ladder
 KEYS = ("groups", "method", "seed", "ladder", "step", "member")
 NUMBERS = ("distance", "reached_base", "inside_at_start", "timed_out", "died", "duration")
 COLUMNS = (*KEYS, "ensemble_steps", *NUMBERS)
@@ -61,25 +84,43 @@ def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
     """Where the ensemble is; trained if it is not there."""
     out = work / f"{method}-{groups}-{seed}"
     if not (out / "manifest.json").exists():
-        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, **METHODS[method], "workers": 1}
-        config = TrainEnsembleConfig(**settings | {"steps": length(groups, method)})
+        own = METHODS[method][1]
+        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1, **own}
+        config = TrainEnsembleConfig(**{"steps": own.get("steps") or length(groups, method), **settings})
         train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
     return out
 
 
 def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> list[Row]:
     """Learn the options of one ensemble on one ladder; of each member the last executions' numbers."""
-    ensemble = ensemble_of(work, groups, "dbat" if method == "oracle" else method, seed)
-    ending = "oracle" if method == "oracle" else "members"
-    settings = {**DOMAIN.defaults["train-options"], "start": ladder, "steps": STEPS, "termination": ending}
+    ensemble = ensemble_of(work, groups, ENSEMBLES.get(method, method), seed)
     out = work / f"options-{groups}-{method}-{seed}-{ladder}"
-    train_options(ensemble, TrainOptionsConfig(**settings), out, seed=seed, force=True, quiet=True)
+    if method != CARRIED:
+        return _learned(ensemble, out, (groups, method, seed, ladder, STEPS))
+    home = work / f"carried-{groups}-{seed}"
+    if not (home / "manifest.json").exists():
+        _train(ensemble, home, seed, METHODS[method][2] | {"start": HOME, "steps": STEPS})
+    # First as they are (a warm-up so long that nothing is learned), then with learning.
+    rows = _learned(ensemble, out, (groups, method, seed, ladder, 0), home, {"steps": MORE, "warm_up": 10**9})
+    return rows + _learned(ensemble, out, (groups, method, seed, ladder, MORE), home, {"steps": MORE})
+
+
+def _train(ensemble: Path, out: Path, seed: int, changes: Settings, options: Path | None = None) -> None:
+    config = TrainOptionsConfig(**{**DOMAIN.defaults["train-options"], **changes})
+    train_options(ensemble, config, out, options=options, seed=seed, force=True, quiet=True)
+
+
+def _learned(
+    ensemble: Path, out: Path, cell: tuple[Any, ...], options: Path | None = None, changes: Settings | None = None
+) -> list[Row]:
+    _, method, seed, ladder, _ = cell
+    _train(ensemble, out, seed, {"start": ladder, "steps": STEPS, **METHODS[method][2], **(changes or {})}, options)
     executions, members = read_executions(out / "executions.csv"), open_artefact(out, "options").config["members"]
     trained = open_artefact(ensemble, "ensemble").config["steps"]
     rows = []
     for member in range(members):
         numbers = option_numbers(executions.of(member))
-        place = dict(zip(KEYS, (groups, method, seed, ladder, STEPS, member), strict=True))
+        place = dict(zip(KEYS, (*cell, member), strict=True))
         rows.append(place | {"ensemble_steps": trained} | {name: float(numbers[name]) for name in NUMBERS})
     shutil.rmtree(out)
     return rows
@@ -94,7 +135,8 @@ def read(path: Path, groups: int, name: str = "distance") -> Distances:
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             if int(row["groups"]) == groups:
-                seeds = found.setdefault((row["method"], row["ladder"]), {})
+                method = row["method"] if row["method"] != CARRIED else f"{CARRIED}-{row['step']}"
+                seeds = found.setdefault((method, row["ladder"]), {})
                 seed = int(row["seed"])
                 seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name]))
     return found
@@ -109,47 +151,121 @@ def tables(path: Path) -> Iterator[str]:
 
 def _tables(groups: int, found: Distances, reached: Distances, inside: Distances) -> Iterator[str]:
     methods = [method for method in METHODS if any(name == method for name, _ in found)]
-    whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in methods)]
-    seeds = sorted(set.intersection(*(set(found[method, ladder]) for method in methods for ladder in whole)))
+    learned = [method for method in methods if method != "oracle"]  # the control may lag behind
+    whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in learned)]
     yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member, mean over seeds."
     yield ""
     yield from table(
-        ["ladder", "seeds", *(TITLES[method] for method in methods)],
+        ["ladder", *(METHODS[method][0] for method in methods), "began inside: D-BAT, no diversity, CNN"],
         (
             [
                 ladder,
-                str(len(set.intersection(*(set(found[method, ladder]) for method in methods)))),
-                *(_three(found[method, ladder]) for method in methods),
+                *(_three(found.get((method, ladder), {})) for method in methods),
+                " / ".join(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned),
             ]
             for ladder in whole
         ),
     )
+    if len(whole) < FEWEST:
+        return
+    seeds = sorted(set.intersection(*(set(found[method, ladder]) for method in learned for ladder in whole)))
     yield f"Mean over {len(whole)} ladders, Student's 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
     yield ""
     yield from table(
-        [
-            "",
-            "best member",
-            "mean member",
-            f"best within {NEAR} of a base",
-            "began inside",
-            "mean member minus D-BAT's",
-        ],
+        ["", "best member", "mean member", f"best within {NEAR} of a base", "mean member minus D-BAT's"],
         (
             [
-                TITLES[method],
+                METHODS[method][0],
                 interval(over(found, method, whole, seeds, np.min), 1),
                 interval(over(found, method, whole, seeds, np.mean), 1),
                 interval(over(reached, method, whole, seeds, np.max), 2),
-                interval(over(inside, method, whole, seeds, np.mean), 2),
                 _against(found, method, whole, seeds),
             ]
-            for method in methods
+            for method in learned
         ),
     )
 
 
+def tables_that_hold(path: Path) -> Iterator[str]:
+    """What the cells of options that hold say, as lines of Markdown."""
+    found, reached = read(path, 1), read(path, 1, "reached_base")
+    methods = [method for method in ("holds-dbat", "holds-none", "holds-ram", "oracle") if _ladders(found, method)]
+    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds (how many)."
+    yield ""
+    yield from table(
+        ["ladder", *(METHODS[method][0] for method in methods), "D-BAT's mean member, seed by seed"],
+        (
+            [
+                ladder,
+                *(_bold(found.get((method, ladder), {})) for method in methods),
+                " ".join(f"{members.mean():.1f}" for _, members in sorted(found["holds-dbat", ladder].items())),
+            ]
+            for ladder in _ladders(found, "holds-dbat")
+        ),
+    )
+    groups = {
+        "nine whose base does not run on": [ladder for ladder in LADDERS if ladder not in RUN_ON],
+        "of these six whose top is no base": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *TOP_IS_BASE)],
+        "three whose base runs on": list(RUN_ON),
+    }
+    yield "Mean member, mean over ladders; Student's 95 % interval over the seeds that have all of these ladders."
+    yield ""
+    yield from table(
+        ["", *groups],
+        (
+            [METHODS[method][0], *(_of_group(found, method, ladders) for ladders in groups.values())]
+            for method in methods
+        ),
+    )
+    parts = [method for method in ("holds-dbat", "no-context", "no-median", "no-patience") if _ladders(found, method)]
+    if len(parts) > 1:
+        yield "Each part left out: best / **mean** / worst member, mean over the same seeds."
+        yield ""
+        ladders = ("3-9", "2-6")
+        seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in parts for ladder in ladders))
+        of = {key: {seed: members[seed] for seed in seeds} for key, members in found.items() if key[1] in ladders}
+        rows = ([METHODS[method][0], *(_bold(of[method, ladder]) for ladder in ladders)] for method in parts)
+        yield from table(["", *ladders], rows)
+    if _ladders(found, f"{CARRIED}-0"):
+        yield "Carried over from 1L, 1M and 1R: share of executions that end at a base, mean member (distance)."
+        yield ""
+        yield from table(
+            ["ladder", "as they are", f"after {MORE:,} steps more"],
+            (
+                [ladder, *(_share(reached, found, f"{CARRIED}-{step}", ladder) for step in (0, MORE))]
+                for ladder in _ladders(found, f"{CARRIED}-0")
+            ),
+        )
+
+
+def _ladders(found: Distances, method: str) -> list[str]:
+    return [ladder for ladder in LADDERS if (method, ladder) in found]
+
+
+def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
+    if not seeds:
+        return "-"
+    best, mean, worst = (np.mean([of(members) for members in seeds.values()]) for of in (np.min, np.mean, np.max))
+    return f"{best:.1f} / **{mean:.1f}** / {worst:.1f} ({len(seeds)})"
+
+
+def _of_group(found: Distances, method: str, ladders: list[str]) -> str:
+    seeds = set.intersection(*(set(found.get((method, ladder), {})) for ladder in ladders))
+    return interval(
+        np.array([np.mean([found[method, ladder][seed].mean() for ladder in ladders]) for seed in seeds]), 1
+    )
+
+
+def _share(reached: Distances, found: Distances, method: str, ladder: str) -> str:
+    shares, distances = (
+        np.mean([members.mean() for members in of[method, ladder].values()]) for of in (reached, found)
+    )
+    return f"{shares:.2f} ({distances:.0f})"
+
+
 def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
+    if not seeds:
+        return "-"
     return " / ".join(f"{np.mean([of(members) for members in seeds.values()]):.0f}" for of in (np.min, np.mean, np.max))
 
 
@@ -171,6 +287,10 @@ def _against(found: Distances, method: str, ladders: list[str], seeds: list[int]
     return interval(apart[0] - apart[1], 1)
 
 
+def _steps(cell: tuple[str, ...]) -> tuple[int, ...]:
+    return (0, MORE) if cell[1] == CARRIED else (STEPS,)
+
+
 def main() -> None:
     """Run the cells that are not in the file yet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -179,34 +299,36 @@ def main() -> None:
         "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
     )
     parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
-    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--methods", default="dbat,none,cnn,oracle", help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--ladders", default=",".join(LADDERS[:9]), help=f"of {', '.join(LADDERS)}")
     parser.add_argument("--seeds", type=parse_integers, default=(10,), help="10-12 or 10,12")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
-        print("\n".join(tables(arguments.csv)))
+        print("\n".join((tables_that_hold if "hold" in arguments.csv.stem else tables)(arguments.csv)))
         return
     work, methods = arguments.work, arguments.methods.split(",")
     for groups in arguments.groups:
         if not (work / f"groups-{groups}.h5").exists():
             collect(DOMAIN, MontezumaConfig(groups=groups, workers=1), work / f"groups-{groups}.h5", quiet=True)
-    trained = {"dbat" if method == "oracle" else method for method in methods}
+    trained = {ENSEMBLES.get(method, method) for method in methods}
     ensembles = [
         partial(ensemble_of, work, groups, method, seed)
         for groups in arguments.groups
         for seed in arguments.seeds
         for method in sorted(trained)
     ]
-    in_processes(ensembles, arguments.workers, lambda *_: None)
+    if arguments.workers > 1:  # else each when it is needed
+        in_processes(ensembles, arguments.workers, lambda *_: None)
     jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
         (str(groups), method, str(seed), ladder): partial(run_cell, work, groups, method, seed, ladder)
         for groups in arguments.groups
         for seed in arguments.seeds
-        for ladder in LADDERS
+        for ladder in arguments.ladders.split(",")
         for method in methods
     }
-    run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, lambda _: (STEPS,), arguments.workers)
+    run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, _steps, arguments.workers)
 
 
 if __name__ == "__main__":

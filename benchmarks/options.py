@@ -92,7 +92,7 @@ class PlainLearner:
             best = self.online(following)[row, last].argmax(1)
             ahead = self.target(following)[row, last].gather(1, best[:, None])[:, 0]
         reward = torch.from_numpy(self.reached.of(data["next"][indices].astype(np.int64))[:, 0]).float()
-        end = torch.from_numpy(data["terminal"][indices])
+        end = torch.from_numpy((data["reached"] | data["end"])[indices])
         goal = reward + 0.95 * ahead * ~end
         taken = values.gather(1, torch.from_numpy(data["a"][indices].astype(np.int64))[:, None])[:, 0]
         errors = nn.functional.huber_loss(taken, goal, reduction="none")

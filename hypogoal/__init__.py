@@ -4,13 +4,12 @@ Its environments are registered with Gymnasium. The heavy parts (torch, the envi
 first use, so that ``import hypogoal`` and the command line's ``--help`` stay fast.
 """
 
-from __future__ import annotations
-
+import importlib
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-__version__ = "0.6.0"
+__version__ = "0.7.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import OptionEnv, load_ensemble, load_options
@@ -18,15 +17,7 @@ if TYPE_CHECKING:
     from hypogoal.domains.gymnasium_domain import GymnasiumDomain
     from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 
-_LAZY = {
-    "GymnasiumDomain": "hypogoal.domains.gymnasium_domain",
-    "load_ensemble": "hypogoal.api",
-    "load_options": "hypogoal.api",
-    "OptionEnv": "hypogoal.api",
-    "SubgoalReward": "hypogoal.api",
-    "SubgoalTermination": "hypogoal.api",
-    "UserError": "hypogoal.core.errors",
-}
+_LAZY = {"GymnasiumDomain": "hypogoal.domains.gymnasium_domain", "UserError": "hypogoal.core.errors"}
 __all__ = [
     "GymnasiumDomain",
     "OptionEnv",
@@ -40,10 +31,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        import importlib
-
-        return getattr(importlib.import_module(_LAZY[name]), name)
+    if name in __all__:
+        return getattr(importlib.import_module(_LAZY.get(name, "hypogoal.api")), name)
     raise AttributeError(f"module 'hypogoal' has no attribute {name!r}")
 
 

@@ -65,7 +65,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     source = open_artefact(folder, "ensemble").whole()
     ensembles = [read_ensemble(source.path, source.config, sub_goal) for sub_goal in config["sub_goals"]]
     weights = load_tensors(artefact.path / "options.safetensors")
-    policies = make_policies(config, weights, source.config)
+    policies = make_policies(config, weights, source.config, ensembles[0])
     goals, members = tuple(config["sub_goals"]), config["members"]
     rule, length = rule_of(config["termination"])
     if rule is Patience:

@@ -8,8 +8,7 @@ last, so a file without it was cut off.
 
 import contextlib
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -18,20 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core import hdf5
 from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replace_file
-from hypogoal.core.hdf5 import (
-    Foreign,
-    attribute,
-    check_dataset,
-    create_hdf5,
-    find,
-    members,
-    open_hdf5,
-    read_array,
-    set_attribute,
-)
+from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
@@ -78,9 +67,9 @@ class Split:
     origins: Mapping[str, NDArray[np.int64]]
 
 
-def digest(picture: NDArray[np.uint8]) -> bytes:
-    """What tells pictures of one shape apart: 16 bytes."""
-    return blake2b(picture.tobytes(), digest_size=16).digest()
+def digest(picture: NDArray[np.uint8], labels: bytes | bytearray = b"") -> bytes:
+    """What tells pictures of one shape, with these labels, apart: 16 bytes."""
+    return blake2b(picture.tobytes() + labels, digest_size=16).digest()
 
 
 def leave_out(states: States, *known: NDArray[np.uint8]) -> States:
@@ -115,8 +104,7 @@ def write_dataset(
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole.
 
-    Raises:
-        UserError: see :func:`require_names`, an origin's name is none, labels are no truth values, or the file exists.
+    Names that cannot be names of files, labels that are no truth values, or a file that exists are a ``UserError``.
     """
     require_names(collected.sub_goals)
     for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
@@ -125,26 +113,21 @@ def write_dataset(
     path = claim(path, kind=DATA, force=force)
     parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    try:
-        with create_hdf5(partial) as file:
-            set_attribute(file, "format", DATA_FORMAT)
-            set_attribute(file, "domain", domain)
-            set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
-            set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
-            set_attribute(file, "config", json.dumps(dict(config)))
-            set_attribute(file, "seed", seed)
-            set_attribute(file, "versions", json.dumps(versions()))
-            set_attribute(file, "complete", False)  # its place is in front: a file that is cut off keeps its attributes
-            for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
-                _write_split(file, split, states, collected.sub_goals)
-            group = file.create_group("unlabelled")
-            write_observations(group, collected.unlabelled.observations)
-            _write_origins(group, collected.unlabelled.origins)
-            file.attrs.modify("complete", True)
-        replace_file(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as fresh, hdf5.create_hdf5(fresh) as file:
+        hdf5.set_attribute(file, "format", DATA_FORMAT)
+        hdf5.set_attribute(file, "domain", domain)
+        hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
+        hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
+        hdf5.set_attribute(file, "config", json.dumps(dict(config)))
+        hdf5.set_attribute(file, "seed", seed)
+        hdf5.set_attribute(file, "versions", json.dumps(versions()))
+        hdf5.set_attribute(file, "complete", False)  # in front: a file that is cut off keeps its attributes
+        for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
+            _write_split(file, split, states, collected.sub_goals)
+        group = file.create_group("unlabelled")
+        write_observations(group, collected.unlabelled.observations)
+        _write_origins(group, collected.unlabelled.origins)
+        file.attrs.modify("complete", True)
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ...]) -> None:
@@ -160,28 +143,24 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
             _write_origins(group, states.origins)
             first = group
         else:
-            group["observations"] = first["observations"]
-            if "origin" in first:
-                group["origin"] = first["origin"]
+            group.update({name: first[name] for name in ("observations", "origin") if name in first})
         _write_column(group, "labels", labels[:, index])
 
 
 def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
     """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
-    if not len(observations):
-        group.create_dataset("observations", data=observations)  # no chunk is as small as that
-        return
-    chunk = (min(64, len(observations)), *observations.shape[1:])
-    group.create_dataset("observations", data=observations, chunks=chunk, compression="gzip", compression_opts=1)
+    _store(group, "observations", observations, 64, compression="gzip", compression_opts=1)
 
 
 def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
     """One value for each state, with checksums: unlike compressed states, a label that was flipped is still a label."""
-    if not len(values):
-        group.create_dataset(name, data=values)  # no chunk is as small as that
-        return
-    chunk = (min(COLUMN_CHUNK, len(values)), *values.shape[1:])
-    group.create_dataset(name, data=values, chunks=chunk, fletcher32=True)
+    _store(group, name, values, COLUMN_CHUNK, fletcher32=True)
+
+
+def _store(group: Any, name: str, values: NDArray[Any], most: int, **filters: Any) -> None:
+    """A dataset in chunks of ``most`` states."""
+    chunks = (min(most, len(values)), *values.shape[1:])
+    group.create_dataset(name, data=values, **({"chunks": chunks, **filters} if len(values) else {}))
 
 
 def _write_origins(group: Any, origins: Mapping[str, NDArray[np.int64]]) -> None:
@@ -196,16 +175,16 @@ class Dataset:
         self.path = path
         foreign = UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
         with self._file() as file:
-            version = attribute(file, "format")
+            version = hdf5.attribute(file, "format")
             if not isinstance(version, int) or isinstance(version, bool):
                 raise foreign
             if version > DATA_FORMAT:
                 raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
             if version < DATA_FORMAT:
                 raise UserError(f"format {version} is that of an earlier hypogoal", path, AGAIN)
-            if attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal saved what was whole of a cut file
+            if hdf5.attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal saved the rest of a cut file
                 raise UserError("a part of the data file was cut off", path, AGAIN)
-            self.attributes = {name: attribute(file, name) for name in ATTRIBUTES}
+            self.attributes = {name: hdf5.attribute(file, name) for name in ATTRIBUTES}
         if not self.attributes["complete"]:
             raise UserError("the data file is not complete", path, AGAIN)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
@@ -254,75 +233,61 @@ class Dataset:
             observations = self._observations(file, base)
             labels = self._labels(file, base)
             if labels.shape != (len(observations),):
-                raise Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
+                raise hdf5.Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
             return Split(observations, labels, self._origins(file, base, len(observations)))
 
     @staticmethod
     def _labels(file: Any, base: str) -> NDArray[np.bool_]:
-        labels = read_array(file, f"{base}/labels", "bui")
+        labels = hdf5.read_array(file, f"{base}/labels", "bui")
         if labels.ndim != 1:
-            raise Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
+            raise hdf5.Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
         return labels.astype(np.bool_)
 
     def _observations(self, file: Any, base: str) -> NDArray[np.uint8]:
         name = f"{base}/observations"
         found = self._found(file, name)
         if found.shape[1:] != self.observation_shape or found.dtype != np.uint8:
-            raise Foreign(f"{name!r} is {found.dtype} {found.shape}, not uint8 (N, {self.observation_shape})")
-        return read_array(file, name, "u")
+            raise hdf5.Foreign(f"{name!r} is {found.dtype} {found.shape}, not uint8 (N, {self.observation_shape})")
+        return hdf5.read_array(file, name, "u")
 
     @staticmethod
     def _found(file: Any, name: str) -> Any:
-        found = find(file, name)
+        found = hdf5.find(file, name)
         if found is None:
-            raise Foreign(f"no readable {name!r}")
-        check_dataset(found, "u")
+            raise hdf5.Foreign(f"no readable {name!r}")
+        hdf5.check_dataset(found, "u")
         if not found.shape:
-            raise Foreign(f"{name!r} is a single number")
+            raise hdf5.Foreign(f"{name!r} is a single number")
         return found
 
     @staticmethod
     def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:
-        group = find(file, f"{base}/origin")
-        names = members(group) if group is not None else []
-        origins = {name: read_array(file, f"{base}/origin/{name}", "iub") for name in names}
+        group = hdf5.find(file, f"{base}/origin")
+        names = hdf5.members(group) if group is not None else []
+        origins = {name: hdf5.read_array(file, f"{base}/origin/{name}", "iub") for name in names}
         for name, values in origins.items():
             if values.shape != (count,):
-                raise Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")
+                raise hdf5.Foreign(f"{base}/origin/{name}: shape {values.shape} for {count} states")
         return {name: values.astype(np.int64) for name, values in origins.items()}
 
     def _json(self, name: str, kind: type) -> Any:
-        value = self.attributes[name]
-        foreign = UserError(
-            "not a hypogoal data file", self.path, f"Its attribute {name!r} is no JSON {kind.__name__}."
-        )
-        if not isinstance(value, str):
-            raise foreign
-        parsed = parse_json(value, self.path, f"not a hypogoal data file, its attribute {name!r} is", AGAIN)
+        parsed = self.attributes[name]
+        if isinstance(parsed, str):
+            parsed = parse_json(parsed, self.path, f"not a hypogoal data file, its attribute {name!r} is", AGAIN)
         if not isinstance(parsed, kind):
-            raise foreign
+            do = f"Its attribute {name!r} is no JSON {kind.__name__}."
+            raise UserError("not a hypogoal data file", self.path, do)
         return parsed
 
-    @contextlib.contextmanager
-    def _file(self) -> Iterator[Any]:
-        """The file, opened; what it should not hold becomes one line."""
-        with open_hdf5(self.path, "the data file", AGAIN) as file:
-            try:
-                yield file
-            except Foreign as error:
-                raise UserError(f"the data file cannot be used: {error}", self.path, AGAIN) from None
+    def _file(self) -> contextlib.AbstractContextManager[Any]:
+        return hdf5.open_hdf5(self.path, "the data file", AGAIN)
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file written by ``collect`` (or by the user in the same schema).
-
-    Raises:
-        UserError: missing, truncated, not HDF5, not ours, incomplete, or of a newer format.
-    """
+    """Open a data file written by ``collect`` (or by the user in the same schema), a ``UserError`` where it is none."""
     if path.is_dir():
-        raise UserError(
-            "a folder where a data file is needed", path, "Give the .h5 file that 'hypogoal collect' wrote."
-        )
+        do = "Give the .h5 file that 'hypogoal collect' wrote."
+        raise UserError("a folder where a data file is needed", path, do)
     if not path.exists():
         raise UserError("no such data file", path, "Make it with 'hypogoal collect'.")
     return Dataset(path)

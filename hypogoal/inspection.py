@@ -4,14 +4,15 @@ To verify, everything is read: schema, sizes, sha256, numbers, and whether the i
 Nothing outside the folder that was asked for is looked at.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
@@ -21,10 +22,6 @@ from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
-
-if TYPE_CHECKING:
-    from rich.console import Group
-    from rich.table import Table
 
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
@@ -40,22 +37,14 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        return {
-            "kind": "data",
-            "path": str(path),
-            **about,
-            "config": dataset.config,
-            "counts": dataset.counts(),
-        }
+        return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
     artefact = open_artefact(path)
     keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
     return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
-    """What ``metrics.json`` holds of an evaluation, or of a run's own; None where there is none, damaged a
-    ``UserError``.
-    """
+    """What ``metrics.json`` of an evaluation or of a run's holds; None where there is none, damaged a ``UserError``."""
     from hypogoal.evaluation.run import read_numbers
 
     for folder in (path, path / EVALUATION):
@@ -66,9 +55,7 @@ def numbers_of(path: Path) -> Mapping[str, Any] | None:
 
 
 def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
-    """The headline numbers of an evaluation, from :func:`numbers_of`, as tables; a ``UserError`` where they are
-    damaged.
-    """
+    """The headline numbers, from :func:`numbers_of`, as tables; a ``UserError`` where they are damaged."""
     from hypogoal.evaluation.questions import summary_table
 
     try:
@@ -86,11 +73,9 @@ def lines(about: dict[str, Any]) -> list[str]:
         if key in ("path", "kind") or value is None:
             continue
         if isinstance(value, dict):
-            text.append(f"{key}:")
-            text.extend(f"  {name}: {item}" for name, item in value.items())
+            text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
         elif key == "inputs" and value:
-            text.append(f"{key}:")
-            text.extend(f"  {item['kind']} {item['path']}" for item in value)
+            text += [f"{key}:", *(f"  {item['kind']} {item['path']}" for item in value)]
         else:
             text.append(f"{key}: {value}")
     return text
@@ -111,7 +96,8 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     dataset = open_dataset(path)
     if len(dataset.observation_shape) != 3:
         raise UserError("the states are no pictures", f"observation shape {dataset.observation_shape}")
-    kinds = kinds_of(dataset.domain)
+    domain = installed_domain(dataset.domain)
+    kinds = domain.kinds if domain else ()
     written = []
     for split in SPLITS:
         for sub_goal in dataset.sub_goals:
@@ -122,18 +108,10 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
                     place.mkdir(parents=True, exist_ok=True)
                     Image.fromarray(sheet).save(file)
                 except OSError as error:
-                    reason = error.strerror or str(error)
-                    raise UserError(
-                        f"the picture cannot be written ({reason})", file, "Choose another folder."
-                    ) from None
+                    what = f"the picture cannot be written ({error.strerror or error})"
+                    raise UserError(what, file, "Choose another folder.") from None
                 written.append(file)
     return written
-
-
-def kinds_of(domain: str) -> Sequence[str]:
-    """What the values of the origin ``kind`` mean in a domain; nothing where it is not installed or has no kinds."""
-    found = installed_domain(domain)
-    return found.kinds if found else ()
 
 
 def parts_of(run: Path) -> list[Path]:
@@ -250,12 +228,10 @@ def _read_table(path: Path) -> None:
 def _read_lines(path: Path) -> None:
     """JSON, one object a line; a number that was not there yet may be NaN."""
     for number, line in enumerate(read_text(path, "the log is", AGAIN).splitlines(), 1):
-        try:
-            fits = isinstance(json.loads(line), dict)
-        except (ValueError, RecursionError):
-            fits = False
-        if not fits:
-            raise UserError(f"line {number} is no JSON object", path, AGAIN)
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(json.loads(line), dict):
+                continue
+        raise UserError(f"line {number} is no JSON object", path, AGAIN)
 
 
 def _read_arrays(path: Path) -> None:

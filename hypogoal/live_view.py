@@ -35,25 +35,15 @@ LARGEST = 1e300  # of what is drawn
 
 @dataclass(frozen=True)
 class Progressing:
-    """One artefact that is made, or was.
+    """One artefact that is made, or was."""
 
-    Attributes:
-        name: its path within the run.
-        sub_goal: that an ensemble is at; empty for others.
-        seconds: since its log was written; None when it is complete.
-        step: the last logged.
-        watched: what is followed (one of ``WATCHED``), empty where there is nothing to follow.
-        series: its values so far.
-        lines: its log so far, of an ensemble of all sub-goals.
-    """
-
-    name: str
-    sub_goal: str
-    seconds: float | None
-    step: int
-    watched: str
-    series: tuple[float, ...]
-    lines: list[dict[str, Any]]
+    name: str  # its path within the run
+    sub_goal: str  # that an ensemble is at; empty for others
+    seconds: float | None  # since its log was written; None when it is complete
+    step: int  # the last logged
+    watched: str  # what is followed (one of ``WATCHED``), empty where there is nothing to follow
+    series: tuple[float, ...]  # its values so far
+    lines: list[dict[str, Any]]  # its log so far, of an ensemble of all sub-goals
 
     @property
     def title(self) -> str:
@@ -91,12 +81,9 @@ def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> Non
 def mirror(rows: Iterable[Progressing], boards: Boards) -> None:
     """What is new in the logs to TensorBoard: a folder per artefact, of an ensemble one per sub-goal."""
     for row in rows:
-        by_place: dict[str, list[dict[str, Any]]] = {}
-        for line in row.lines:
-            place = f"{row.name}/{line['sub_goal']}" if "sub_goal" in line else row.name
-            by_place.setdefault(place, []).append(line)
-        for place, lines in by_place.items():
-            boards.add(place, lines, time.time())
+        for goal in dict.fromkeys(line.get("sub_goal") for line in row.lines):
+            lines = [line for line in row.lines if line.get("sub_goal") == goal]
+            boards.add(row.name if goal is None else f"{row.name}/{goal}", lines, time.time())
 
 
 def finished(run: Path) -> bool:
@@ -142,13 +129,10 @@ def _lines(log: Path) -> list[dict[str, Any]]:
             value = json.loads(line)
         except (ValueError, RecursionError):
             continue
-        if isinstance(value, dict) and _is_step(value.get("step")) and plain_name(value.get("sub_goal", "none")):
-            found.append(value)
+        if isinstance(value, dict) and plain_name(value.get("sub_goal", "none")):
+            step = value.get("step")
+            found += [value] if type(step) is int and 0 <= step <= MOST_INTEGER else []
     return found
-
-
-def _is_step(value: Any) -> bool:
-    return type(value) is int and 0 <= value <= MOST_INTEGER
 
 
 def _is_number(value: Any) -> bool:
@@ -161,11 +145,8 @@ def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
     table = Table(box=None, padding=(0, 1, 0, 0), width=WIDTH - 1, title_justify="left", caption_justify="left")
     making = sum(row.seconds is not None for row in rows)
     table.title = f"{making} in the making, {len(rows) - making} complete"
-    table.add_column("artefact", width=NAME, no_wrap=True)
-    table.add_column("written", width=10, justify="right", no_wrap=True)
-    table.add_column("step", width=9, justify="right", no_wrap=True)
-    table.add_column("now", width=14, no_wrap=True)
-    table.add_column("so far", width=CURVE, no_wrap=True)
+    for name, width in (("artefact", NAME), ("written", 10), ("step", 9), ("now", 14), ("so far", CURVE)):
+        table.add_column(name, width=width, justify="right" if name in ("written", "step") else "left", no_wrap=True)
     shown = rows if most is None or len(rows) <= most else rows[: max(1, most - 1)]
     for row in shown:
         table.add_row(
@@ -217,9 +198,8 @@ class Boards:
             from tensorboard.compat.proto.summary_pb2 import Summary
             from tensorboard.summary.writer.record_writer import RecordWriter
         except ImportError:
-            raise UserError(
-                "TensorBoard is not installed", out, "Install it: pip install 'hypogoal[tensorboard]'."
-            ) from None
+            do = "Install it: pip install 'hypogoal[tensorboard]'."
+            raise UserError("TensorBoard is not installed", out, do) from None
         if os.path.lexists(out):
             raise UserError("the folder exists already", out, "Name another one, or remove it.")
         self._event, self._summary, self._writer = Event, Summary, RecordWriter
@@ -233,9 +213,7 @@ class Boards:
         shows the time ``now``, in seconds since 1970.
         """
         folder = inside(self._out, printable(place)) or self._out
-        events = []
-        if folder not in self._steps:
-            events.append(self._event(wall_time=now, file_version="brain.Event:2"))
+        events = [] if folder in self._steps else [self._event(wall_time=now, file_version="brain.Event:2")]
         for line in lines:
             step = line.get("step")
             if not isinstance(step, int) or step <= self._steps.get(folder, -1):

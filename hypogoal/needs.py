@@ -85,8 +85,7 @@ def baseline_needs(observation: int, replay: int) -> Needs:
 def evaluation_needs(data: list[Path], workers: int = 1) -> Needs:
     """``evaluate``: the held-out and unlabelled states of one data file at a time, twice, in each of its processes."""
     largest = 0
-    for path in data:
-        dataset = open_dataset(path)
+    for dataset in map(open_dataset, data):
         counts = dataset.counts()
         heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
         largest = max(largest, (heldout + counts["unlabelled"]) * prod(dataset.observation_shape))

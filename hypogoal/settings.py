@@ -1,7 +1,6 @@
 """The stages that have settings, listed once: a new one is a line here, its file and its command."""
 
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Any
 
 from hypogoal.core.config import resolve
@@ -9,15 +8,13 @@ from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import AuditConfig, TrainMetaConfig, TrainOptionsConfig
 
-CONFIGS: Mapping[str, type] = MappingProxyType(
-    {
-        "train-ensemble": TrainEnsembleConfig,
-        "train-options": TrainOptionsConfig,
-        "train-meta": TrainMetaConfig,
-        "train-baseline": BaselineConfig,
-        "audit": AuditConfig,
-    }
-)
+CONFIGS: Mapping[str, type] = {
+    "train-ensemble": TrainEnsembleConfig,
+    "train-options": TrainOptionsConfig,
+    "train-meta": TrainMetaConfig,
+    "train-baseline": BaselineConfig,
+    "audit": AuditConfig,
+}
 STAGES = ("collect", *CONFIGS)  # whose settings are its domain's
 TABLES = (*STAGES, "run")  # of presets
 

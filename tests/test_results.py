@@ -5,15 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bandits, choosing, hypotheses, labels, ladders, thresholds, which_feature
+from benchmarks import bandits, choosing, hypotheses, labels, ladder_options, ladders, thresholds, which_feature
 from benchmarks.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
+    "figure4-ladders": ladder_options.tables,
     "hypotheses-doorkey": hypotheses.tables,
     "hypotheses-ladders": ladders.tables,
     "labels-doorkey": labels.tables,
+    "options-that-hold": ladder_options.tables_that_hold,
     "thresholds-doorkey": thresholds.tables,
     "which-feature": which_feature.tables,
     "which-feature-bandits": bandits.tables,

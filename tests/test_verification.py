@@ -20,7 +20,7 @@ from hypogoal.stages.train_ensemble import unlabelled_file
 TESTS = Path(__file__).parent
 FEW = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison")
-MAY = {"executions.csv"}, ("figures/", "videos/")  # what settings do not say
+MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/")  # what settings do not say
 
 
 @pytest.fixture(scope="module")

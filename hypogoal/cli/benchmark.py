@@ -1,7 +1,5 @@
 """Benchmarks of hypothesis learning: what an objective finds where the answer is known (Spec H1)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,9 +1,7 @@
 """What all commands share: the application, its options, and how outcomes are printed."""
 
-from __future__ import annotations
-
 import contextlib
-import math
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -91,16 +89,11 @@ def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
 def print_outcome(numbers: dict[str, Any], quiet: bool) -> None:
     """What training came to; what NaN says, that no episode has ended, the number of episodes says too."""
     if not quiet:
-        known = {key: value for key, value in numbers.items() if not (isinstance(value, float) and math.isnan(value))}
-        text = ", ".join(
-            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in known.items()
-        )
-        say(text)
+        texts = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in numbers.items()}
+        say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"))
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:
-    import json
-
     if as_json:
         give(json.dumps(value, indent=1))
     else:

@@ -21,10 +21,9 @@ def show(
     """What is this: kind, configuration, inputs; of data the counts, of an evaluation or its run the numbers."""
     from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
 
-    about = describe_path(path)
+    about, numbers = describe_path(path), None
     if not as_json:
         echo(about, False, lines(about))
-    numbers = None
     try:
         numbers = numbers_of(path)
     except UserError as error:  # what it is can be told all the same

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
+from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import give, say
 
@@ -40,14 +42,12 @@ def import_(
 ) -> None:
     """Make a data file of own states: arrays, images, or a Minari dataset with label functions."""
     from hypogoal.core import own_code
-    from hypogoal.core.errors import UserError
     from hypogoal.stages.import_data import import_data as stage
 
     labels = dict(text.partition("=")[::2] for text in label or ())
     if not all(name and function for name, function in labels.items()):
-        raise UserError(
-            "--label needs name=module:function", " ".join(label or ()), "For example --label won=mine:won."
-        )
+        do = "For example --label won=mine:won."
+        raise UserError("--label needs name=module:function", " ".join(label or ()), do)
     with own_code.given(*labels.values()):
         counts = stage(
             source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,
@@ -123,10 +123,6 @@ def label(
 
 def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
     """``KEY=VALUE``, the value as JSON where it is some, else as text."""
-    import json
-
-    from hypogoal.core.errors import UserError
-
     found: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
@@ -153,7 +149,6 @@ def check(
     --set changes how states of the domain are collected, as for 'collect'; they are collected twice.
     """
     from hypogoal.core import own_code
-    from hypogoal.core.errors import UserError
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")

@@ -1,7 +1,5 @@
 """The commands that make something: one stage each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -92,6 +90,10 @@ def train_ensemble(
 def train_options(
     ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
     out: Out,
+    options: Annotated[
+        Path | None,
+        typer.Option(help="Go on with these options of the same ensemble, from another start or elsewhere."),
+    ] = None,
     layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
@@ -107,9 +109,10 @@ def train_options(
 
     given = {"layout_seed": layout_seed}
     config = configuration("train-options", domain_of(ensemble, "ensemble"), preset, set_, given)
-    print_outcome(
-        stage(ensemble, config, out, seed=seed, force=force, resume=resume, quiet=quiet, device=device), quiet
+    numbers = stage(
+        ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
     )
+    print_outcome(numbers, quiet)
     give(out)
 
 
@@ -133,12 +136,10 @@ def train_meta(
 
     given = {"layout_seed": layout_seed}
     config = configuration("train-meta", domain_of(ensemble, "ensemble"), preset, set_, given)
-    print_outcome(
-        stage(
-            ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
-        ),
-        quiet,
+    numbers = stage(
+        ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
     )
+    print_outcome(numbers, quiet)
     give(out)
 
 

@@ -4,8 +4,6 @@ What has a manifest is complete (Spec A8). The manifest says what made the artef
 resolved configuration, the seed, the sha256 of every file and of every input's manifest, package versions.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -15,19 +13,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
-from hypogoal.core.drafts import (
-    PARTIAL,
-    check_complete,
-    check_free,
-    check_replaceable,
-    draft,
-    place_of,
-    put_in_place,
-    unfinished,
-)
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json
 from hypogoal.core.hdf5 import Busy, open_hdf5
@@ -45,6 +34,7 @@ from hypogoal.core.manifests import (
 
 DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
+DEPTH = 3  # of folders, in which a run's artefacts lie
 FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
@@ -71,7 +61,7 @@ class Artefact:
 
     @property
     def kind(self) -> str:
-        """ensemble, options, meta, baseline, evaluation, report, comparison or audit."""
+        """ensemble, options, meta, baseline, evaluation or report."""
         return str(self.manifest["kind"])
 
     @property
@@ -84,26 +74,20 @@ class Artefact:
         """The seed that made it."""
         return int(self.manifest["seed"])
 
-    def whole(self) -> Artefact:
-        """This artefact, asked for before a stage starts (some ms per MB): its files are as the manifest says, or
-        UserError.
-        """
-        faults = check_files(self)
-        if faults:
+    def whole(self) -> Self:
+        """This artefact; a ``UserError`` where its files are not as the manifest says. Costs some ms per MB."""
+        if faults := check_files(self):
             raise UserError(f"the artefact is damaged ({faults[0]})", self.path, AGAIN)
         return self
 
     def input(self, kind: str) -> Path:
-        """The input of ``kind``: beside this artefact, else as recorded; gone, changed since, or never read is a
-        ``UserError``.
-        """
+        """The input of ``kind``, beside this artefact, else as recorded; gone or changed since, a ``UserError``."""
         for entry in self.manifest["inputs"]:
             if entry["kind"] == kind:
                 path, fault = find_input(self.path, entry)
                 if path is None:
-                    raise UserError(
-                        f"the {kind} that {self.path} was made from is {fault}", entry["path"], "Restore it."
-                    )
+                    what = f"the {kind} that {self.path} was made from is {fault}"
+                    raise UserError(what, entry["path"], "Restore it.")
                 return path
         raise UserError(f"{self.path} was made from no {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
@@ -135,19 +119,11 @@ def versions() -> dict[str, str]:
 
 
 def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
-    """Check, before any work is done, that ``out`` may be written; nothing is made yet.
+    """Check, before any work is done, that ``out`` may be written as a ``kind``: an artefact's, ``data`` or ``arrays``.
 
-    Args:
-        out: the output.
-        kind: what it is to be: that of an artefact, ``data`` or ``arrays``.
-        inputs: what is read to make it.
-        force: replace what is there.
-        resume: go on with what is unfinished; what is complete is left to ``create_artefact``.
-
-    Raises:
-        UserError: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
-            exists and is of another kind; another process writes it; something unfinished is there and neither
-            ``force`` nor ``resume`` says what to do with it.
+    A ``UserError``: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
+    exists and is of another kind; another process writes it; something unfinished is there and neither ``force`` nor
+    ``resume`` says what to do with it. What is there complete is with ``resume`` left to ``create_artefact``.
     """
     place = out.resolve()
     if len(os.fsencode(place.name)) > MAX_NAME_BYTES:  # the draft's name is longer
@@ -157,11 +133,11 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
             raise UserError("the output would replace an input", path, "Choose another --out.")
     if out.exists():
         if not resume:  # of what is complete only the stage knows whether it was made as asked
-            check_replaceable(out, force=force)
+            drafts.check_replaceable(out, force=force)
         check_kind(out, kind)
-    out = place_of(out)
+    out = drafts.place_of(out)
     check_parent(out)
-    check_free(out, force=force, resume=resume)
+    drafts.check_free(out, force=force, resume=resume)
     return out
 
 
@@ -238,55 +214,36 @@ def create_artefact(
 ) -> Iterator[Path]:
     """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
 
-    Args:
-        out: the artefact's final folder.
-        kind: see ``Artefact.kind``.
-        config: the resolved configuration, a dataclass or a dict.
-        seed: the seed that makes it.
-        inputs: artefact folders or data files that were read.
-        force: replace an existing artefact, begin anew what is unfinished.
-        resume: go on with what is unfinished, where there is something.
-
-    Yields:
-        The folder to write into; ``checkpoints_of`` knows where the checkpoints beside it are. When the block raises,
-        ``out`` is as it was, and the folder is removed unless it has a checkpoint.
+    ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are artefact folders or data files that
+    were read. ``checkpoints_of`` knows where the checkpoints beside the folder are. When the block raises, ``out`` is
+    as it was, and the folder is removed unless it has a checkpoint.
 
     Raises:
-        UserError: as of ``claim``, or what is there, unfinished or complete, was begun with another configuration,
-            seed or inputs.
+        UserError: see :func:`claim`, or what is there was begun with another configuration, seed or inputs.
         Complete: with ``resume``, it was made with these.
     """
     inputs = [Path(path) for path in inputs]
     given, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
-    about = {
-        "kind": kind,
-        "format": FORMAT_VERSION,
-        "config": config if isinstance(config, dict) else as_dict(config),
-        "seed": seed,
-    }
+    config = config if isinstance(config, dict) else as_dict(config)
+    about = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
     entries = [_input_entry(path, out) for path in inputs]
     check_writable({**about, "inputs": entries, "files": {}}, out)
     identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
-    if resume and out.exists() and not unfinished(out):
+    if resume and out.exists() and not drafts.unfinished(out):
         manifest = open_artefact(out, kind).manifest
         hashes = [entry["sha256"] for entry in manifest["inputs"]]
-        raise check_complete({**manifest, "inputs": hashes}, identity, given)
-    with draft(out, identity, force=force, resume=resume) as work:
+        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
+    with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
-        files = {
-            file.relative_to(work.files).as_posix(): sha256_of(file)
-            for file in sorted(work.files.rglob("*"))
-            if file.is_file()
-        }
+        made = sorted(file for file in work.files.rglob("*") if file.is_file())
+        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
         manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
         (work.files / MANIFEST).write_bytes(sealed(manifest))
-        put_in_place(work.files, out)
+        drafts.put_in_place(work.files, out)
 
 
 def _input_entry(path: Path, out: Path) -> dict[str, str]:
-    folder = path.is_dir()
-    target = path / MANIFEST if folder else path
-    kind = open_artefact(path).kind if folder else "data"
+    kind, target = (open_artefact(path).kind, path / MANIFEST) if path.is_dir() else ("data", path)
     try:
         relative = os.path.relpath(path.absolute(), out.absolute())
     except ValueError:  # Windows: on another drive
@@ -307,26 +264,21 @@ def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefa
     manifest = read_manifest(manifest_path)
     kinds = (kind,) if isinstance(kind, str) else kind
     if kinds is not None and manifest["kind"] not in kinds:
-        raise UserError(
-            f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed",
-            path,
-            "Give the right folder.",
-        )
+        what = f"this is a {manifest['kind']!r} artefact, but {' or '.join(kinds)} is needed"
+        raise UserError(what, path, "Give the right folder.")
     return Artefact(path, manifest)
 
 
-def find_artefacts(run: Path, kind: str, depth: int = 3) -> list[Artefact]:
+def find_artefacts(run: Path, kind: str) -> list[Artefact]:
     """All complete artefacts of ``kind`` below ``run`` (and ``run`` itself), sorted by path."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'hypogoal run' wrote.")
     found = []
     for manifest in sorted(run.rglob(MANIFEST)):
         parts = manifest.relative_to(run).parts
-        if len(parts) <= depth + 1 and not any(part.startswith(".") for part in parts):
-            artefact = open_artefact(manifest.parent)
-            if artefact.kind == kind:
-                found.append(artefact)
-    return found
+        if len(parts) <= DEPTH + 1 and not any(part.startswith(".") for part in parts):
+            found.append(open_artefact(manifest.parent))
+    return [artefact for artefact in found if artefact.kind == kind]
 
 
 def check_files(artefact: Artefact) -> list[str]:
@@ -349,11 +301,11 @@ def extra_files(artefact: Artefact) -> list[str]:
     """What lies in the artefact's folder and is none of its files; artefacts and drafts within are no part of it."""
     known, found = {MANIFEST, *artefact.manifest["files"]}, []
     for place, folders, names in os.walk(artefact.path):
-        folder = Path(place)
-        inner = [name for name in folders if not (folder / name / MANIFEST).exists() and not name.endswith(PARTIAL)]
-        folders[:] = sorted(name for name in inner if not (folder / name).is_symlink())
-        links = [name for name in inner if (folder / name).is_symlink()]
-        found += [(folder / name).relative_to(artefact.path).as_posix() for name in sorted([*names, *links])]
+        inner = [Path(place, name) for name in folders if not name.endswith(drafts.PARTIAL)]
+        inner = [path for path in inner if not (path / MANIFEST).exists()]
+        folders[:] = sorted(path.name for path in inner if not path.is_symlink())
+        files = [*(Path(place, name) for name in names), *(path for path in inner if path.is_symlink())]
+        found += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
     return [name for name in found if name not in known]
 
 

@@ -17,7 +17,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -35,7 +35,7 @@ FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART, SUM_PART = "json-2", "crc32"  # the number rises with what stages keep
+JSON_PART, SUM_PART = "json-3", "crc32"  # the number rises with what stages keep
 ARRAY, TENSOR = "$array", "$tensor"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -49,10 +49,7 @@ class Checkpoints:
     """One state on disk, replaced by a later one now and then; the earlier stays until the later is whole.
 
     As a context, Ctrl-C and SIGTERM wait for the next :meth:`offer`, which saves and raises ``KeyboardInterrupt`` with
-    the signal's number. A second Ctrl-C does not wait.
-
-    Args:
-        path: the file; None, nothing is ever saved.
+    the signal's number. A second Ctrl-C does not wait. Where the ``path`` is None, nothing is ever saved.
     """
 
     def __init__(self, path: Path | None):
@@ -72,9 +69,7 @@ class Checkpoints:
                     self._handlers[number] = signal.signal(number, self._note)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         if self._signal is not None and kind is None:
@@ -96,9 +91,7 @@ class Checkpoints:
         return self.path is not None and self.path.is_file()
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Called where the state is whole: saves it if it is time to, or if a signal came, which then is a
-        ``KeyboardInterrupt``.
-        """
+        """Where the state is whole: save it if it is time to, or if a signal came: then a ``KeyboardInterrupt``."""
         if self._signal is None and time.monotonic() < self._next:
             return
         begun = time.monotonic()
@@ -120,7 +113,8 @@ class Checkpoints:
 
         if self.path is None:
             return
-        arrays, tensors = _Parts(), _Parts()
+        arrays: dict[str, NDArray[Any]] = {}
+        tensors: dict[str, NDArray[Any]] = {}
         tree = _taken_apart(state, "", arrays, tensors)
         if not all(np.isfinite(values).all() for values in tensors.values() if values.dtype.kind == "f"):
             return
@@ -133,9 +127,8 @@ class Checkpoints:
             replace_file(fresh, self.path)
         except (OSError, SafetensorError) as error:
             fresh.unlink(missing_ok=True)
-            raise UserError(
-                f"a checkpoint cannot be written ({error})", self.path, "Make room, then give --resume to go on."
-            ) from None
+            what = f"a checkpoint cannot be written ({error})"
+            raise UserError(what, self.path, "Make room, then give --resume to go on.") from None
 
     def load(self) -> State | None:
         """The state last saved; None where none was. A damaged file is a ``UserError``."""
@@ -150,18 +143,9 @@ class Checkpoints:
                 raise ValueError
             state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
         except (SafetensorError, KeyError, ValueError, RecursionError):
-            raise UserError(
-                "the checkpoint is damaged, or of an earlier version", self.path, "Give --force to begin anew."
-            ) from None
+            what = "the checkpoint is damaged, or of an earlier version"
+            raise UserError(what, self.path, "Give --force to begin anew.") from None
         return state
-
-
-class _Parts(dict[str, NDArray[Any]]):
-    """Arrays by their place in the state."""
-
-    def add(self, place: str, values: NDArray[Any]) -> str:
-        self[place] = values if values.flags.c_contiguous else values.copy(order="C")
-        return place
 
 
 def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
@@ -173,18 +157,20 @@ def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
     return np.array([value], np.uint32)
 
 
-def _taken_apart(value: Any, place: str, arrays: _Parts, tensors: _Parts) -> Any:
-    """``value`` as plain JSON values, its arrays and tensors put aside."""
+def _taken_apart(value: Any, place: str, arrays: State, tensors: State) -> Any:
+    """``value`` as plain JSON values, its arrays and tensors put aside by their place."""
     if isinstance(value, dict):
         return {key: _taken_apart(item, f"{place}/{key}", arrays, tensors) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_taken_apart(item, f"{place}/{number}", arrays, tensors) for number, item in enumerate(value)]
     if isinstance(value, np.ndarray):
-        return {ARRAY: arrays.add(place, value)}
+        arrays[place] = np.asarray(value, order="C")
+        return {ARRAY: place}
     if isinstance(value, np.generic):
         return value.item()
     if hasattr(value, "detach"):
-        return {TENSOR: tensors.add(place, value.detach().cpu().numpy())}
+        tensors[place] = np.asarray(value.detach().cpu().numpy(), order="C")
+        return {TENSOR: place}
     return value
 
 

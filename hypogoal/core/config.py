@@ -37,28 +37,16 @@ def setting(
     high: float | None = None,
 ) -> Any:
     """A dataclass field with its unit, meaning, source and allowed values."""
-    metadata = {
-        "meaning": meaning,
-        "unit": unit,
-        "source": source,
-        "choices": tuple(choices) if choices is not None else None,
-        "low": low,
-        "high": high,
-    }
-    return dataclasses.field(default=default, metadata=metadata)
+    allowed = {"choices": None if choices is None else tuple(choices), "low": low, "high": high}
+    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
-    """The differences from the defaults that preset ``name`` asks for in ``stage``.
+    """The differences from the defaults that preset ``name`` asks for in ``stage``, a command: its table ``[stage]``.
 
-    Args:
-        name: a preset shipped with the package (``demo``, ``paper``), the path of an own TOML file, or None.
-        stage: the command's name; the TOML table read is ``[stage]``.
-        domain: whose presets are meant; those of a domain that has none are DoorKey's.
-        tables: what a preset may have; anything where empty.
-
-    Raises:
-        UserError: unknown preset, unreadable file, not TOML, or with what belongs to no stage.
+    The name is that of a preset of the package (``demo``, ``paper``), of ``domain`` or, if it has none, of DoorKey, or
+    the path of an own TOML file. An unknown preset, one that is not TOML, or with other tables than ``tables`` (none:
+    any) is a ``UserError``.
     """
     if name is None:
         return {}
@@ -120,19 +108,11 @@ def resolve(
     defaults: Mapping[str, Any] | None = None,
     tables: Collection[str] = (),
 ) -> T:
-    """The configuration of a stage from its preset, its options and its ``--set`` pairs.
+    """The configuration of a stage, a frozen dataclass of :func:`setting` fields.
 
-    Args:
-        config_class: frozen dataclass of :func:`setting` fields.
-        stage: the command's name, for presets and messages.
-        preset, tables: see :func:`load_preset`.
-        options: command-line options; those that are None were not given.
-        assignments: ``key=value`` texts.
-        domain: whose presets are meant.
-        defaults: the domain's own, before which the class's stand back.
-
-    Raises:
-        UserError: unknown key, wrong type, or a value out of range.
+    From its preset (see :func:`load_preset`), the command line's ``options``, those that are not None, its ``--set``
+    ``assignments`` and the domain's own ``defaults``, before which the class's stand back. An unknown key, a wrong
+    type, or a value out of range is a ``UserError``.
     """
     values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})
@@ -182,10 +162,8 @@ def describe(config_class: type, defaults: Mapping[str, Any] | None = None) -> l
 def _allowed(meta: Mapping[str, Any]) -> str:
     if meta.get("choices"):
         return "|".join(str(choice) for choice in meta["choices"])
-    low, high = meta.get("low"), meta.get("high")
-    if low is None and high is None:
-        return ""
-    return f"{'' if low is None else low} .. {'' if high is None else high}".strip()
+    low, high = ("" if meta.get(bound) is None else meta[bound] for bound in ("low", "high"))
+    return "" if low == high == "" else f"{low} .. {high}".strip()
 
 
 def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -> Any:
@@ -240,9 +218,9 @@ def _parse(kind: Any, value: Any) -> Any:
         if isinstance(value, bool):
             return value
         return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[str(value).lower()]
+    if isinstance(value, bool):  # to Python an int
+        raise TypeError
     if kind is int:
-        if isinstance(value, bool):
-            raise TypeError
         if isinstance(value, str):
             value = value.replace("_", "")
         number = float(value)
@@ -250,11 +228,7 @@ def _parse(kind: Any, value: Any) -> Any:
             raise ValueError
         return int(value) if isinstance(value, (int, str)) and str(value).lstrip("+-").isdigit() else int(number)
     if kind is float:
-        if isinstance(value, bool):
-            raise TypeError
         return float(value)
-    if kind is str:
-        if not isinstance(value, str):
-            raise TypeError
+    if kind is str and isinstance(value, str):
         return value
-    raise TypeError(f"unsupported setting type {kind}")
+    raise TypeError(f"{value!r} is no {kind}")

@@ -63,9 +63,7 @@ def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
-    """Refuse (``UserError``), before any work is done, to write what another process writes, or to lose what is
-    unfinished.
-    """
+    """Refuse (``UserError``), before any work, to write what another process writes, or to lose what is unfinished."""
     folder = draft_folder(out)
     if folder.is_dir() and os.access(folder, os.W_OK):
         with sole_writer(out):
@@ -273,8 +271,7 @@ def _check_own(folder: Path) -> None:
 def try_lock(file: TextIO | BinaryIO, *, shared: bool = False) -> bool | None:
     """Take the kernel's lock on a file, which whoever inherits the file holds too, until the last of them closes it.
 
-    Returns:
-        Whether it was free; None where the system cannot lock, and nobody is kept out.
+    Whether it was free; None where the system cannot lock, and nobody is kept out.
     """
     if fcntl is None:
         return None if shared else _try_lock_byte(file)

@@ -4,6 +4,7 @@ Sizes are looked at before anything is read, names before anything is opened. De
 all that is not read by a library of its own is opened with :func:`open_file`, which never waits.
 """
 
+import contextlib
 import csv
 import io
 import json
@@ -11,7 +12,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, TypeGuard
@@ -61,9 +62,7 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
 
 
 def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
-    """A regular file of at most ``limit`` bytes; see :func:`require_file`. Larger or not readable, it is a
-    ``UserError``.
-    """
+    """A regular file, see :func:`require_file`; of more than ``limit`` bytes, or not readable, a ``UserError``."""
     with open_file(path, what, do) as file:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -113,10 +112,7 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
-    """TOML, else a ``UserError``.
-
-    Keys in hundreds of parts (``a.a.a``), for which the parser takes the square of their number, are refused.
-    """
+    """TOML, else a ``UserError``; so are keys in hundreds of parts (``a.a.a``), whose time is their number squared."""
     try:
         for number, line in enumerate(text.split("\n"), 1):
             if line.count(".") > MOST_DOTS:
@@ -135,12 +131,8 @@ def _no_number(name: str) -> NoReturn:
 def _check_depth(value: Any) -> None:
     level = [value]
     for _ in range(MAX_JSON_DEPTH):
-        level = [
-            inner
-            for item in level
-            if isinstance(item, (dict, list))
-            for inner in (item.values() if isinstance(item, dict) else item)
-        ]
+        groups = (item for item in level if isinstance(item, (dict, list)))
+        level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
         if not level:
             return
     raise RecursionError
@@ -148,9 +140,16 @@ def _check_depth(value: Any) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Write a file whole or not at all: a reader finds what was there before, or ``text``."""
+    with replacing(path) as fresh:
+        fresh.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to write, called ``path`` when the block ends; gone when it raises."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
-        fresh.write_text(text, encoding="utf-8")
+        yield fresh
         replace_file(fresh, path)
     finally:
         fresh.unlink(missing_ok=True)

@@ -30,23 +30,29 @@ class Busy(UserError):
     """A file that may be whole, and cannot be read now."""
 
 
-def open_hdf5(path: Path, what: str, do: str) -> Any:
+@contextlib.contextmanager
+def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
     """An HDF5 file opened for reading, locked where the file system can.
 
-    Missing, truncated or another file is a ``UserError``; open in another program to write, or not to be read,
-    ``Busy``.
+    Missing, truncated or another file, or what is found ``Foreign`` in it, is a ``UserError``; open in another program
+    to write, or not to be read, ``Busy``.
     """
     import h5py
 
     require_file(path, f"{what} is", do)
     try:
-        return h5py.File(path, "r", locking="best-effort")
+        opened = h5py.File(path, "r", locking="best-effort")
     except (OSError, ValueError, RuntimeError, KeyError) as error:
         if "unable to lock" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
             raise Busy(f"{what} is open in another program", path, "Close it there first.") from None
         if isinstance(error, PermissionError):
             raise Busy(f"{what} may not be read (permission denied)", path, "Ask for permission.") from None
         raise UserError(f"{what} is truncated or not HDF5", path, do) from None
+    with opened as file:
+        try:
+            yield file
+        except Foreign as error:
+            raise UserError(f"{what} cannot be used: {error}", path, do) from None
 
 
 @contextlib.contextmanager
@@ -86,9 +92,7 @@ def set_attribute(file: Any, name: str, value: str | int | float | bool) -> None
 def attribute(file: Any, name: str) -> Any:
     """An attribute of the root: a text, an int, a float or a bool; None where there is none.
 
-    Raises:
-        Foreign: it is something else (a text of variable length too: HDF5 2.0 may read one from a damaged heap for
-            ever), or larger than ``MAX_ATTRIBUTE_BYTES``.
+    Anything else (a text of variable length: HDF5 2.0 may read one from a damaged heap for ever) is ``Foreign``.
     """
     try:
         if name not in file.attrs:
@@ -145,13 +149,9 @@ def find(file: Any, name: str) -> Any:
 def check_dataset(dataset: Any, kinds: str) -> int:
     """The size in bytes that reading a dataset takes, found not to be more than its file can hold.
 
-    Args:
-        dataset: from :func:`find`.
-        kinds: the kinds of number allowed, letters of NumPy's ``dtype.kind``; ``S`` for texts of fixed length.
-
-    Raises:
-        Foreign: another type (references and texts of variable length among them), data outside the file, a filter
-            that is a plugin, or more bytes declared than what is stored can stand for.
+    ``kinds`` are letters of NumPy's ``dtype.kind``; ``S`` for texts of fixed length. Another type (references and texts
+    of variable length among them), data outside the file, a filter that is a plugin, or more bytes declared than what
+    is stored can stand for is ``Foreign``.
     """
     import h5py
 
@@ -203,12 +203,9 @@ def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
 
 
 def walk(group: Any, prefix: str = "", depth: int = 8, seen: set[int] | None = None) -> Iterator[str]:
-    """The names of all datasets below a group; of one that has several, the first.
+    """The names of all datasets below a group; ``Foreign``: links, unreadable parts, groups more than ``depth`` deep.
 
-    There may be millions of names for a few groups, and so gigabytes to read for a few kilobytes.
-
-    Raises:
-        Foreign: a link, unreadable parts, or groups within each other more than ``depth`` deep.
+    Of a dataset that has several names, of which there may be millions, only the first.
     """
     import h5py
 

@@ -78,10 +78,6 @@ def _count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= MOST_INTEGER
 
 
-def _list_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and all(map(fits, value))
-
-
 def _input(value: Any) -> bool:
     return isinstance(value, dict) and all(_is_text(value.get(key)) for key in ("path", "relative", "kind", "sha256"))
 
@@ -100,7 +96,7 @@ WANTED: dict[str, Callable[[Any], bool]] = {
     "format": lambda value: type(value) is int,
     "config": lambda value: isinstance(value, dict),
     "seed": _count,
-    "inputs": _list_of(_input),
+    "inputs": lambda value: isinstance(value, list) and all(map(_input, value)),
     "files": _files,
 }
 SETTINGS: dict[str, Callable[[Any], bool]] = {
@@ -120,7 +116,8 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
 def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
     """The files that an artefact must have by its kind and settings, besides its manifest; None of an unknown kind.
 
-    What it may have and its settings do not say (figures, videos, ``executions.csv``) only its manifest knows.
+    What it may have and its settings do not say (figures, videos, ``executions.csv``, ``exploits.csv``) only its
+    manifest knows.
     """
     if kind in ("options", "meta"):
         played = {LOG, EPISODES, LAYOUT, OPTIONS, "choices.csv", "terminations.h5"}

@@ -10,8 +10,6 @@ process that runs it is told so (:func:`environment_of_children`), and in it not
 Whatever such code does, raises or gives back ends as one line that says where it is: :class:`UsersCode`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import inspect
@@ -25,8 +23,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, NoReturn
+from types import FrameType
+from typing import Any, NoReturn, Self
 
 from hypogoal.core.errors import Complete, NumericalError, UserError
 
@@ -39,10 +37,7 @@ _own: set[str] = set()  # top-level modules that were loaded by name and are not
 
 
 def given(*names: str) -> contextlib.AbstractContextManager[None]:
-    """Within the block these names are the user's own words: ``module:object`` among them may be loaded.
-
-    Without effect where the command is a file's.
-    """
+    """Within the block ``module:object`` among these names may be loaded: the user's own words, if no file's."""
     return vouched(*([] if os.environ.get(OF_FILE) else names))
 
 
@@ -134,11 +129,7 @@ class UsersCode:
     Args:
         what: whose code it is ("the label function of won").
         of: the function, or the object that has ``method``; or a text, what the user calls it.
-        method: see ``of``.
         failed: between ``what`` and the exception.
-
-    Raises:
-        UserError: when leaving the block by another exception than a UserError or Ctrl-C.
     """
 
     __slots__ = ("failed", "method", "of", "what")
@@ -146,13 +137,11 @@ class UsersCode:
     def __init__(self, what: str, of: object = None, method: str = "", *, failed: str = "raised"):
         self.what, self.of, self.method, self.failed = what, of, method, failed
 
-    def __enter__(self) -> UsersCode:
+    def __enter__(self) -> Self:
         _running.blocks += 1
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         _running.blocks -= 1
         if error is None or isinstance(error, KeyboardInterrupt):
             return

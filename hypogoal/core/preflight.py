@@ -19,22 +19,19 @@ def preflight(stage: str, out: Path, needs: tuple[float, float], *, resume: bool
     if resume and out.exists() and not unfinished(out):
         return
     memory, disk = needs
-    free, folders = free_memory(), (folder for folder in out.absolute().parents if folder.is_dir())
-    space = shutil.disk_usage(next(folders)).free
+    free, known = free_memory(), "unknown"
+    space = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
     if free is not None:
         free += own_memory()  # which is part of what is needed: nobody needs it twice
-    known = "unknown" if free is None else human(free)
-    text = (
-        f"{stage}: needs about {human(memory)} of memory ({known} free) and {human(disk)} of disk ({human(space)} free)"
-    )
-    if free is not None and memory > free:
-        raise UserError(
-            f"not enough memory: about {human(memory)} needed, {human(free)} free", stage, "See 'hypogoal config'."
-        )
+        known = human(free)
+        if memory > free:
+            what = f"not enough memory: about {human(memory)} needed, {known} free"
+            raise UserError(what, stage, "See 'hypogoal config'.")
     if disk > space:
         raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
     if not quiet:
-        say(text, err=True)
+        needed = f"needs about {human(memory)} of memory ({known} free) and {human(disk)} of disk"
+        say(f"{stage}: {needed} ({human(space)} free)", err=True)
 
 
 def free_memory() -> int | None:

@@ -1,15 +1,12 @@
 """Progress on stderr: a rich bar with rate and time left in a terminal, plain lines elsewhere."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from hypogoal.core.terminal import printable, say, screen
 
@@ -26,7 +23,7 @@ class Progress:
         self._bar: Any = None
         self._task: Any = None
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> Self:
         if not self.quiet and sys.stderr.isatty():
             from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bar
@@ -43,9 +40,7 @@ class Progress:
             self._task = self._bar.add_task(printable(self.title), total=self.total, numbers="")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
         elif not self.quiet and kind is None:

@@ -26,9 +26,7 @@ PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when it
 
 def cores() -> int:
     """How many cores this process may use: those the system gives it, or fewer where ``HYPOGOAL_CORES`` says so."""
-    given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    told = os.environ.get(CORES, "")
-    return max(1, min(given, int(told))) if told.isdigit() else given
+    return allowed(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def allowed(wanted: int) -> int:

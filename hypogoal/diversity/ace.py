@@ -1,7 +1,5 @@
 """ACE: confident disagreement on the few states where members disagree most easily (Daniels et al. 2025)."""
 
-from __future__ import annotations
-
 import math
 from itertools import permutations
 
@@ -19,9 +17,6 @@ def ensemble_loss(context: Context) -> Tensor:
     D-BAT asks members to contradict each other on every unlabelled state. This asks for it on some, those where the
     members as they are disagree most, and for certainty there; of the rest nothing is asked. Mixed directions: a says
     yes where b says no on some states, and the other way round on others.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
 
     Returns:
         float (), at least 0, in nats; 0 for no states or no pairs.

@@ -1,7 +1,5 @@
 """D-BAT: diversity by disagreement (Pagliardini et al. 2022), the paper's Eq. (1)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

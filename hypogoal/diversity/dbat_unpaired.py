@@ -1,7 +1,5 @@
 """A control for D-BAT that pairs no members: each member's term is with itself."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from hypogoal.diversity import Context
@@ -13,9 +11,6 @@ def ensemble_loss(context: Context) -> Tensor:
 
     It is lowest where every member is undecided (p = 1/2) on every unlabelled state, so it asks for no difference
     between members. What D-BAT gains over it comes from pairing. One member alone has a weight of 1.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
 
     Returns:
         float (), at least 0, in nats; 0 for no states.

@@ -1,7 +1,5 @@
 """DivDis: diversity by statistical independence (Lee et al. 2022), with its ratio term."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -19,9 +17,6 @@ def ensemble_loss(context: Context) -> Tensor:
     ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``, with p(y) the labelled states' share of
     positives. The second term is what keeps a member from saying the same of all unlabelled states, where the first is
     0 without a gradient.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
 
     Returns:
         float (), in nats, at least 0 up to rounding; 0 for no states.

@@ -1,7 +1,5 @@
 """Independent features: the Hilbert-Schmidt independence criterion between members' last hidden layers."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import torch
@@ -19,9 +17,6 @@ def ensemble_loss(context: Context) -> Tensor:
     (of this batch, held fixed), and H = I - 1/N. It is 0 where what one member computes of a state tells nothing of
     what the other does. Divided so that features cannot escape it by becoming small. Frozen members have no features
     and do not count.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; features of unlabelled states are used.
 
     Returns:
         float (), from 0 to K (K - 1); 0 for fewer than two states or members.

@@ -1,7 +1,5 @@
 """Members that look at different pixels: orthogonal gradients of their logits by the input (Teney et al. 2022)."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import torch
@@ -19,9 +17,6 @@ def ensemble_loss(context: Context) -> Tensor:
     product of the gradients; here they are normalised, so that members cannot escape by flattening, and squared, so
     that opposite gradients, which use the same features, are no way out. No unlabelled states are needed. Frozen
     members do not count.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; ``input_gradients`` is called.
 
     Returns:
         float (), from 0 to K (K - 1); 0 for one member.

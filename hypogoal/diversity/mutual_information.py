@@ -1,7 +1,5 @@
 """Mutual information of members' classes: DivDis without its ratio term, which the authors' code optimises."""
 
-from __future__ import annotations
-
 import math
 
 import torch

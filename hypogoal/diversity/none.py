@@ -1,18 +1,11 @@
 """No diversity: members differ by their initial weights alone."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 
 def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
     """Spec C1: 0, still a function of both members so that it can be differentiated like the others.
 
-    Args:
-        logits_a: float (..., N, 2), one member on N unlabelled states.
-        logits_b: float (..., N, 2), another member on the same states.
-
-    Returns:
-        float (...,), all 0; so are its gradients.
+    Of logits (..., N, 2) of two members on N unlabelled states float (...,), all 0; so are its gradients.
     """
     return (logits_a.sum(dim=(-2, -1)) + logits_b.sum(dim=(-2, -1))).nan_to_num(0.0, 0.0, 0.0) * 0.0

@@ -1,7 +1,5 @@
 """A repulsive ensemble in function space (D'Angelo and Fortuin 2021)."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -19,9 +17,6 @@ def ensemble_loss(context: Context) -> Tensor:
     squared distance between members over log K (held fixed). The f_j are held fixed too: each member is pushed away
     from where the others are. Repulsion falls off with distance, unlike D-BAT's, which goes on until members contradict
     each other.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
 
     Returns:
         float (), from -K log K to 0; 0 for one member or no states.

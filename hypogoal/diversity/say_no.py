@@ -1,7 +1,5 @@
 """A control for D-BAT that pairs no members: unlabelled states are weak negatives."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -13,9 +11,6 @@ def ensemble_loss(context: Context) -> Tensor:
 
     Most states are no sub-goal, so it moves members' thresholds to where they belong without a word on which features
     to use. The weight K - 1 is that of :mod:`hypogoal.diversity.dbat_unpaired`; one member alone has 1.
-
-    Args:
-        context: see :class:`~hypogoal.diversity.Context`; logits of unlabelled states are used.
 
     Returns:
         float (), at least 0, in nats; 0 for no states.

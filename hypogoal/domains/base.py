@@ -45,21 +45,13 @@ class Step(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What follows in the states that can be reached from the start, as far as it can be told.
+    """What follows in the states that can be reached from the start, as far as it can be told."""
 
-    Attributes:
-        ids: int64 (N,), the states.
-        actions: int64 (A,), those that are followed.
-        following: int64 (N, A), the state after each of them, one of ``ids``.
-        final: bool (N,), an episode ends there, so nothing follows.
-        solved: bool (N,), it ends there with the task solved.
-    """
-
-    ids: NDArray[np.int64]
-    actions: NDArray[np.int64]
-    following: NDArray[np.int64]
-    final: NDArray[np.bool_]
-    solved: NDArray[np.bool_]
+    ids: NDArray[np.int64]  # (N,), the states
+    actions: NDArray[np.int64]  # (A,), those that are followed
+    following: NDArray[np.int64]  # (N, A), the state after each of them, one of ``ids``
+    final: NDArray[np.bool_]  # (N,), an episode ends there, so nothing follows
+    solved: NDArray[np.bool_]  # (N,), it ends there with the task solved
 
 
 class Engine(ABC):
@@ -236,8 +228,9 @@ class Domain(ABC):
             that name is kept until all are there.
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
-        measures: it has :meth:`distance`; pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has
-            :meth:`agent_pixels`.
+        many_starts: it takes some of them, too, comma-separated.
+        measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
+        pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
     name: str
@@ -249,7 +242,9 @@ class Domain(ABC):
     resumes = False
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
+    many_starts: bool = False
     measures = pictures = sees_agent = False
+    near = 0
 
     @property
     @abstractmethod

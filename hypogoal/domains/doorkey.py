@@ -16,17 +16,9 @@ from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import Collected, States, leave_out
+from hypogoal.domains import doorkey_env as env
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.domains.doorkey_env import (
-    DOOR_LABELS,
-    MAX_STEPS,
-    OBSERVATION_SHAPE,
-    SUB_GOALS,
-    WRONG_KEYS,
-    Layout,
-    layout_of,
-)
 
 
 @dataclass(frozen=True)
@@ -54,18 +46,18 @@ class DoorKeyConfig:
         "open",
         "open-red-door holds when the door is 'open', or when the agent is also 'in-front', facing it",
         source="in-front: paper; open: the authors' code",
-        choices=DOOR_LABELS,
+        choices=env.DOOR_LABELS,
     )
     keyring: bool = setting(True, "several keys can be held", source="the authors' code")
     wrong_key: str = setting(
         "harmless",
         "holding the blue or the green key is 'harmless', or 'ends' the episode without reward",
         source="ours: a task in which choosing decides",
-        choices=WRONG_KEYS,
+        choices=env.WRONG_KEYS,
     )
 
 
-Source: TypeAlias = tuple[int, int, Layout]  # layout seed, draw (see ``collect``), layout
+Source: TypeAlias = tuple[int, int, env.Layout]  # layout seed, draw (see ``collect``), layout
 
 
 class _Sweep(NamedTuple):
@@ -78,7 +70,7 @@ class _Sweep(NamedTuple):
 
 
 def _labelled_layouts(config: DoorKeyConfig, seed: int) -> list[Source]:
-    layout = layout_of(config.labelled_seed)
+    layout = env.layout_of(config.labelled_seed)
     if config.regime == "fixed":
         return [(config.labelled_seed, 0, layout)]
     placements = list(itertools.permutations(layout.key_cells(), 3))
@@ -92,21 +84,21 @@ def _labelled_layouts(config: DoorKeyConfig, seed: int) -> list[Source]:
     ]
 
 
-def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[Layout]) -> list[Source]:
+def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[env.Layout]) -> list[Source]:
     """The first layouts from ``heldout_first`` on whose grid no other layout has."""
-    grids = {layout.grid for layout in [*avoid, layout_of(config.labelled_seed)]}
+    grids = {layout.grid for layout in [*avoid, env.layout_of(config.labelled_seed)]}
     chosen: list[Source] = []
     for layout_seed in itertools.count(config.heldout_first):
         if len(chosen) == config.heldout_layouts:
             break
-        layout = layout_of(layout_seed)
+        layout = env.layout_of(layout_seed)
         if layout.grid not in grids:
             grids.add(layout.grid)
             chosen.append((layout_seed, 0, layout))
     return chosen
 
 
-def _sweep(config: DoorKeyConfig, layout_seed: int, draw: int, layout: Layout, progress: Any) -> _Sweep:
+def _sweep(config: DoorKeyConfig, layout_seed: int, draw: int, layout: env.Layout, progress: Any) -> _Sweep:
     engine = DoorKeyEngine(layout, keyring=config.keyring, door_label=config.door_label, wrong_key=config.wrong_key)
     sweep = _Sweep(layout_seed, draw, engine, engine.reachable())
     progress.advance()
@@ -129,8 +121,8 @@ class DoorKeyDomain(Domain):
     """Spec B6: three-key DoorKey."""
 
     name = "doorkey"
-    sub_goals = SUB_GOALS
-    observation_shape = OBSERVATION_SHAPE
+    sub_goals = env.SUB_GOALS
+    observation_shape = env.OBSERVATION_SHAPE
     config_class = DoorKeyConfig
     engine_settings = ("keyring", "door_label", "wrong_key")
     env_id = "hypogoal/DoorKey-8x8-v0"
@@ -150,21 +142,13 @@ class DoorKeyDomain(Domain):
         keys picked up a layout can look like another. In the regime ``shuffled`` as many states as the layout has as
         it lies are kept, at random.
 
-        Args:
-            config: see ``DoorKeyConfig``.
-            seed: of the key placements and of the choice among their states; ``fixed`` does not depend on it.
-            progress: told how many layouts there are, and of each that is done.
-
-        Returns:
-            Labels of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each:
-            layout_seed, draw (0: keys as the seed has them), agent_x, agent_y, direction, door_state (0 open,
-            1 closed, 2 locked), keys_held (bit 0 blue, 1 green, 2 red).
-
-        Raises:
-            UserError: the labelled states have one class only of some sub-goal, or too many draws are asked for.
+        ``seed`` is of the key placements and of the choice among their states; ``fixed`` does not depend on it. Labels
+        are of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each: layout_seed, draw
+        (0: keys as the seed has them), and those of ``DoorKeyEngine.origins``. Labelled states of one class only of
+        some sub-goal, or too many draws, are a ``UserError``.
         """
         labelled = _labelled_layouts(config, seed)
-        unlabelled = [(layout_seed, 0, layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]
+        unlabelled = [(layout_seed, 0, env.layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]
         heldout = _heldout_layouts(config, avoid=[layout for _, _, layout in [*labelled, *unlabelled]])
         sources = labelled, unlabelled, heldout
         progress.expect(sum(map(len, sources)))
@@ -179,14 +163,16 @@ class DoorKeyDomain(Domain):
             sweeps[0] = [sweep._replace(ids=sweep.ids[part]) for sweep, part in zip(sweeps[0], parts, strict=True)]
         learnt, others, test = map(_states_of, sweeps)
         test = leave_out(test, learnt.observations, others.observations)
-        for index, sub_goal in enumerate(SUB_GOALS):
+        for index, sub_goal in enumerate(env.SUB_GOALS):
             if len(np.unique(learnt.labels[:, index])) < 2:
                 where = f"labelled_seed={config.labelled_seed}, keyring={config.keyring}"
                 do = "Choose another labelled_seed, or keyring=true."
                 raise UserError(f"the labelled states have no two classes of {sub_goal}", where, do)
-        return Collected(OBSERVATION_SHAPE, SUB_GOALS, learnt, others, test)
+        return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, learnt, others, test)
 
-    def make_engine(self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, **arguments: Any) -> DoorKeyEngine:
+    def make_engine(
+        self, layout_seed: int, count: int, max_steps: int = env.MAX_STEPS, **arguments: Any
+    ) -> DoorKeyEngine:
         """An engine of ``count`` environments of one layout; ``arguments``: its ``engine_settings``."""
         return DoorKeyEngine(layout_seed, count, max_steps=max_steps, **arguments)
 

@@ -87,14 +87,7 @@ def tiles() -> NDArray[np.uint8]:
 class DoorKeyEngine(Engine):
     """Many environments of one layout, stepped together; ids are stable, and START is the id of the start state.
 
-    Args:
-        layout: the layout, or the seed of that of ``DoorKeyEnv(layout_seed=...)``.
-        count: environments (E).
-        keyring, door_label, wrong_key: see ``DoorKeyEnv``.
-        max_steps: steps after which an episode is truncated.
-
-    Attributes:
-        changes: of configurations that have been worked out, by configuration, cell and action.
+    Arguments are those of ``DoorKeyEnv``, but for ``layout``, one or the seed of one, and ``count``, of environments.
     """
 
     n_actions = N_ACTIONS
@@ -115,7 +108,7 @@ class DoorKeyEngine(Engine):
         self.harsh = wrong_key == "ends"
         self.layout = layout if isinstance(layout, Layout) else layout_of(layout)
         self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
-        self.changes: dict[int, int] = {}
+        self.changes: dict[int, int] = {}  # of configurations, worked out so far, by configuration, cell and action
         self._numbers: dict[Configuration, int] = {}
         # Of each configuration: its door and keys; what it shows without the agent, twice; the ids by pose.
         self._places = np.zeros((16, 4), np.uint8)
@@ -172,8 +165,7 @@ class DoorKeyEngine(Engine):
     def _changed(self, configuration: int, front: int, action: int) -> int:
         """The configuration after ``pickup``, ``drop`` or ``toggle`` on cell ``front``; may be the same."""
         key = (configuration * CELLS + front) * N_ACTIONS + action
-        known = self.changes.get(key)
-        if known is not None:
+        if (known := self.changes.get(key)) is not None:
             return known
         door, *keys = self._places[configuration].tolist()
         held = sum(place >= HELD for place in keys)
@@ -262,10 +254,8 @@ class DoorKeyEngine(Engine):
         ids, actions = self.distances()[0], np.array([action for action in range(N_ACTIONS) if action != DROP])
         final = self._final[ids]
         following = np.repeat(ids[:, None], len(actions), axis=1)
-        origin = ids[~final]
-        following[~final] = self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))).reshape(
-            len(origin), -1
-        )
+        each = np.broadcast_to(actions, following.shape)[~final]
+        following[~final] = self.follow(following[~final].ravel(), each.ravel()).reshape(each.shape)
         return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:
@@ -293,11 +283,7 @@ class DoorKeyEngine(Engine):
         }
 
     def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of the same layout and count, of states that were met in the order of these.
-
-        Raises:
-            ValueError: another count or layout, or states were met that the snapshot does not begin with.
-        """
+        """Continue from a ``snapshot`` of this layout and count, its states met in this order; else ``ValueError``."""
         if snapshot["ids"].shape != (self.count,):
             raise ValueError(f"the snapshot is of {len(snapshot['ids'])} environments, not {self.count}")
         configurations, sites = snapshot["configurations"], snapshot["sites"]
@@ -334,8 +320,7 @@ class DoorKeyEngine(Engine):
         return new
 
     def _number_of(self, configuration: Configuration) -> int:
-        known = self._numbers.get(configuration)
-        if known is not None:
+        if (known := self._numbers.get(configuration)) is not None:
             return known
         new = self._numbers[configuration] = len(self._rows)
         if new == len(self._places):

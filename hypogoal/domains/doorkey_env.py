@@ -52,21 +52,14 @@ def sub_goals_reached(
 
 @dataclass(frozen=True)
 class Layout:
-    """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x.
+    """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x."""
 
-    Attributes:
-        walls: the cells of walls (the door's cell is not among them).
-        door, goal: their cells.
-        start, direction: where the agent begins (0 right, 1 down, 2 left, 3 up).
-        keys: the cells of the blue, the green and the red key.
-    """
-
-    walls: frozenset[int]
+    walls: frozenset[int]  # cells; the door's is not among them
     door: int
     goal: int
-    start: int
-    direction: int
-    keys: tuple[int, int, int]
+    start: int  # where the agent begins
+    direction: int  # 0 right, 1 down, 2 left, 3 up
+    keys: tuple[int, int, int]  # the cells of the blue, the green and the red key
 
     @property
     def grid(self) -> tuple[frozenset[int], int, int, tuple[int, int, int]]:
@@ -123,16 +116,12 @@ class DoorKeyGrid(MiniGridEnv):
         self.door_label, self.wrong_key = door_label, wrong_key
         self.ring: list[Key] = []
         super().__init__(
-            mission_space=MissionSpace(mission_func=self._gen_mission),
+            mission_space=MissionSpace(mission_func=lambda: MISSION),
             grid_size=SIZE,
             max_steps=max_steps,
             render_mode=render_mode,
             highlight=False,
         )
-
-    @staticmethod
-    def _gen_mission() -> str:
-        return MISSION
 
     @property
     def held(self) -> tuple[str, ...]:

@@ -18,20 +18,8 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.terminal import say
 from hypogoal.dataset import Collected, States, digest
+from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
-from hypogoal.domains.gymnasium_engine import (
-    MEMORY,
-    GymnasiumEngine,
-    Label,
-    MakeEnv,
-    as_image,
-    begun,
-    labels_of,
-    made,
-    make_checked,
-    shape_of,
-    stepped,
-)
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 """What is played to collect states: (environment, observation, random numbers) -> action."""
@@ -83,12 +71,12 @@ class GymnasiumDomain(Domain):
 
     def __init__(
         self,
-        make: MakeEnv,
-        sub_goals: Mapping[str, Label],
+        make: engines.MakeEnv,
+        sub_goals: Mapping[str, engines.Label],
         *,
         policy: Policy | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
-        memory: int = MEMORY,
+        memory: int = engines.MEMORY,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
@@ -103,9 +91,9 @@ class GymnasiumDomain(Domain):
 
     @cached_property
     def observation_shape(self) -> tuple[int, ...]:
-        env = make_checked(self.make_env)
+        env = engines.make_checked(self.make_env)
         env.close()
-        return shape_of(env)
+        return engines.shape_of(env)
 
     @property
     def has_env(self) -> bool:
@@ -113,13 +101,13 @@ class GymnasiumDomain(Domain):
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: settings of its own, the defaults of those that are not there."""
-        return made(self.make, **{**self._own_settings, **arguments})
+        return engines.made(self.make, **{**self._own_settings, **arguments})
 
-    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> engines.GymnasiumEngine:
         """An engine of ``count`` environments of one layout; ``arguments``: ``memory``, and settings of its own."""
         memory = arguments.pop("memory", self.memory)
         make = partial(self.make_env, **arguments)
-        return GymnasiumEngine(make, self._labels, layout_seed, count, max_steps=max_steps, memory=memory)
+        return engines.GymnasiumEngine(make, self._labels, layout_seed, count, max_steps=max_steps, memory=memory)
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)
@@ -137,7 +125,7 @@ class GymnasiumDomain(Domain):
         """
         seeds_of_sets = config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds
         progress.expect(sum(map(len, seeds_of_sets)) * config.steps)
-        env = make_checked(partial(self.make_env, **self.world(as_dict(config))))
+        env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
         learnt: set[bytes] = set()  # what the labelled and the unlabelled states look like
         sets: list[States] = []
         for seeds in seeds_of_sets:
@@ -160,15 +148,15 @@ class GymnasiumDomain(Domain):
         actions = int(env.action_space.n)  # type: ignore[attr-defined]
 
         def look(observation: Any) -> None:
-            image = as_image(env, observation, self.observation_shape)
+            image = engines.as_image(env, observation, self.observation_shape)
             picture = digest(image)
             if picture not in seen:
                 seen.add(picture)
-                labels = labels_of(env, self._labels)
+                labels = engines.labels_of(env, self._labels)
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states))
                 group.offer(_Met(image, labels, (layout, episode, step)), rng)
 
-        observation, _info = begun(env, seed=layout)
+        observation, _info = engines.begun(env, seed=layout)
         look(observation)
         for _ in range(config.steps):
             if self.policy is None or rng.random() < config.explore:
@@ -176,12 +164,12 @@ class GymnasiumDomain(Domain):
             else:
                 with UsersCode("the domain's policy", self.policy) as code:
                     action = code.choice(self.policy(env, observation, rng), "the action", actions)
-            observation, _reward, terminated, truncated, _info = stepped(env, action)
+            observation, _reward, terminated, truncated, _info = engines.stepped(env, action)
             step += 1
             look(observation)  # the last state of an episode, too: a sub-goal may lie there
             progress.advance()
             if terminated or truncated or step >= config.max_episode_steps:
-                observation, _info = begun(env, seed=layout)
+                observation, _info = engines.begun(env, seed=layout)
                 episode, step = episode + 1, 0
         return _shared_out(list(groups.values()), config.states, rng)
 
@@ -221,10 +209,8 @@ class _Sample:
         self.offered += 1
         if len(self.kept) < self.size:
             self.kept.append(state)
-        else:
-            place = int(rng.integers(self.offered))
-            if place < self.size:
-                self.kept[place] = state
+        elif (place := int(rng.integers(self.offered))) < self.size:
+            self.kept[place] = state
 
 
 def _shared_out(groups: list[_Sample], size: int, rng: np.random.Generator) -> list[_Met]:

@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from hashlib import blake2b
 from typing import Any
 
 import gymnasium
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
+from hypogoal.dataset import digest
 from hypogoal.domains.base import TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
@@ -30,9 +30,7 @@ def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
 
 
 def make_checked(make: MakeEnv) -> gymnasium.Env:
-    """An environment whose observations, uint8 images, and actions, ``Discrete``, hypogoal can use; else a
-    ``UserError``.
-    """
+    """An environment whose observations are uint8 images, and actions ``Discrete``; else a ``UserError``."""
     env = made(make)
     with UsersCode("the environment", env, failed="has no spaces:"):
         space, actions = env.observation_space, env.action_space
@@ -68,9 +66,7 @@ def with_channels(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """An environment's observation as uint8 (H, W, C), in memory of its own; a ``UserError`` where its space says
-    other.
-    """
+    """An observation as uint8 (H, W, C), in memory of its own; a ``UserError`` where its space says other."""
     code = UsersCode("the environment", env, "step")
     if not isinstance(observation, np.ndarray):
         with code:
@@ -99,14 +95,8 @@ def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, di
         if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_kinds(given)}", do)
-        observation, reward, over, cut, info = given
-        return (
-            observation,
-            code.number(reward, "the reward"),
-            code.truth(over, "terminated"),
-            code.truth(cut, "truncated"),
-            info,
-        )
+        number, over = code.number(given[1], "the reward"), code.truth(given[2], "terminated")
+        return given[0], number, over, code.truth(given[3], "truncated"), given[4]
 
 
 def _kinds(given: object) -> str:
@@ -133,13 +123,8 @@ class GymnasiumEngine(TurnEngine):
     the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
     Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
 
-    Args:
-        make: makes an environment.
-        labels: G functions, see :func:`labels_of`.
-        layout_seed: the seed of every reset.
-        count: environments (E).
-        max_steps: steps after which an episode is truncated, where the environment does not do so earlier.
-        memory: distinct states, see above.
+    ``labels`` are G functions, see :func:`labels_of`. Episodes are truncated after ``max_steps`` steps, where the
+    environment does not do so earlier.
     """
 
     def __init__(
@@ -188,9 +173,8 @@ class GymnasiumEngine(TurnEngine):
         """The id of what an environment is in now."""
         image = as_image(env, observation, self.observation_shape)
         labels = labels_of(env, self._label_functions).tobytes()
-        digest = _digest(image, labels)
-        new = self.n_states
-        known = self._ids.get(digest)
+        look, new = digest(image, labels), self.n_states
+        known = self._ids.get(look)
         if known is not None and known >= new - self.memory:
             return known
         if len(self._ring) < 2 * self.memory:
@@ -198,13 +182,13 @@ class GymnasiumEngine(TurnEngine):
         else:
             self._ring[new % (2 * self.memory)] = image
         self._labels += labels
-        self._file(digest, new)
+        self._file(look, new)
         return new
 
-    def _file(self, digest: bytes, identity: int) -> None:
+    def _file(self, look: bytes, identity: int) -> None:
         """The newest id of this digest; those of forgotten states go."""
-        self._ids[digest] = identity
-        self._ids.move_to_end(digest)
+        self._ids[look] = identity
+        self._ids.move_to_end(look)
         if self._ids[next(iter(self._ids))] < self.oldest:
             self._ids.popitem(last=False)
 
@@ -231,10 +215,9 @@ class GymnasiumEngine(TurnEngine):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments: episodes are played up to there.
+        """Continue from a ``snapshot`` of an engine made alike: episodes are played up to there.
 
-        Raises:
-            UserError: they did not lead to the same states, so the environment is not the same for the same seed.
+        Where they lead to other states, the environment is not the same for the same seed, it is a ``UserError``.
         """
         width, size = len(self._label_functions), 2 * self.memory
         self._labels = bytearray(snapshot["labels"].tobytes())
@@ -242,7 +225,7 @@ class GymnasiumEngine(TurnEngine):
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
-            self._file(_digest(self._ring[identity % size], labels), identity)
+            self._file(digest(self._ring[identity % size], labels), identity)
         for number, actions in enumerate(snapshot["played"]):
             env = self._envs[number]
             observation, _info = begun(env, seed=self.layout_seed)
@@ -254,8 +237,3 @@ class GymnasiumEngine(TurnEngine):
                 raise UserError(what, f"layout_seed={self.layout_seed}", "Begin anew with --force.")
         self._played = [list(actions) for actions in snapshot["played"]]
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
-
-
-def _digest(image: NDArray[np.uint8], labels: bytes | bytearray) -> bytes:
-    """What a state is known by: what is seen, and its labels."""
-    return blake2b(image.tobytes() + labels, digest_size=16).digest()

@@ -89,9 +89,7 @@ class MontezumaConfig:
 
 
 class _Task(NamedTuple):
-    """``wanted`` states of a room for the set called ``name``, there from index ``begin`` on: gathered, and kept till
-    all are there.
-    """
+    """``wanted`` states of a room for the set ``name``, from index ``begin`` on: gathered, kept till all are there."""
 
     name: str
     begin: int
@@ -122,9 +120,7 @@ def _states_of(states: RoomStates) -> States:
 
 
 class MontezumaDomain(Domain):
-    """Spec B6: the ladders of Montezuma's Revenge; by default Table 1, and for options what lets them learn on a
-    laptop.
-    """
+    """Spec B6: Montezuma's ladders; by default Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"
     sub_goals = SUB_GOALS
@@ -132,8 +128,10 @@ class MontezumaDomain(Domain):
     config_class = MontezumaConfig
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(ladder.name for ladder in LADDERS)
+    many_starts = True
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
+    near = 12
     distance = staticmethod(distance_to_base)
     pixel = staticmethod(pixel)
     agent_pixels = staticmethod(observed_pixel)
@@ -182,19 +180,11 @@ class MontezumaDomain(Domain):
         stack of the held-out set is in another one, and none is twice in one room of a set. Nothing depends on how
         many processes play.
 
-        Args:
-            config: see ``MontezumaConfig``.
-            seed: of the rollouts; each room of each set has a stream of its own.
-            progress: told how many states there will be, and of each room that is done.
-            kept: by name, where each room's states are kept until all are there; what is there is not gathered again.
-
-        Returns:
-            Labels of all three sets (those of the unlabelled are for tests only). Origins: see
-            ``montezuma_states.origins_of``; of held-out states also ``seen``: 0 the room is in no training set, 1 it is
-            among the unlabelled rooms, 2 among the labelled ones.
-
-        Raises:
-            UserError: there is no such room, or no emulator, or a room does not show so many different states.
+        ``seed`` is of the rollouts; each room of each set has a stream of its own. ``kept`` says by name where each
+        room's states are kept until all are there; what is there is not gathered again. Labels are of all three sets
+        (those of the unlabelled are for tests only). Origins: see ``montezuma_states.origins_of``; of held-out states
+        also ``seen``: 0 the room is in no training set, 1 it is among the unlabelled rooms, 2 among the labelled ones.
+        No such room, no emulator, or a room that does not show so many different states is a ``UserError``.
         """
         labelled, unlabelled = labelled_rooms(config.groups), unlabelled_rooms(config)
         tasks: list[_Task] = []
@@ -232,9 +222,8 @@ class MontezumaDomain(Domain):
         seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
         seen[np.isin(heldout.origins["room"], labelled)] = SEEN_LABELLED
         heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
-        return Collected(
-            OBSERVATION_SHAPE, SUB_GOALS, _states_of(whole["labelled"]), _states_of(whole["unlabelled"]), heldout
-        )
+        learnt, others = _states_of(whole["labelled"]), _states_of(whole["unlabelled"])
+        return Collected(OBSERVATION_SHAPE, SUB_GOALS, learnt, others, heldout)
 
     def make_engine(
         self,

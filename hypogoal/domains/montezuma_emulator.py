@@ -74,17 +74,11 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of the emulator and what was seen before it, which is no part of the emulator's own state.
+    """A state of the emulator and what was seen before it, which is no part of the emulator's own state."""
 
-    Attributes:
-        state: an ``ALEState``.
-        seen: the frames of its observation.
-        screen: uint8 (210, 160), the last of them before it was made small.
-    """
-
-    state: Any
-    seen: Frames
-    screen: NDArray[np.uint8]
+    state: Any  # an ``ALEState``
+    seen: Frames  # of its observation
+    screen: NDArray[np.uint8]  # (210, 160), the last of them before it was made small
 
     @property
     def stack(self) -> NDArray[np.uint8]:
@@ -98,17 +92,14 @@ def row_of(room: int) -> int:
 
 
 def load_ale(seed: int) -> Any:
-    """A raw emulator with the game's ROM in it, deterministic, one frame per act; a ``UserError`` where it is not
-    there.
-    """
+    """A raw emulator with the game's ROM, deterministic, one frame per act; a ``UserError`` where it is not there."""
     try:
         import cv2  # noqa: F401
         from ale_py import ALEInterface, LoggerMode
         from ale_py.roms import get_rom_path
     except ImportError as error:
-        raise UserError(
-            f"Montezuma's Revenge cannot be played ({error})", GAME, "pip install ale-py opencv-python-headless."
-        ) from None
+        what = f"Montezuma's Revenge cannot be played ({error})"
+        raise UserError(what, GAME, "pip install ale-py opencv-python-headless.") from None
     rom = get_rom_path(GAME)
     if rom is None or not rom.is_file():
         raise UserError("the emulator has no ROM of the game", GAME, "Install ale-py 0.11 or newer: its wheel has it.")
@@ -124,9 +115,6 @@ def load_ale(seed: int) -> Any:
 class Emulator:
     """One game: agent steps of four frames, stacks of four steps, RAM, and the agent put anywhere.
 
-    Args:
-        seed: of the emulator; without sticky actions nothing depends on it.
-
     Attributes:
         seen, screen: as in ``Snapshot``. Never written to again: each step makes new ones.
         screens: False, nothing is looked at and ``seen`` stays as it is: half the time, where only RAM is wanted.
@@ -135,7 +123,7 @@ class Emulator:
     def __init__(self, seed: int = 0):
         import cv2
 
-        self.ale = load_ale(seed)
+        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed
         self.actions = list(self.ale.getLegalActionSet())
         self.screens = True
         self._resize, self._area, self._brighter = cv2.resize, cv2.INTER_AREA, cv2.max
@@ -185,12 +173,10 @@ class Emulator:
         for _ in range(count):
             self.ale.act(act)
 
-    def ram(self, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """The console's memory, uint8 (128,), into ``out``; where not given, overwritten by the next call."""
-        if out is None:
-            out = self._ram
-        self.ale.getRAM(out)
-        return out
+    def ram(self) -> NDArray[np.uint8]:
+        """The console's memory, uint8 (128,), overwritten by the next call."""
+        self.ale.getRAM(self._ram)
+        return self._ram
 
     def read(self, name: str) -> int:
         """One byte of ``RAM`` by name."""
@@ -226,15 +212,8 @@ class Emulator:
         """Spec B5: the agent at (x, y) of a room, with the torch, its enemies ``phase`` frames old.
 
         The room is entered through its side, as if the agent came from the neighbour: writing the room's number alone
-        draws half a room. Of places in the air the agent falls.
-
-        Args:
-            room, x, y: where, in the RAM's units.
-            phase: frames to wait before the agent is put at its place.
-            settle: agent steps to wait afterwards; four or more fill the stack with what the place looks like.
-
-        Returns:
-            The state; None where the agent did not live to see it, or left the room.
+        draws half a room. Of places in the air the agent falls. Afterwards it waits for ``settle`` agent steps; four or
+        more fill the stack with what the place looks like. None where it did not live to see that, or left the room.
         """
         if room not in self._entered:
             self._entered[room] = self._enter(room)

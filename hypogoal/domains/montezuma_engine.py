@@ -6,6 +6,8 @@ frames of older ones are forgotten.
 
 import json
 from collections.abc import Mapping
+from itertools import chain
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -13,21 +15,13 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.base import TurnEngine
-from hypogoal.domains.montezuma_emulator import (
-    N_ACTIONS,
-    OBSERVATION_SHAPE,
-    RAM,
-    Emulator,
-    Frames,
-    Snapshot,
-    stack_frames,
-)
 from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, draw_start, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import ladder_named
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and what is not yet in it
-ROOM, X, Y, DYING = (RAM[name] for name in ("room", "x", "y", "dying"))
+ROOM, X, Y, DYING = (game.RAM[name] for name in ("room", "x", "y", "dying"))
 
 
 class MontezumaEngine(TurnEngine):
@@ -36,22 +30,17 @@ class MontezumaEngine(TurnEngine):
     Ids 0 .. S-1 are the S start states, for ever; every step of every environment gets a new one. The images of the
     newest ``memory`` of these can be had, positions, labels and who is alive of all.
 
+    Arguments are those of ``MontezumaLadder``, and ``count``, of environments (E). No such ladder, too few start
+    states, too small a memory, or no emulator is a ``UserError``.
+
     Args:
-        start: the ladder, see ``montezuma_ladders.LADDERS``.
-        count: environments (E).
-        max_steps: agent steps after which an episode is truncated.
-        start_states: S; see ``montezuma_env.make_starts``.
-        along: the share of episodes that begin somewhere on the way down instead of at the top.
-        end_at_death: an episode terminates when the agent begins to die; False, when the game is over.
+        start: the ladder; or some, comma-separated, with ``start_states`` of each.
         memory: states whose images are kept; 7 kB each, taken when first needed.
         seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
-
-    Raises:
-        UserError: no such ladder, too few start states, too small a memory, or no emulator.
     """
 
-    n_actions = N_ACTIONS
-    observation_shape = OBSERVATION_SHAPE
+    n_actions = game.N_ACTIONS
+    observation_shape = game.OBSERVATION_SHAPE
     position_names = ("room", "x", "y")
 
     def __init__(
@@ -71,13 +60,17 @@ class MontezumaEngine(TurnEngine):
             raise UserError("no such engine", f"count={count}, memory={memory}", do)
         self.count, self.max_steps, self.along, self.end_at_death = count, max_steps, along, end_at_death
         self.memory: int = memory
-        self._arguments = json.dumps(
-            [start, count, max_steps, start_states, along, end_at_death, memory, seed]
-        ).encode()
-        self._emulators = [Emulator(seed + number) for number in range(count)]
-        self.starts: list[Start] = make_starts(self._emulators[0], ladder_named(start), start_states, seed, along=along)
+        given = [start, count, max_steps, start_states, along, end_at_death, memory, seed]
+        self._arguments = json.dumps(given).encode()
+        self._emulators = [game.Emulator(seed + number) for number in range(count)]
+        of_ladders = [
+            make_starts(self._emulators[0], ladder_named(name), start_states, seed, along=along)
+            for name in start.split(",")
+        ]
+        # draw_start counts on those at the top to come first.
+        self.starts: list[Start] = sorted(chain(*of_ladders), key=attrgetter("on_the_way"))
         self._rng = rng_for(seed, "start-of-episode")
-        self._seen: list[Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
+        self._seen: list[game.Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
@@ -126,7 +119,7 @@ class MontezumaEngine(TurnEngine):
             if fixed <= state < oldest:
                 raise ValueError(f"state {state} is forgotten; the oldest kept is {oldest}")
             seen = self.starts[state].snapshot.seen if state < fixed else self._seen[self._place(state)]
-            stack_frames(seen, image)
+            game.stack_frames(seen, image)
         return out
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -179,4 +172,4 @@ class MontezumaEngine(TurnEngine):
         states = np.split(snapshot["states"], np.cumsum(snapshot["state_sizes"])[:-1])
         now = zip(self._emulators, states, stacks[-self.count :], snapshot["screens"], strict=True)
         for emulator, state, seen, screen in now:
-            emulator.restore(Snapshot(ALEState(state.tobytes()), seen, screen.copy()))
+            emulator.restore(game.Snapshot(ALEState(state.tobytes()), seen, screen.copy()))

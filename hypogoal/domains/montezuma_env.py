@@ -14,15 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.montezuma_emulator import (
-    DOWN,
-    FRAME_SKIP,
-    N_ACTIONS,
-    OBSERVATION_SHAPE,
-    Emulator,
-    Position,
-    Snapshot,
-)
+from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.montezuma_ladders import REACH, SUB_GOAL, Ladder, at_base, ladder_named, within
 
 SUB_GOALS = (SUB_GOAL,)
@@ -35,40 +27,23 @@ FRAMES_PER_SECOND = 60
 
 @dataclass(frozen=True)
 class Start:
-    """Where an episode begins.
+    """Where an episode begins."""
 
-    Attributes:
-        snapshot: the state.
-        position: of the agent.
-        on_the_way: on the way down, not at the top.
-        picture: the console's, uint8 (210, 160, 3): a restored emulator has none to show before its first step.
-    """
-
-    snapshot: Snapshot
-    position: Position
-    on_the_way: bool
-    picture: NDArray[np.uint8]
+    snapshot: game.Snapshot
+    position: game.Position  # of the agent
+    on_the_way: bool  # down, not at the top
+    picture: NDArray[np.uint8]  # the console's, (210, 160, 3): a restored emulator has none before its first step
 
 
-def make_starts(emulator: Emulator, ladder: Ladder, count: int, seed: int, *, along: float = 0.0) -> list[Start]:
+def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int, *, along: float = 0.0) -> list[Start]:
     """Spec D4: states at the top of a ladder from which the scripted descent lives, and some on the way down.
 
     They differ in the phase of what moves, drawn from ``seed``. No two look the same if ``TRIES`` phases for each of
     them offer so many looks. The top of 14-22 has one only: its states differ in what is out of sight.
 
-    Args:
-        emulator: is left in some other state.
-        ladder: the ladder.
-        count: how many states.
-        seed: of the phases and of the places on the way. Same seed, same states, whatever was played before.
-        along: the share of the states that are on the way down, at random steps of the scripted descent; between 0
-            and 1 there is at least one of each kind.
-
-    Returns:
-        The states, those at the top first.
-
-    Raises:
-        UserError: there are fewer such states, or ``along`` is no share.
+    The same seed gives the same states, those at the top first, whatever was played before; the emulator is left in
+    some other state. ``along`` is the share of those on the way down, at random steps of the scripted descent; between
+    0 and 1 there is at least one of each kind. Fewer such states, or no share, is a ``UserError``.
     """
     if not 0.0 <= along <= 1.0 or count < (2 if 0.0 < along < 1.0 else 1):
         do = "Give along a share, 0 to 1, and one state or more of each kind."
@@ -83,7 +58,7 @@ def make_starts(emulator: Emulator, ladder: Ladder, count: int, seed: int, *, al
     return starts
 
 
-def _tops(emulator: Emulator, ladder: Ladder, tries: int, rng: np.random.Generator) -> Iterator[Start]:
+def _tops(emulator: game.Emulator, ladder: Ladder, tries: int, rng: np.random.Generator) -> Iterator[Start]:
     """The top in random phases, where the descent from it lives."""
     for phase in rng.permutation(PHASES)[:tries].tolist():
         snapshot = emulator.place(*ladder.top, phase=phase)
@@ -97,17 +72,19 @@ def _tops(emulator: Emulator, ladder: Ladder, tries: int, rng: np.random.Generat
             yield start
 
 
-def _ways_down(emulator: Emulator, ladder: Ladder, tops: Sequence[Start], rng: np.random.Generator) -> Iterator[Start]:
+def _ways_down(
+    emulator: game.Emulator, ladder: Ladder, tops: Sequence[Start], rng: np.random.Generator
+) -> Iterator[Start]:
     """Random steps of the descents from ``tops``, but for the last: that is the base."""
     for number in rng.permutation(len(tops) * (ladder.steps_down - 1)).tolist():
         top, steps = divmod(number, ladder.steps_down - 1)
         emulator.restore(tops[top].snapshot)
         for _ in range(steps + 1):
-            emulator.step(DOWN)
+            emulator.step(game.DOWN)
         yield _start(emulator, on_the_way=True)
 
 
-def _start(emulator: Emulator, *, on_the_way: bool) -> Start:
+def _start(emulator: game.Emulator, *, on_the_way: bool) -> Start:
     return Start(emulator.save(), emulator.position(), on_the_way, emulator.screen_rgb())
 
 
@@ -124,10 +101,10 @@ def _looking_different(starts: Iterator[Start], count: int) -> list[Start]:
     return [*chosen.values(), *others][:count]
 
 
-def descend(emulator: Emulator, ladder: Ladder) -> bool:
+def descend(emulator: game.Emulator, ladder: Ladder) -> bool:
     """The scripted descent: DOWN from the top to the base. Whether the agent gets there alive."""
     for _ in range(ladder.steps_down):
-        emulator.step(DOWN)
+        emulator.step(game.DOWN)
         if not emulator.alive():
             return False
     return bool(within(np.array([emulator.position()]), [ladder.base], REACH))
@@ -164,7 +141,7 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
             n-th.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND // FRAME_SKIP}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND // game.FRAME_SKIP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -177,9 +154,9 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         start_seed: int = 0,
     ):
         self.max_steps, self.end_at_death, self.along, self.render_mode = max_steps, end_at_death, along, render_mode
-        self.observation_space = spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
-        self.action_space = spaces.Discrete(N_ACTIONS)
-        self.emulator = Emulator()
+        self.observation_space = spaces.Box(0, 255, game.OBSERVATION_SHAPE, np.uint8)
+        self.action_space = spaces.Discrete(game.N_ACTIONS)
+        self.emulator = game.Emulator()
         self.starts = make_starts(self.emulator, ladder_named(start), start_states, start_seed, along=along)
         self.elapsed = 0
         self._picture: NDArray[np.uint8] | None = None
@@ -188,7 +165,7 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         """What the actions are called, as Gymnasium's Atari environments tell it."""
         import ale_py
 
-        return [ale_py.Action(number).name for number in range(N_ACTIONS)]
+        return [ale_py.Action(number).name for number in range(game.N_ACTIONS)]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

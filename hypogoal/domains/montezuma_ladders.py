@@ -20,20 +20,13 @@ REACH = 2  # at a base: this far from it at most, in x and in y
 
 @dataclass(frozen=True)
 class Ladder:
-    """A ladder, from where the agent mounts it to where it gets off.
+    """A ladder, from where the agent mounts it to where it gets off."""
 
-    Attributes:
-        name: its rooms, or its place in room 1 (left, middle, right).
-        top, base: the positions.
-        steps_down: agent steps of DOWN from the top to the base.
-        runs_on: the base is the top of the next ladder; by Spec B5 such states get no label.
-    """
-
-    name: str
+    name: str  # its rooms, or its place in room 1 (left, middle, right)
     top: Position
     base: Position
-    steps_down: int
-    runs_on: bool = False
+    steps_down: int  # agent steps of DOWN from the top to the base
+    runs_on: bool = False  # the base is the top of the next ladder; by Spec B5 such states get no label
 
 
 LADDERS = (

@@ -2,13 +2,11 @@
 are kept, of what kind they are, and their labels (Spec B4, B5, B7).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -95,26 +93,20 @@ LAVA_BELOW = 220  # y; nobody stands on lava, unless put there
 
 @dataclass(frozen=True)
 class RoomStates:
-    """States of a room or of several.
+    """States of a room or of several."""
 
-    Attributes:
-        observations: uint8 (n, 84, 84, 4).
-        ram: uint8 (n, 128), the console's memory.
-        actions: int64 (n, 2), the last one and the one before it.
-    """
-
-    observations: NDArray[np.uint8]
-    ram: NDArray[np.uint8]
-    actions: NDArray[np.int64]
+    observations: NDArray[np.uint8]  # (n, 84, 84, 4)
+    ram: NDArray[np.uint8]  # (n, 128), the console's memory
+    actions: NDArray[np.int64]  # (n, 2), the last one and the one before it
 
     @classmethod
-    def empty(cls, count: int) -> RoomStates:
+    def empty(cls, count: int) -> Self:
         """Room for ``count`` states, to be ``put`` there."""
         shapes = OBSERVATION_SHAPE, (RAM_BYTES,)
         observations, ram = (np.zeros((count, *shape), np.uint8) for shape in shapes)
         return cls(observations, ram, np.zeros((count, 2), np.int64))
 
-    def put(self, begin: int, states: RoomStates) -> None:
+    def put(self, begin: int, states: Self) -> None:
         """Write other states here, from index ``begin`` on."""
         part = slice(begin, begin + len(states.ram))
         self.observations[part], self.ram[part], self.actions[part] = states.observations, states.ram, states.actions
@@ -185,18 +177,11 @@ def emulator_of_process() -> Emulator:
 def gather(
     room: int, wanted: int, seed: int, stream: tuple[str | int, ...], *, play: str, held_out: bool, runs_on: bool
 ) -> RoomStates:
-    """States of a room that are all different: rollouts until there are enough, and of what they show a choice.
+    """``wanted`` states of a room, all different: rollouts until there are enough, and of what they show a choice.
 
-    Args:
-        room: 0..23.
-        wanted: how many states.
-        seed, stream: of everything that is random here, see ``rng_for``.
-        play: how the agent plays: a name in ``PLAYS``.
-        held_out: which side of ``may_be_held_out``.
-        runs_on: whether to keep states at bases of ladders that run on through the floor.
-
-    Raises:
-        UserError: the room does not show so many different states.
+    ``seed`` and ``stream`` are of everything that is random here, see ``rng_for``; ``play``, a name in ``PLAYS``, is
+    how the agent plays; ``held_out``, which side of ``may_be_held_out``; ``runs_on``, whether to keep states at bases
+    of ladders that run on through the floor. A room that does not show so many different states is a ``UserError``.
     """
     rng = rng_for(seed, *stream, room)
     bases = [(index, ladder.base) for index, ladder in enumerate(LADDERS) if ladder.base.room == room]
@@ -241,9 +226,7 @@ def gather(
 def choose(
     kinds: NDArray[np.int64], positions: NDArray[np.int64], wanted: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """The indices, in order, of ``wanted`` of states (n,): of each kind its share, spread over positions (n, 3), others
-    at random.
-    """
+    """Indices, in order, of ``wanted`` of n states: of each kind its share, spread over positions; others at random."""
     order = rng.permutation(len(kinds))
     latest: dict[tuple[int, ...], int] = {}  # kind and position -> turn of the last state so far
     turns = np.empty(len(kinds), np.int64)  # of those of its kind and position, the how manyth a state is
@@ -257,19 +240,13 @@ def choose(
 
 
 class Placing(NamedTuple):
-    """Where a rollout begins.
-
-    Attributes:
-        x, y: the agent is put there.
-        action, steps: then it plays that for so many agent steps, unseen.
-        hold: while the stack fills, it goes back to the base that it is near, instead of doing nothing.
-    """
+    """Where a rollout begins: the agent is put there, then plays ``action`` for so many agent steps, unseen."""
 
     x: int
     y: int
     action: int = NOOP
     steps: int = 0
-    hold: bool = False
+    hold: bool = False  # while the stack fills, it goes back to the base that it is near, instead of doing nothing
 
 
 class Shown(NamedTuple):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 from scipy.stats import rankdata
 
 from hypogoal.core.seeding import rng_for
@@ -26,8 +27,6 @@ from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import Episodes
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 

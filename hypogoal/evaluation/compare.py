@@ -1,7 +1,5 @@
 """Several evaluated runs side by side: whether they can be compared, what differs, and who wins (Spec F5, F7)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -71,9 +69,7 @@ def why_not(runs: Mapping[str, Metrics]) -> str | None:
         if len({texts[0] for texts in values.values()}) > 1:
             return f"they were evaluated with different {key} (" + _told(values) + ")"
     if not shared(runs):
-        has = {
-            label: [name for name, part in PARTS.items() if part.entries(metrics)] for label, metrics in runs.items()
-        }
+        has = {label: shared({label: metrics}) for label, metrics in runs.items()}
         return "they have no kind of result in common (" + _told(has) + ")"
     return None
 
@@ -227,12 +223,10 @@ def _curve(
         lines.append(curves.Line(called, values, PALETTE[index], dashed=index % 2 == 1))
     about, axis = QUANTITIES[quantity]
     bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
-    counts = "; ".join(
-        f"{run}, {curves.runs_of(page.pick(runs[run]['agents'], 'name', agent))}" for run, agent, _ in drawn
-    )
-    more = (
-        f" Not drawn: {page.listed([called for _, _, called in wanted[MOST_LINES:]])}." if wanted[MOST_LINES:] else ""
-    )
+    played = ((run, page.pick(runs[run]["agents"], "name", agent)) for run, agent, _ in drawn)
+    counts = "; ".join(f"{run}, {curves.runs_of(agent)}" for run, agent in played)
+    left = page.listed([called for _, _, called in wanted[MOST_LINES:]])
+    more = f" Not drawn: {left}." if wanted[MOST_LINES:] else ""
     caption = (
         f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and seeds; "
         f"{curves.BANDS} over them ({counts}).{more}"

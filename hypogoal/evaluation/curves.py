@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation import page
@@ -35,8 +36,6 @@ from hypogoal.evaluation.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VE
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Work
 
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
@@ -126,27 +125,26 @@ def trailing_mean(
 def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = WINDOW) -> dict[str, NDArray[np.float64]]:
     """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`."""
     values = {"reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length}
-    return {
-        name: trailing_mean(episodes.step, of.astype(np.float64), grid, window, FIRST) for name, of in values.items()
-    }
+    floats = {name: of.astype(np.float64) for name, of in values.items()}
+    return {name: trailing_mean(episodes.step, of, grid, window, FIRST) for name, of in floats.items()}
 
 
-def steps_to_solve(episodes: Episodes, window: int = WINDOW, share: float = SOLVED) -> int | None:
-    """Spec F5: the first step at which ``share`` of the last ``window`` episodes succeeded; None: never, or too few."""
+def steps_to_solve(episodes: Episodes, window: int = WINDOW) -> int | None:
+    """Spec F5: the first step at which 95 % of the last ``window`` episodes succeeded; None: never, or too few."""
     if len(episodes.step) < window:
         return None
     sums = np.concatenate([[0], np.cumsum(episodes.succeeded.astype(np.int64))])
     recent = sums[window:] - sums[:-window]
-    reached = np.flatnonzero(recent >= share * window)
+    reached = np.flatnonzero(recent >= SOLVED * window)
     return int(episodes.step[reached[0] + window - 1]) if len(reached) else None
 
 
-def discounted_return(episodes: Episodes, gamma: float = GAMMA) -> float:
-    """Spec F5: mean of gamma ** (length - 1) * reward, for tasks whose reward comes last; NaN without episodes.
+def discounted_return(episodes: Episodes) -> float:
+    """Spec F5: mean of 0.99 ** (length - 1) * reward, for tasks whose reward comes last; NaN without episodes.
 
     Unlike success at a cap of 500 steps it tells a short way to the goal from a long one.
     """
-    return mean_of(gamma ** (episodes.length - 1.0) * episodes.reward)
+    return mean_of(GAMMA ** (episodes.length - 1.0) * episodes.reward)
 
 
 def near_shortest(episodes: Episodes, shortest_path: int | None) -> float:
@@ -376,8 +374,18 @@ def summary_section(material: Material) -> Block:
         "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
         "hypotheses that are true there?"
     )
-    headline = [_headline(material)] if metrics["agents"] else []
-    return page.section("summary", "Summary", [*_answers(material), asked], headline, metrics["missing"])
+    headline = page.table(
+        (AGENT, *HEADLINE),
+        metrics["agents"],
+        main=lambda agent: bool(agent["name"] == LEARNED),
+        caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
+        "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
+        f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
+        "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
+        "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
+    )
+    blocks = [headline] if metrics["agents"] else []
+    return page.section("summary", "Summary", [*_answers(material), asked], blocks, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
@@ -439,19 +447,6 @@ def runs_of(agent: Entry) -> str:
     return (
         f"{len(runs)} run{'s' if len(runs) > 1 else ''}: layout seed{'s' if len(layouts) > 1 else ''} "
         f"{page.listed(layouts)}, run seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}"
-    )
-
-
-def _headline(material: Material) -> Block:
-    return page.table(
-        (AGENT, *HEADLINE),
-        material.metrics["agents"],
-        main=lambda agent: bool(agent["name"] == LEARNED),
-        caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
-        "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
-        f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
-        "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
-        "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
 
 

@@ -293,7 +293,7 @@ def show_stops(
 
 def _rooms_of(domain: Domain, ladder: str) -> list[int]:
     with UsersCode("the domain's rooms_of", domain, "rooms_of") as code:
-        gave = domain.rooms_of(ladder)
+        gave = tuple(dict.fromkeys(room for name in ladder.split(",") for room in domain.rooms_of(name)))
         rooms = [number for number in map(as_number, gave) if number is not None and number >= 0]
     if len(rooms) < len(gave):
         code.refuse(f"gave {gave!r}", "Give the rooms' numbers.")

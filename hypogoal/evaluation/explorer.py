@@ -77,9 +77,7 @@ def pick_to_browse(
 
 
 def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The states of ``order``, indices (n,) with the better first, reordered so that groups take turns: the first of
-    each, then the second of each, ... ``groups`` (N,) says each state's.
-    """
+    """Indices (n,), better ones first, reordered so that ``groups`` (N,) take turns: each one's first, second, ..."""
     groups = groups[order]
     turn = np.zeros(len(order), dtype=np.int64)
     for group in np.unique(groups):
@@ -188,7 +186,8 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
 
 def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: str) -> dict[str, Any]:
     option = goal["members"][member]
-    chosen, expected = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
+    counts = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
+    parts = zip(*(count[:, option["option"]] for count in counts), strict=True)
     notes = [word for word in ("most", "least") if goal[word] == member]
     return {
         "name": f"layout {run['layout_seed']}, run seed {run['seed']}{f', {settings}' if settings else ''}",
@@ -200,14 +199,10 @@ def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: 
             ("mean steps", page.fixed(option["duration"], 1)),
             ("match on this layout", page.fixed(option["match"], 2)),
         ],
-        "over": _over(chosen[:, option["option"]], expected[:, option["option"]]),
+        # Preference in each part of training; None where it was not offered.
+        "over": [round(float(chosen / expected), 3) if expected > 0 else None for chosen, expected in parts],
         "png": _overlay(material, run["path"], option["option"]),
     }
-
-
-def _over(chosen: Any, expected: Any) -> list[float | None]:
-    """Preference in each part of training; None where it was not offered."""
-    return [round(float(c / e), 3) if e > 0 else None for c, e in zip(chosen, expected, strict=True)]
 
 
 def _stopped(material: Material, row: Entry, member: int) -> dict[str, Any]:

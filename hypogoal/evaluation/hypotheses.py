@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import Metrics, Row, Rows, grouped, over, pairs, ranked, rows_of, rows_of_members
@@ -25,8 +26,6 @@ from hypogoal.hypotheses.scores import (
 )
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Judgement, Work
 
 WHICH = ("best", "mean", "worst")

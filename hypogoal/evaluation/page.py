@@ -19,14 +19,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Judgement, Work
     from hypogoal.evaluation.numbers import Row, Rows
 
@@ -165,8 +164,6 @@ def table(
 
 def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, sections: bool = False) -> Table:
     """The same table for a terminal, 79 columns wide; a line between groups of rows where ``sections``."""
-    from rich.table import Table
-
     drawn = table(columns, entries)
     found = Table(title=title, title_justify="left", width=79)
     for column in columns:
@@ -249,14 +246,14 @@ def noted(member: int, words: Mapping[str, int | None], most: int | None = None)
     return f"{member} ({', '.join(told)})" if told else str(member)
 
 
-def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "", opened: bool = False) -> Block:
+def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "") -> Block:
     """A list of names and texts, folded until asked for."""
-    return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading, "open": opened}
+    return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading}
 
 
-def cell(text: str, small: str = "", mark: str = "") -> dict[str, str]:
+def cell(text: str, small: str = "") -> dict[str, str]:
     """A cell with a small remark beside its text."""
-    return {"text": text, "small": small, "class": mark}
+    return {"text": text, "small": small, "class": ""}
 
 
 def listed(items: Sequence[Any]) -> str:

@@ -1,7 +1,5 @@
 """The kit of figures: their look, and how they are written. Colours are Okabe and Ito's, told apart by all readers."""
 
-from __future__ import annotations
-
 import io
 import re
 import textwrap
@@ -127,10 +125,7 @@ def slug(text: str) -> str:
 
 
 def to_svg(figure: Figure, name: str) -> str:
-    """The figure as an SVG document, the same bytes each time.
-
-    The :func:`slug` of ``name`` makes the ids inside unique among several on one page.
-    """
+    """The figure as SVG, the same bytes each time, its ids unique on a page by the :func:`slug` of ``name``."""
     name = slug(name)
     buffer = io.StringIO()
     with styled({"svg.hashsalt": name}):
@@ -151,16 +146,11 @@ def to_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def to_pdf(figure: Figure) -> bytes:
-    """The figure as a PDF with its fonts in it as fonts, for papers; the same bytes each time."""
+def to_file(figure: Figure, name: str, kind: str) -> bytes:
+    """The figure as ``svg``, ``png``, or ``pdf`` with its fonts in it as fonts; the same bytes each time."""
+    if kind != "pdf":
+        return to_svg(figure, name).encode() if kind == "svg" else to_png(figure)
     buffer = io.BytesIO()
     with styled({"pdf.fonttype": 42}):
         figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
     return buffer.getvalue()
-
-
-def to_file(figure: Figure, name: str, kind: str) -> bytes:
-    """The figure as ``svg``, ``pdf`` or ``png``."""
-    if kind == "svg":
-        return to_svg(figure, name).encode()
-    return to_pdf(figure) if kind == "pdf" else to_png(figure)

@@ -1,7 +1,5 @@
 """What everything was made from and with (Spec A8)."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Mapping
@@ -105,9 +103,8 @@ def _settings(about: Mapping[str, Any]) -> list[Block]:
         same = json.dumps([artefact["kind"], varying], sort_keys=True)
         if same not in shown:
             shown.add(same)
-            blocks.append(
-                page.facts(f"Settings of {artefact['path']} ({artefact['kind']})", _lines(artefact["config"]))
-            )
+            name = f"Settings of {artefact['path']} ({artefact['kind']})"
+            blocks.append(page.facts(name, _lines(artefact["config"])))
     return blocks
 
 

@@ -1,24 +1,32 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
-from hypogoal.evaluation import choosing, curves, distance, explorer, hypotheses, ranking, rooms, saliency, selection
+from rich.console import Group
+from rich.table import Table
+
+from hypogoal.evaluation import (
+    choosing,
+    curves,
+    distance,
+    exploits,
+    explorer,
+    hypotheses,
+    ranking,
+    rooms,
+    saliency,
+    selection,
+)
 from hypogoal.evaluation.numbers import QUANTITIES, Metrics
 from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
 from hypogoal.evaluation.provenance import domains_of, provenance_section
-
-if TYPE_CHECKING:
-    from rich.console import Group
-    from rich.table import Table
 
 # In the order of the page; the numbers of one are there for those below it.
 QUESTIONS: list[Question] = [
     curves.QUESTION,
     rooms.QUESTION,
     distance.QUESTION,
+    exploits.QUESTION,
     hypotheses.QUESTION,
     ranking.QUESTION,
     explorer.QUESTION,
@@ -47,8 +55,6 @@ def summary_table(metrics: Metrics) -> Table | Group:
 
     A table for each kind of thing that there is: ensembles, options on ladders, agents.
     """
-    from rich.console import Group
-
     tables = [table for question in agents_last() for table in question.summary(metrics)]
     if metrics["missing"]:
         last = tables[-1]

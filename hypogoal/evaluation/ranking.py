@@ -62,9 +62,8 @@ def look(work: Work, judgement: Judgement) -> None:
     origins, judged = judgement.split.origins, judgement.judged
     unseen = origins["seen"] == 0 if "seen" in origins else np.ones(len(judgement.split.labels), dtype=np.bool_)
     contexts = next((origins[name][unseen] for name in ("layout_seed", "room") if name in origins), None)
-    judgement.row["ranking"] = known(
-        judged.probabilities[unseen], judged.verdicts[unseen], judgement.split.labels[unseen], contexts
-    )
+    labels = judgement.split.labels[unseen]
+    judgement.row["ranking"] = known(judged.probabilities[unseen], judged.verdicts[unseen], labels, contexts)
 
 
 def numbers(work: Work) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
@@ -39,8 +40,6 @@ from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, lege
 from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Judgement, Work
 
 # Values of the origin ``seen`` of a held-out state: its room was in no training set, among the unlabelled states, or
@@ -77,18 +76,14 @@ def room_metrics(
     origins: Mapping[str, NDArray[np.int64]],
     kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Spec F1: one ensemble's members by whether training saw the room.
+    """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
 
-    Args:
-        probabilities: float (N, K), that held-out states are reached.
-        verdicts: bool (N, K), what was made of them.
-        labels: bool (N,), the truth.
-        origins: int (N,) each: ``seen`` (see ``SCOPES``) and, where there are, ``room`` and ``kind``.
-        kinds: names of the values of ``kind``.
+    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there are,
+    ``room`` and ``kind``, whose values have the names ``kinds``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
-        of accuracy, balanced accuracy and ``ranking`` (see ``accuracy.ranking``); ``validated``: which member the rooms
+        of accuracy, balanced accuracy and ``ranking`` (area under the ROC curve); ``validated``: which member the rooms
         of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
     """
     seen, rooms = origins["seen"], origins.get("room")
@@ -192,10 +187,8 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
         entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
         entry["ensembles"] = len(goals)
         counts = {scope: (scopes[0][scope]["positives"], scopes[0][scope]["states"]) for scope in TABLED}
-        entry["positives"] = {scope: positives for scope, (positives, _) in counts.items()}
-        entry["always_no"] = {
-            scope: 1 - yes / states if states else math.nan for scope, (yes, states) in counts.items()
-        }
+        entry["positives"] = {scope: yes for scope, (yes, _) in counts.items()}
+        entry["always_no"] = {scope: 1 - yes / of if of else math.nan for scope, (yes, of) in counts.items()}
         entry["scores"] = {
             scope: {
                 score: _by_which([each[scope]["scores"][score] for each in scopes], score, cell, score, scope)
@@ -398,7 +391,7 @@ def rooms_section(material: Material) -> Block:
     )
     blocks = []
     for rows in _by_sub_goal(material):
-        blocks += [page.shown(material, _best(material, rows)), page.shown(material, _four(material, rows))]
+        blocks += [page.shown(material, figure) for figure in _drawn(material, rows)]
         blocks += [*(_table(rows, scope) for scope in TABLED), *_over_seeds(rows)]
         blocks += kinds_tables(material, rows) + room_tables(material, rows)
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
@@ -456,9 +449,8 @@ def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
 def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
     """What accuracy is worth here: that of a member that never says yes, by N."""
     found = {entry["groups"]: entry["always_no"][scope] for entry in rows if entry["always_no"][scope] is not None}
-    told = [
-        f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in sorted(found.items(), key=str)
-    ]
+    every = sorted(found.items(), key=str)
+    told = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
     return f"Never saying yes has accuracy {page.listed(told)}. " if told else ""
 
 
@@ -472,51 +464,38 @@ def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _seeds(material: Material, rows: Sequence[Mapping[str, Any]]) -> str:
-    names = {entry["method"] for entry in rows}
-    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in names})
-    return f"Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}."
-
-
 def figures(material: Material) -> Iterator[Drawn]:
     """Figure 3, and what it leaves out."""
     for rows in _by_sub_goal(material):
-        yield _best(material, rows)
-        yield _four(material, rows)
+        yield from _drawn(material, rows)
 
 
-def _best(material: Material, rows: Sequence[Entry]) -> Drawn:
+def _drawn(material: Material, rows: Sequence[Entry]) -> Iterator[Drawn]:
+    """Of one sub-goal the best member, then every way to pick one."""
+    suffix = f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
+    methods = {entry["method"] for entry in rows}
+    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
     panels = [
         (f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
         for score in ("accuracy", "balanced_accuracy")
         for scope in ("all", "unseen")
     ]
-    name = f"figure3{_suffix(material, rows)}"
     caption = (
         "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
         f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
-        f"{_seeds(material, rows)} {_why_dashes(rows)}{PAPER}"
+        f"Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. {_why_dashes(rows)}{PAPER}"
     )
     nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
     title, drawn = "Figure 3: the best member against labelled ladder groups", scores_over_groups(rows, panels)
-    return Drawn(name, title, drawn, caption, nothing)
-
-
-def _four(material: Material, rows: Sequence[Entry]) -> Drawn:
+    yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
     panels = [(name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
-    name = f"unseen{_suffix(material, rows)}"
     caption = (
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
         f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
         "Only the second can be had without labels from the rooms it is for."
     )
     title, drawn = "Balanced accuracy on unseen rooms", scores_over_groups(rows, panels)
-    return Drawn(name, title, drawn, caption, "As above.", file=f"figure3-{name}")
-
-
-def _suffix(material: Material, rows: Sequence[Entry]) -> str:
-    """What a figure's name ends with where there are several sub-goals."""
-    return f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
+    yield Drawn(f"unseen{suffix}", title, drawn, caption, "As above.", file=f"figure3-unseen{suffix}")
 
 
 def bands(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -9,6 +9,7 @@ import contextlib
 import csv
 import inspect
 import io
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ LAST = 100  # executions of an option that count
 MOST = 2**53  # integers that a float holds
 MOST_OPTIONS = 2**16
 MAX_TABLE_BYTES = 2**30
+BLANK = ("best_near", "best_far")  # columns whose cells may be empty, NaN
 PARTS = ("agents", "ensembles", "hypotheses", "rooms", "distance", "saliency", "selection", "settings", "provenance")
 Table = TypeVar("Table")
 
@@ -212,7 +214,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, ND
     """Columns of a table of numbers, a CSV file with a header; float (n,) each.
 
     ``columns`` are those that must be there; all that are where None. A file that is missing, too large, no table, or
-    holds anything but finite numbers of at most 2^53 is a ``UserError``.
+    holds anything but finite numbers of at most 2^53 (or, in a ``BLANK`` column, nothing) is a ``UserError``.
     """
     text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
     try:
@@ -220,12 +222,12 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, ND
         columns = list(reader.fieldnames or ()) if columns is None else columns
         if not set(columns) <= set(reader.fieldnames or ()):
             raise KeyError(path)
-        rows = [[float(row[name]) for name in columns] for row in reader]
+        rows = [[math.nan if row[of] == "" and of in BLANK else float(row[of]) for of in columns] for row in reader]
     except (ValueError, KeyError, TypeError, csv.Error):
         raise UserError("the table is damaged", path, AGAIN) from None
     values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
     # NaN is no number, and of an integer column nothing may be lost.
-    if not (np.abs(values) < MOST).all():
+    if not ((np.abs(values) < MOST) | (np.isnan(values) & np.isin(columns, BLANK))).all():
         raise UserError("a number in the table is missing or too large", path, AGAIN)
     table = {name: values[:, index] for index, name in enumerate(columns)}
     options = table.get("option", np.zeros(0))

@@ -69,24 +69,22 @@ def look(work: Work, judgement: Judgement) -> None:
 
 
 def pick_examples(
-    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], per_kind: int = 2
+    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]
 ) -> list[tuple[int, str]]:
     """States on which members disagree, all err, or all are right, so that a reader sees each.
 
-    Of N states with K members' probabilities and verdicts, (index, kind), ``per_kind`` at most: ``disagree`` (the
-    widest spread of probabilities first, true and false states in turn), ``wrong`` (the most sure errors first),
-    ``right yes`` and ``right no``; fewer where there are none.
+    Of N states with K members' probabilities and verdicts, (index, kind), of each kind a true and a false one:
+    ``disagree`` (the widest spread of probabilities), ``wrong`` (the most sure error), ``right yes`` and ``right no``;
+    fewer where there are none.
     """
     correct = verdicts == labels[:, None]
     spread = probabilities.max(1) - probabilities.min(1)
     error = np.abs(probabilities - labels[:, None]).min(1)
-    disagree = ~(verdicts.all(1) | (~verdicts).all(1))
-    half = -(-per_kind // 2)
+    disagree, wrong, right = ~(verdicts.all(1) | (~verdicts).all(1)), ~correct.any(1), correct.all(1)
     picked: list[tuple[int, str]] = []
-    for mask, order, kind in ((disagree, -spread, "disagree"), (~correct.any(1), -error, "wrong")):
-        picked += _first(mask & labels, order, half, kind) + _first(mask & ~labels, order, per_kind - half, kind)
-    right = correct.all(1)
-    return [*picked, *_first(right & labels, error, 1, "right yes"), *_first(right & ~labels, error, 1, "right no")]
+    for mask, order, kind in ((disagree, -spread, "disagree"), (wrong, -error, "wrong")):
+        picked += _first(mask & labels, order, kind) + _first(mask & ~labels, order, kind)
+    return [*picked, *_first(right & labels, error, "right yes"), *_first(right & ~labels, error, "right no")]
 
 
 def pick_to_explain(
@@ -108,14 +106,13 @@ def pick_to_explain(
     ):
         free = mask.copy()
         free[[index for index, _ in picked]] = False
-        picked += _first(free, order, 1, kind)
+        picked += _first(free, order, kind)
     return picked
 
 
-def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], count: int, kind: str) -> list[tuple[int, str]]:
+def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], kind: str) -> list[tuple[int, str]]:
     candidates = np.flatnonzero(mask)
-    ranked = candidates[np.argsort(order[candidates], kind="stable")]
-    return [(int(index), kind) for index in ranked[:count]]
+    return [(int(candidates[order[candidates].argmin()]), kind)] if len(candidates) else []
 
 
 def sections(material: Material) -> list[Block]:
@@ -167,9 +164,8 @@ def saliency_section(material: Material) -> Block:
     found = material.metrics["saliency"]
     title = "What members look at"
     if found is None:
-        return page.section(
-            "saliency", title, [], [], ["Attributions: they need an ensemble artefact: train-ensemble."]
-        )
+        lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
+        return page.section("saliency", title, [], [], lacking)
     states = [state for goal in found["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
     text = (
@@ -181,9 +177,7 @@ def saliency_section(material: Material) -> Block:
     )
     check = (
         f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
-        f"{max(errors):.0e} (log-odds)."
-        if errors
-        else ""
+        f"{max(errors, default=0.0):.0e} (log-odds)."
     )
     blocks = [
         _cards(material, goal["sub_goal"], index, state)
@@ -191,7 +185,7 @@ def saliency_section(material: Material) -> Block:
         for index, state in enumerate(goal["states"])
     ]
     missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
-    return page.section("saliency", title, [text, check], blocks, missing)
+    return page.section("saliency", title, [text, check if errors else ""], blocks, missing)
 
 
 def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block:
@@ -241,14 +235,14 @@ def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
     return f"member {member}: {says['text']}"
 
 
-def attributions_of_members(state: Mapping[str, NDArray[Any]], columns: int = 4) -> Figure:
+def attributions_of_members(state: Mapping[str, NDArray[Any]]) -> Figure:
     """Figure 2: what each member goes by in one state; of a stack of frames the last.
 
     ``state`` is of one state what is in ``EXPLAINED``, as ``arrays.h5`` has it; the first of a row's pictures is the
     state itself.
     """
     members = len(state["attributions"])
-    columns = min(columns, members + 1)
+    columns = min(4, members + 1)
     figure, places = grid_of_pictures(-(-(members + 1) // columns), columns, KEY)
     show_picture(places[0], state["observations"], f"truth: {'yes' if state['labels'] else 'no'}")
     grey = brightness(state["seen"]) / 255

@@ -67,18 +67,11 @@ def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[st
 def selection_of_run(
     choices: Choices, match: NDArray[np.float64], sub_goals: Sequence[str], members: int
 ) -> list[dict[str, Any]]:
-    """Spec F6: how often each member was offered and chosen, beside its match.
+    """Spec F6: how often each of K members of G sub-goals was offered and chosen, beside its ``match``, float (G*K,).
 
-    Args:
-        choices: the run's table of choices.
-        match: float (G*K,), each member's balanced accuracy on the layout's reachable states.
-        sub_goals: G names.
-        members: K.
-
-    Returns:
-        A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option,
-        offered, chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last
-        quarter of training). NaN where not defined.
+    A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option, offered,
+    chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last quarter of
+    training). NaN where not defined.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
@@ -86,13 +79,9 @@ def selection_of_run(
     late = choices.since(end - LATE * (end - begin))
     duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
     counts = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")}
-    floats = {"expected": totals["expected"], "duration": duration, "match": match}
-    columns = {
-        **counts,
-        **floats,
-        "preference": preference(totals["chosen"], totals["expected"]),
-        "late_preference": preference(late.total("chosen", options), late.total("expected", options)),
-    }
+    columns = {**counts, "expected": totals["expected"], "duration": duration, "match": match}
+    columns["preference"] = preference(totals["chosen"], totals["expected"])
+    columns["late_preference"] = preference(late.total("chosen", options), late.total("expected", options))
     by_goal = []
     for index, sub_goal in enumerate(sub_goals):
         start = index * members
@@ -157,18 +146,14 @@ def match_on_layout(path: Path, layout_seed: int) -> NDArray[np.float64]:
     return np.concatenate(match)
 
 
-def states_of_layout(engine: Engine, steps: int = 2_000) -> NDArray[np.int64]:
-    """The states of a fresh engine's layout: those that can be reached, or, where nobody knows them, what so many
-    steps of random play meet; each once.
-    """
+def states_of_layout(engine: Engine) -> NDArray[np.int64]:
+    """Of a fresh engine's layout the states that can be reached, else those that random play meets; each once."""
     if (reachable := engine.reachable()) is not None:
         return reachable
-    rng = rng_for(0, "states-of-layout")
-    met = [
-        step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids
-        for _ in range(steps // engine.count)
-    ]
-    return np.unique(np.concatenate([engine.ids, *met]))
+    rng, met = rng_for(0, "states-of-layout"), [engine.ids]
+    for _ in range(2_000 // engine.count):
+        met.append(step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids)
+    return np.unique(np.concatenate(met))
 
 
 def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:

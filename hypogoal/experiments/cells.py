@@ -11,23 +11,17 @@ from hypogoal.core.files import path_part
 
 DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
 SHORT = ("--members", "--diversity", "--layout-seed", "--agent")  # options that are settings, which --set goes before
+COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # of ``results.csv``, behind those of the cell
 Axes = tuple[tuple[str, str | int | float], ...]
 
 
 class Cost(NamedTuple):
-    """What a cell costs, estimated; 0 where that is not known.
+    """What a cell costs, estimated; 0 where that is not known."""
 
-    Attributes:
-        seconds: on one core like that of docs/performance.md.
-        memory: bytes, of each of its processes.
-        disk: bytes that it leaves behind or needs on the way.
-        cores: processes that it can use.
-    """
-
-    seconds: float = 0.0
-    memory: float = 0.0
-    disk: float = 0.0
-    cores: int = 1
+    seconds: float = 0.0  # on one core like that of docs/performance.md
+    memory: float = 0.0  # bytes, of each of its processes
+    disk: float = 0.0  # bytes that it leaves behind or needs on the way
+    cores: int = 1  # processes that it can use
 
 
 UNKNOWN = Cost()
@@ -35,23 +29,14 @@ UNKNOWN = Cost()
 
 @dataclass(frozen=True)
 class Cell:
-    """One command of an experiment.
+    """One command of an experiment."""
 
-    Attributes:
-        name: for messages and its log.
-        arguments: of ``hypogoal``, without ``--force``.
-        out: what it writes.
-        needs: outputs of other cells that must be complete first.
-        cost: what it takes.
-        axes: where it stands in the experiment: seed, method, ... with its value; columns of ``results.csv``.
-    """
-
-    name: str
-    arguments: tuple[str, ...]
-    out: Path
-    needs: tuple[Path, ...] = ()
+    name: str  # for messages and its log
+    arguments: tuple[str, ...]  # of ``hypogoal``, without ``--force``
+    out: Path  # what it writes
+    needs: tuple[Path, ...] = ()  # outputs of other cells that must be complete first
     cost: Cost = UNKNOWN
-    axes: Axes = ()
+    axes: Axes = ()  # where it stands in the experiment: seed, method, ... with its value; columns of ``results.csv``
 
     @property
     def stage(self) -> str:
@@ -76,20 +61,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """An experiment.
+    """An experiment."""
 
-    Attributes:
-        experiment: its name.
-        cells: in an order in which they can run.
-        workers: how many cores they may use at once.
-        anew: names of those that are still to be made again, whatever is there.
-        presets: the preset files that its commands name, each with its digest when the sweep was last started.
-    """
-
-    experiment: str
-    cells: list[Cell]
-    workers: int
-    anew: frozenset[str] = frozenset()
+    experiment: str  # its name
+    cells: list[Cell]  # in an order in which they can run
+    workers: int  # how many cores they may use at once
+    anew: frozenset[str] = frozenset()  # names of those that are still to be made again, whatever is there
+    # The preset files that its commands name, each with its digest when the sweep was last started.
     presets: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -96,7 +96,8 @@ class Estimates:
             kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
             return Cost(seconds, *baseline_needs(prod(domain.observation_shape), kept))
-        domain.rooms_of(config.start)  # which says so where there is no such start
+        for start in config.start.split(","):
+            domain.rooms_of(start)  # which says so where there is no such start
         about: dict[str, Any] = {"sub_goals": domain.sub_goals, "members": 1}
         if source is not None:
             about = {"sub_goals": source.sub_goals or domain.sub_goals, "members": source.members}

@@ -20,9 +20,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import Cell, Cost, Plan, closing_cells, stage_cell
+from hypogoal.experiments.cells import COLUMNS, Cell, Cost, Plan, closing_cells, stage_cell
 from hypogoal.experiments.costs import Estimates
-from hypogoal.experiments.results import COLUMNS
 from hypogoal.settings import CONFIGS, STAGES, TABLES, configuration
 
 FORMAT_VERSION = 1
@@ -74,16 +73,8 @@ class _Group:
         return self.words[0]
 
     @property
-    def command(self) -> str:
-        return str(self.row["command"])
-
-    @property
     def out(self) -> str:
         return str(self.row.get("out", self.name))
-
-    @property
-    def switch(self) -> str:
-        return str(self.row.get("if", ""))
 
     @property
     def named(self) -> list[str]:
@@ -116,19 +107,17 @@ class Experiment:
         fields: list[tuple[str, Any, Any]] = []
         for name, (value, about) in self.settings.items():
             kinds = {type(item) for item in value} if isinstance(value, tuple) else set()
-            kind: Any = (
-                tuple[int, ...] if kinds == {int} else tuple[float, ...] if kinds == {float} else tuple[str, ...]
-            )
+            kind: Any = bool if isinstance(value, bool) else tuple[str, ...]
+            kind = tuple[int, ...] if kinds == {int} else tuple[float, ...] if kinds == {float} else kind
             told = {key: about[key] for key in ("source", "low", "high") if key in about}
             choices = about.get("choices") or about.get("words") or None
             described = setting(value, about.get("meaning", ""), choices=choices, **told)
-            fields.append((name, bool if isinstance(value, bool) else kind, described))
+            fields.append((name, kind, described))
         workers = setting(self.table.get("workers", 0), "cells at once; 0 for one per core", low=0, high=1024)
         fields.append(("workers", int, workers))
         if self.domain is None:
-            fields.append(
-                ("evaluate", bool, setting(self.table.get("evaluate", True), "evaluation and report at the end"))
-            )
+            closing = setting(self.table.get("evaluate", True), "evaluation and report at the end")
+            fields.append(("evaluate", bool, closing))
         return make_dataclass("RunConfig", fields, frozen=True)
 
 
@@ -284,20 +273,16 @@ class _Planner:
             if self.domain is None and isinstance(axis.value, tuple):
                 _values(name, list(axis.value), Path("--set"))
         chosen = experiment.groups.items()
-        self.groups = {name: group for name, group in chosen if not group.switch or getattr(config, group.switch)}
+        self.groups = {name: group for name, group in chosen if getattr(config, group.row.get("if", ""), True)}
         self._check_stages(by_stage)
-        self.common = {
-            stage: (
-                *(("--preset", preset) if preset else ()),
-                *(x for pair in by_stage.get(stage, ()) for x in ("--set", pair)),
-                *(("--device", device) if device != "auto" and stage in CONFIGS else ()),
-            )
-            for stage in experiment.stages
-        }
+        self.common: dict[str, list[str]] = {}
         self.resolved: dict[str, Any] = {}
-        if self.domain:
-            for stage in experiment.stages:
-                self.resolved[stage] = configuration(stage, self.domain, preset, by_stage.get(stage))
+        for stage in experiment.stages:
+            pairs = by_stage.get(stage, [])
+            common = [*(("--preset", preset) if preset else ()), *(x for pair in pairs for x in ("--set", pair))]
+            self.common[stage] = common + (["--device", device] if device != "auto" and stage in CONFIGS else [])
+            if self.domain:
+                self.resolved[stage] = configuration(stage, self.domain, preset, pairs)
 
     def _refuse(self, assignments: Sequence[str], preset: str | None, device: str) -> None:
         if preset is not None:
@@ -326,7 +311,7 @@ class _Planner:
         found: dict[tuple[str, str], str] = {}
         for group in self.experiment.groups.values():
             for axis, name in group.lists.items():
-                options = re.findall(rf"--(\S+)\s+\{{{axis}\}}", group.command)
+                options = re.findall(rf"--(\S+)\s+\{{{axis}\}}", group.row["command"])
                 for words in self.settings[name].about.get("words", {}).values():
                     options += re.findall(r"--(\S+)", words)
                 found.update(((group.stage, option.replace("-", "_")), name) for option in options)
@@ -334,7 +319,8 @@ class _Planner:
 
     def plan(self, *, short: bool) -> Plan:
         experiment = self.experiment
-        self.short = short and bool(experiment.table.get("short")) and all(map(self._is_single, self.groups.values()))
+        single = all(len(self._of(group, axis)) == 1 for group in self.groups.values() for axis in group.named)
+        self.short = short and single and bool(experiment.table.get("short"))
         planned: list[Cell] = []
         read: list[Path] = []
         for _, rows in groupby(self.groups.values(), lambda group: group.row.get("for") or group.name):
@@ -366,9 +352,6 @@ class _Planner:
         values: Any = ("", *own.value) if own.about.get("changes") else own.value  # type: ignore[misc]
         return tuple(values[:1]) if axis in group.row.get("first", ()) else tuple(values)
 
-    def _is_single(self, group: _Group) -> bool:
-        return all(len(self._of(group, axis)) == 1 for axis in group.named)
-
     def _points(self, group: _Group) -> Iterable[tuple[tuple[int, ...], Point]]:
         """Each combination of values of a group's axes, behind the numbers of those of its outer ones."""
         pairs = [
@@ -387,16 +370,14 @@ class _Planner:
         for places in product(*(range(len(own)) for own in values.values())):
             at = dict(zip(values, places, strict=True))
             if all(len({at[axis] for axis in axes}) <= 1 for axes in pairs):
-                yield (
-                    tuple(at[axis] for axis in group.row.get("for", ())),
-                    {axis: values[axis][at[axis]] for axis in values},
-                )
+                outer = tuple(at[axis] for axis in group.row.get("for", ()))
+                yield outer, {axis: values[axis][at[axis]] for axis in values}
 
     def _check_read(self, group: _Group) -> None:
         """Refuse values for which the cells that a group reads are not made."""
         if not all(self._of(group, axis) for axis in group.lists):
             return
-        for other in (self.groups[name] for name in REFERENCE.findall(group.command) if name in self.groups):
+        for other in (self.groups[name] for name in REFERENCE.findall(group.row["command"]) if name in self.groups):
             for axis in other.lists.keys() & group.lists.keys():
                 there, mine = self._of(other, axis), self.settings[group.lists[axis]].value
                 if missing := [value for value in mine if value not in there]:  # type: ignore[union-attr]
@@ -416,16 +397,14 @@ class _Planner:
             other = self.groups.get(key)
             missing = set() if other is None else other.lists.keys() - point.keys()
             if other is None or other is group or any(not self._is_changes(other, axis) for axis in missing):
-                raise UserError(
-                    f"{{{key}}} is no axis of these cells, nor the name of cells above over some of their axes",
-                    f"cells {group.name!r}",
-                    MEND,
-                )
+                what = f"{{{key}}} is no axis of these cells, nor the name of cells above over some of their axes"
+                raise UserError(what, f"cells {group.name!r}", MEND)
             needs.append(self._place(other, {**dict.fromkeys(missing, ""), **point}))
             return str(needs[-1])
 
         words: list[str] = []
-        for word in _words(re.sub(r"\[([^\[\]]*)\]", self._if_there, group.command), f"cells {group.name!r}"):
+        command = re.sub(r"\[([^\[\]]*)\]", self._if_there, group.row["command"])
+        for word in _words(command, f"cells {group.name!r}"):
             axis = word[1:-1]
             own = self.settings[group.lists[axis]] if word == f"{{{axis}}}" and axis in point else None
             if own and own.about.get("changes"):
@@ -447,7 +426,8 @@ class _Planner:
     def _if_there(self, match: re.Match[str]) -> str:
         """What stands in brackets, unless it names cells that are switched off."""
         names = REFERENCE.findall(match[1])
-        if not any(name in self.experiment.groups and self.experiment.groups[name].switch for name in names):
+        known = self.experiment.groups
+        if not any(name in known and "if" in known[name].row for name in names):
             return match[0]
         return match[1] if all(name in self.groups for name in names) else ""
 

@@ -30,21 +30,13 @@ GIVE = "Give the command that began it, of 'run' with --resume and without --for
 
 @dataclass(frozen=True)
 class Record:
-    """How a cell went so far.
+    """How a cell went so far."""
 
-    Attributes:
-        attempts: how often it was started.
-        seconds: that it ran, all attempts that ended together.
-        code: its exit code, minus the signal that ended it; None: it runs, or died with whoever ran it.
-        started: when the last attempt began, seconds of the clock since 1970; for people only.
-        host: where.
-    """
-
-    attempts: int = 0
-    seconds: float = 0.0
-    code: int | None = None
-    started: float = 0.0
-    host: str = ""
+    attempts: int = 0  # how often it was started
+    seconds: float = 0.0  # that it ran, all attempts that ended together
+    code: int | None = None  # its exit code, minus the signal that ended it; None: it runs, or died with whoever ran it
+    started: float = 0.0  # when the last attempt began, seconds of the clock since 1970; for people only
+    host: str = ""  # where
 
 
 def log_of(run: Path, cell: Cell) -> Path:
@@ -60,10 +52,8 @@ def last_line(log: Path) -> str:
 
 def read_record(run: Path, cell: Cell) -> Record:
     """How a cell went; an empty record where it was never started, or where what is there cannot be read."""
-    path = run / LOGS / f"{cell.name}.json"
     try:
-        values = read_json(path, "the record is", AGAIN)
-        record = Record(**values)
+        record = Record(**read_json(run / LOGS / f"{cell.name}.json", "the record is", AGAIN))
         numbers = (record.attempts, record.seconds, record.started, record.code or 0)
         return record if all(isinstance(number, int | float) for number in numbers) else Record()
     except (UserError, TypeError):
@@ -78,12 +68,6 @@ def write_record(run: Path, cell: Cell, record: Record) -> None:
 def begun(before: Record) -> Record:
     """The record of a cell that is being started."""
     return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
-
-
-def forget_records(run: Path, cells: Sequence[Cell]) -> None:
-    """Have no record of cells: as if none of them had ever been started."""
-    for cell in cells:
-        (run / LOGS / f"{cell.name}.json").unlink(missing_ok=True)
 
 
 def excuse(run: Path, cells: Sequence[Cell]) -> None:
@@ -198,9 +182,7 @@ def made_anew(run: Path, cell: Cell) -> None:
 
 
 def check_same(run: Path, cells: Sequence[Cell]) -> None:
-    """Refuse (``UserError``) cells that do not go on with what the folder has: all of before, with the same command and
-    presets.
-    """
+    """Refuse (``UserError``) cells without all that the folder has, with the same commands and presets."""
     if not (run / PLAN).is_file():
         return
     do = "Give the settings it was begun with, or choose another --out."

@@ -4,26 +4,22 @@ Made from the sweep's evaluation, and from the cells' own artefacts where that h
 between two runs of the same commands is in it: no time, no machine, no path.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_text, write_table
 from hypogoal.core.manifests import AGAIN
 from hypogoal.dataset import open_dataset
-from hypogoal.experiments.cells import Cell, Plan
+from hypogoal.evaluation import curves, distance, hypotheses
+from hypogoal.evaluation.numbers import Row, rows_of
+from hypogoal.evaluation.run import read_episodes, read_executions, read_layout
+from hypogoal.experiments.cells import COLUMNS, Cell, Plan
 from hypogoal.experiments.records import RESULTS
 from hypogoal.experiments.status import done_of
-
-if TYPE_CHECKING:
-    from hypogoal.evaluation.numbers import Row
-
-COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # behind those of the cell
 
 
 def write_results(plan: Plan, run: Path) -> Path:
@@ -56,8 +52,6 @@ def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
 
 def _of_metrics(metrics: dict[str, Any]) -> Iterator[Row]:
     """What stands in ``metrics.json`` of each artefact: members, options, runs."""
-    from hypogoal.evaluation import curves, distance, hypotheses
-
     metrics = {"ensembles": [], "agents": [], "layouts": [], "distance": {"options": []}, **metrics}
     for rows in (hypotheses.rows, distance.rows, curves.rows):
         yield from rows(metrics, {})
@@ -73,9 +67,6 @@ def _logged(cell: Cell) -> Iterable[Row]:
 
 def _by_chance(cell: Cell) -> Iterator[Row]:
     """How random play does where an agent was trained."""
-    from hypogoal.evaluation.numbers import rows_of
-    from hypogoal.evaluation.run import read_layout
-
     if _has(cell, "episodes.csv") and not _has(cell, "executions.csv"):
         yield from rows_of({"random_success": read_layout(cell.out / "layout.json")["random_success"]})
 
@@ -87,8 +78,6 @@ def _has(cell: Cell, table: str) -> bool:
 
 
 def _states(path: Path) -> Iterator[Row]:
-    from hypogoal.evaluation.numbers import rows_of
-
     counts = open_dataset(path).counts()
     for split in ("labelled", "heldout"):
         for sub_goal, row in counts[split].items():
@@ -97,8 +86,6 @@ def _states(path: Path) -> Iterator[Row]:
 
 
 def _losses(artefact: Artefact) -> Iterator[Row]:
-    from hypogoal.evaluation.numbers import rows_of
-
     last: dict[str, dict[str, Any]] = {}
     for line in read_text(artefact.path / "metrics.jsonl", "the log is", AGAIN).splitlines():
         row = json.loads(line)
@@ -109,16 +96,12 @@ def _losses(artefact: Artefact) -> Iterator[Row]:
 
 def _unevaluated(cell: Cell) -> Iterator[Row]:
     """What an evaluation would say of a run or of options: it has not been made, or takes them for a part of others."""
-    from hypogoal.evaluation.curves import Run, agent_metrics
-    from hypogoal.evaluation.distance import rows_of_ladder
-    from hypogoal.evaluation.run import read_episodes, read_executions, read_layout
-
     artefact = open_artefact(cell.out) if _has(cell, "episodes.csv") or _has(cell, "executions.csv") else None
     if artefact is not None and _has(cell, "executions.csv"):
         about = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
-        found = rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
+        found = distance.rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
         yield from _of_metrics({"distance": {"options": [{**about, **row} for row in found]}})
     elif artefact is not None:
         episodes, layout = read_episodes(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
-        run = Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
-        yield from _of_metrics({"agents": [agent_metrics("", [run])]})
+        run = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
+        yield from _of_metrics({"agents": [curves.agent_metrics("", [run])]})

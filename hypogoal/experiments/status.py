@@ -27,20 +27,12 @@ MOST_SHOWN = 20
 
 @dataclass(frozen=True)
 class State:
-    """Where one cell is.
-
-    Attributes:
-        cell: which.
-        state: done, running, failed, stopped (it goes on with the next start), waiting (not begun), held (it waits
-            for one that failed).
-        record: how it went so far.
-        text: of one that runs or failed, what it said last.
-    """
+    """Where one cell is."""
 
     cell: Cell
-    state: str
+    state: str  # one of those above: stopped ones go on with the next start, held ones wait for one that failed
     record: Record
-    text: str = ""
+    text: str = ""  # of one that runs or failed, what it said last
 
 
 @dataclass(frozen=True)
@@ -58,9 +50,7 @@ class Status:
 
 
 def read_status(run: Path) -> Status:
-    """Look at every cell (``UserError``: there is no sweep); done is as of :func:`done_of`, which the next start checks
-    file by file.
-    """
+    """Look at every cell; done is as of :func:`done_of`, which the next start checks file by file."""
     plan, factor = read_plan(run)
     states: list[State] = []
     done = done_of(plan)
@@ -143,11 +133,8 @@ def lines(status: Status) -> list[str]:
     for state in (RUNNING, FAILED):
         shown = [row for row in status.states if row.state == state]
         for row in shown[:MOST_SHOWN]:
-            where = (
-                f" on {row.record.host}"
-                if state == RUNNING and row.record.host
-                else f" ({log_of(status.run, row.cell)})"
-            )
+            host = row.record.host if state == RUNNING else ""
+            where = f" on {host}" if host else f" ({log_of(status.run, row.cell)})"
             text.append(f"  {state} {row.cell.name}{where}: {row.text}")
         if len(shown) > MOST_SHOWN:
             text.append(f"  and {len(shown) - MOST_SHOWN} more {state}")
@@ -180,14 +167,9 @@ def is_finished(cell: Cell) -> bool:
     """Whether the cell's output is there, whole, and made of what is there now; asked when all that it needs is.
 
     An evaluation or report of less than what is there now, or of something else, is not finished. What a training stage
-    made is never replaced by itself: it may be weeks of work.
-
-    Raises:
-        UserError: something else is in the output's place, a file of it was changed, or an input was changed since.
+    made is never replaced by itself, it may be weeks of work: what is something else, or changed, is a ``UserError``.
     """
-    if not cell.out.exists():
-        return False
-    if cell.out.is_dir() and not any(cell.out.iterdir()):
+    if not cell.out.exists() or (cell.out.is_dir() and not any(cell.out.iterdir())):
         return False
     try:
         fault = _fault(cell)
@@ -201,10 +183,7 @@ def is_finished(cell: Cell) -> bool:
 
 
 def stamp_of(cell: Cell) -> tuple[int, int] | None:
-    """Which output of a cell is there: its file's number, and when that was written, in ns; None where none is.
-
-    It gets its name when it is whole.
-    """
+    """Which whole output of a cell is there: its file's number, and when that was written, in ns; None: none."""
     place = cell.out if cell.stage == "collect" else cell.out / MANIFEST
     try:
         found = place.stat()
@@ -214,9 +193,7 @@ def stamp_of(cell: Cell) -> tuple[int, int] | None:
 
 
 def left_of(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells that are not :func:`is_finished`; of evaluation and report also those that read what is still to be
-    made.
-    """
+    """The cells that are not :func:`is_finished`, and evaluation and report of what is still to be made."""
     left: list[Cell] = []
     pending: set[Path] = set()
     for cell in cells:
@@ -232,18 +209,13 @@ def _fault(cell: Cell) -> str:
         open_dataset(cell.out)
         return ""
     artefact = open_artefact(cell.out)
-    damage = check_files(artefact)
-    if damage:
+    if damage := check_files(artefact):
         return damage[0]
     for entry in artefact.manifest["inputs"]:
-        fault = find_input(artefact.path, entry)[1]
-        if fault.startswith("changed"):
+        if find_input(artefact.path, entry)[1].startswith("changed"):
             return f"its input {entry['path']} was changed since"
-    return (
-        "it is of other artefacts"
-        if cell.stage == "evaluate" and not _of_all(artefact, Path(cell.arguments[1]))
-        else ""
-    )
+    others = cell.stage == "evaluate" and not _of_all(artefact, Path(cell.arguments[1]))
+    return "it is of other artefacts" if others else ""
 
 
 def is_current(cell: Cell) -> bool:

@@ -11,12 +11,8 @@ class FlatParameters:
     parameter. Matrices lie transposed in the vectors, (in, out) row by row: so a dense layer's product needs nothing
     rearranged, and for the 16 states of an acting step it takes a fifth of the time. Same values, up to rounding.
 
-    Args:
-        modules: on one device, float32; they get new parameters, which are to be changed in place only.
-        learning: whether there are gradients.
-
-    Attributes:
-        vector: float32 (P,); where ``learning``, with its ``grad``, to be given to an optimiser.
+    The modules, on one device, float32, get new parameters, which are to be changed in place only. ``vector``, float32
+    (P,), where ``learning`` with its ``grad``, is to be given to an optimiser.
     """
 
     def __init__(self, *modules: nn.Module, learning: bool = True):

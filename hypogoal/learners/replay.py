@@ -58,13 +58,10 @@ class SumTree:
 
 
 class PrioritisedReplay(Resumable):
-    """A ring of transitions, sampled in proportion to priority ** alpha.
+    """A ring of transitions (Tables 2 and 4: 1e5), sampled in proportion to priority ** alpha.
 
-    Args:
-        capacity: transitions kept (Tables 2 and 4: 1e5).
-        fields: name -> NumPy dtype of what is stored per transition.
-        alpha: 0 samples uniformly, 1 in full proportion.
-        beta: strength of the importance weights that correct for it.
+    ``fields`` are by name the NumPy dtypes of what is stored per transition. An ``alpha`` of 0 samples uniformly, 1 in
+    full proportion; ``beta`` is the strength of the importance weights that correct for it.
     """
 
     def __init__(self, capacity: int, fields: Mapping[str, Any], *, alpha: float, beta: float):
@@ -88,11 +85,7 @@ class PrioritisedReplay(Resumable):
         return indices
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Stratified sample in proportion to priority.
-
-        Returns:
-            indices int64 (count,) and importance weights float32 (count,), the largest of them 1.
-        """
+        """Stratified in proportion to priority: indices and importance weights (count,), the largest of these 1."""
         total = self.tree.total
         sums = (np.arange(count) + rng.random(count)) * (total / count)
         indices = np.minimum(self.tree.find(np.minimum(sums, np.nextafter(total, 0))), self.size - 1)
@@ -128,10 +121,6 @@ class StepsAhead(Resumable):
     """Joins the steps of many sequences played side by side into transitions over up to n steps.
 
     A transition from a step reaches n steps on, or to the sequence's end where that comes sooner; never beyond.
-
-    Args:
-        sequences: E, how many are played side by side.
-        n: steps ahead.
     """
 
     CHANGING = ("_open",)
@@ -150,13 +139,8 @@ class StepsAhead(Resumable):
     ) -> dict[str, NDArray[Any]]:
         """One step of every sequence, arrays (E,); returns the transitions that are complete now, arrays (m,).
 
-        Args:
-            s, a, following: state ids before, actions, state ids after.
-            ended: the sequence ends with this step.
-            columns: what else is known of the step; a transition gets that of its last step.
-
-        Returns:
-            ``s``, ``a``, ``next``, ``steps`` (how far the transition reaches, 1 .. n) and ``columns``.
+        Of a step state ids before, actions, state ids after, and ``columns`` are given; of a transition ``s``, ``a``,
+        ``next``, ``steps`` (how far it reaches, 1 .. n) and the ``columns`` of its last step.
         """
         if self.n == 1:
             return {"s": s, "a": a, "next": following, "steps": np.ones(len(s), dtype=np.int64), **columns}

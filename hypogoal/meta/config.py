@@ -49,7 +49,10 @@ class WorldConfig(OptionConfig):
     """Where options are played."""
 
     start: str = setting(
-        "", "where episodes begin, in a domain that names several such places", source="paper, policy learning"
+        "",
+        "where episodes begin, in a domain that names several such places; of some, comma-separated, each is drawn as "
+        "often",
+        source="paper, policy learning; several: ours",
     )
     along: float = setting(
         0.0,

@@ -2,13 +2,18 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import Artefact, sha256_of
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
@@ -28,6 +33,7 @@ from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
 from hypogoal.options.visited import Visited
+from hypogoal.options.windows import AgentWindows, localiser_of
 
 LOG_INTERVAL = 2_000  # environment steps
 LEARNERS: dict[str, type[Learner]] = {"light": LightLearner, "paper": RecurrentLearner, "planned": PlannedLearner}
@@ -60,6 +66,12 @@ def assemble(
         _check_rule(terminations, config)
         if (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
+    seen = None
+    if config.policy_view == "agent-crop":
+        if config.network != "light":
+            given = f"policy_view=agent-crop, network={config.network}"
+            raise UserError("only the light network sees windows", given, "Give --set network=light.")
+        seen = AgentWindows(engine, localiser_of(read_ensemble(ensemble, dict(about), sub_goals[0])))
     gamma, rng = 1.0, rng_for(seed, "random-choice")
     chooser: Chooser = EvenChooser(options, rng) if config.chooser == "even" else RandomChooser(rng)
     if isinstance(config, TrainMetaConfig):
@@ -68,10 +80,10 @@ def assemble(
             chooser = MetaPolicy(engine, options, config, seed, device)
         elif config.chooser in BANDITS:
             chooser = BANDITS[config.chooser](options, engine.count, rng)
-    return OptionLoop(
+    loop = OptionLoop(
         engine,
         terminations,
-        LEARNERS[config.network](engine, terminations, config, seed, device),
+        LEARNERS[config.network](engine, terminations, config, seed, device, seen),
         chooser,
         Recorder(options, engine),
         config,
@@ -79,6 +91,31 @@ def assemble(
         initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
+    if near := nearness(domain, engine, about, config):
+        near(np.repeat(engine.ids[:1], options), np.arange(options))  # labels that fail do so before all is learned
+    return loop
+
+
+def nearness(
+    domain: Domain, engine: Engine, about: Mapping[str, Any], config: PlayConfig
+) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None:
+    """Spec H5: of states (n,) and options (n,) whether these options' true sub-goals hold there, or nearly.
+
+    None where the domain has not all of the ensemble's sub-goals, or options end where they are true.
+    """
+    sub_goals = about["sub_goals"]
+    if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
+        return None
+    columns = np.repeat(_columns(domain, sub_goals), about["members"])
+
+    def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
+        with UsersCode("the engine's labels", engine, "labels"):
+            told = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
+        if not (domain.measures and engine.position_names):
+            return told
+        return told | (domain.distance(engine.positions(ids)) <= domain.near)
+
+    return near
 
 
 def make_engine(domain: Domain, about: Mapping[str, Any], config: WorldConfig, options: int, seed: int) -> Engine:
@@ -134,9 +171,10 @@ def start_arguments(domain: Domain, config: WorldConfig, options: int, seed: int
             given = f"start={config.start}" if config.start else f"along={config.along}"
             raise UserError(f"{domain.name} has no named starts", given, "Leave it out.")
         return {}
-    if config.start not in domain.starts:
-        what = "unknown start" if config.start else "where are episodes to begin?"
-        raise UserError(what, config.start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
+    for start in config.start.split(",") if domain.many_starts else [config.start]:
+        if start not in domain.starts:
+            what = "unknown start" if start else "where are episodes to begin?"
+            raise UserError(what, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
@@ -188,6 +226,21 @@ def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, che
             checkpoints.offer(state)
 
 
+def check_fit(
+    trained: Artefact, source: Artefact, config: TrainOptionsConfig | TrainMetaConfig, fixed: Sequence[str]
+) -> None:
+    """Whether options can be trained further: they are of this ensemble (``source``), and alike in these settings."""
+    made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
+    if sha256_of(source.path / "manifest.json") not in made_from:
+        what = "these options were trained with another ensemble"
+        raise UserError(what, trained.path, f"Train them from {source.path}.")
+    before = as_dict(type(config)()) | trained.config  # of settings from before there were any, the default
+    for key in fixed:
+        if before[key] != getattr(config, key):
+            what = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
+            raise UserError(what, trained.path, f"Give --set {key}={before[key]}.")
+
+
 def description(
     loop: OptionLoop, domain: Domain, about: Mapping[str, Any], config: PlayConfig, **more: Any
 ) -> dict[str, Any]:
@@ -207,6 +260,8 @@ def write_trained(
 ) -> None:
     """Into an artefact's folder: what was learned and what happened meanwhile."""
     loop.recorder.write(folder)
+    if near := nearness(domain, loop.engine, about, config):
+        loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
         loop.visited.write(folder, domain, about, seed)
     save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())

@@ -19,7 +19,9 @@ from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.networks import Pictures
 from hypogoal.options.termination import Terminations
+from hypogoal.options.windows import AgentWindows
 
 COUNTERS = ("option_steps", "steps_since_positive")
 
@@ -57,6 +59,7 @@ class Learner(Resumable, ABC):
         config: see :class:`OptionConfig`.
         seed: of weights, exploration and sampling.
         device: where the networks are.
+        windows: what the policies see of states; all of it where None.
 
     Attributes:
         actions: the engine's actions that the policies choose among, int64 (A,).
@@ -68,7 +71,7 @@ class Learner(Resumable, ABC):
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *COUNTERS)
+    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "windows", *COUNTERS)
 
     def __init__(
         self,
@@ -77,8 +80,10 @@ class Learner(Resumable, ABC):
         config: OptionConfig,
         seed: int,
         device: torch.device | str = "cpu",
+        windows: AgentWindows | None = None,
     ):
-        self.engine, self.terminations, self.config = engine, terminations, config
+        self.engine, self.terminations, self.config, self.windows = engine, terminations, config, windows
+        self.pictures: Pictures = windows or engine
         self.options, self.device = terminations.options, torch.device(device)
         self.actions = action_set(engine, config.actions)
         self._index = np.zeros(engine.n_actions, dtype=np.int64)

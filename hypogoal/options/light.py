@@ -50,13 +50,19 @@ class LightLearner(Learner):
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
+        if config.shaping and not self.running_only:
+            what = "only the running option's member says how near it is to a yes"
+            given = f"shaping={config.shaping:g}, experience={config.experience}"
+            raise UserError(what, given, "Give --set experience=own or --set shaping=0.")
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
-            self.online = LightQNetwork(self.engine.observation_shape, self.options, len(self.actions)).to(self.device)
+            self.online = LightQNetwork(self.pictures.observation_shape, self.options, len(self.actions)).to(
+                self.device
+            )
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
-        self.pixels = Pixels(self.engine, 2 * config.option_batch, self.device) if pictures else None
+        self.pixels = Pixels(self.pictures, 2 * config.option_batch, self.device) if pictures else None
         self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
         self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
         self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
@@ -72,7 +78,7 @@ class LightLearner(Learner):
 
     @torch.no_grad()
     def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
-        values = apply_to_states(self.online, self.engine, ids).cpu().numpy()
+        values = apply_to_states(self.online, self.pictures, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
@@ -145,6 +151,14 @@ class LightLearner(Learner):
         ahead = self.tensor(batch["steps"]).float()[:, None]
 
         values, next_online, next_target = self._values(s, following)
+        if self.config.shaping:
+            # A potential for a reward is the same as learning what is left of the values above it (Wiewiora 2003).
+            option = batch["option"].astype(np.int64)
+            near, next_near = (
+                self.config.shaping * self.tensor(self.terminations.nearness(ids, option))[:, None, None]
+                for ids in (s, following)
+            )
+            values, next_online, next_target = values + near, next_online + next_near, next_target + next_near
         with torch.no_grad():
             goal = double_q_targets(
                 self.tensor(reached) * self.config.option_gamma ** (ahead - 1),
@@ -172,9 +186,9 @@ class LightLearner(Learner):
             with torch.no_grad():
                 ahead = self.online(there), self.target(there)
             return self.online(here), *ahead
-        values = apply_to_states(self.online, self.engine, s)
+        values = apply_to_states(self.online, self.pictures, s)
         with torch.no_grad():
-            next_online, next_target = apply_all_to_states((self.online, self.target), self.engine, following)
+            next_online, next_target = apply_all_to_states((self.online, self.target), self.pictures, following)
         return values, next_online, next_target
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:

@@ -106,7 +106,7 @@ class OptionLoop(Resumable):
             self.engine.restart(ended & ~over)
         if self.visited:
             self.visited.see(step.next_ids, actions, step.terminated | step.truncated)
-        self.recorder.episodes.see(step)
+        self.recorder.see(step)
         self._finish_options(step, reached, ended)
         return moved
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
+from hypogoal.options.windows import AgentWindows
 
 CELL = 8  # pixels
 SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
@@ -162,12 +163,15 @@ class PaperQNetwork(nn.Module):
         return self.values(out), hidden
 
 
-def apply_to_states(network: nn.Module, engine: Engine, ids: NDArray[np.int64]) -> Tensor:
+Pictures = Engine | AgentWindows
+
+
+def apply_to_states(network: nn.Module, engine: Pictures, ids: NDArray[np.int64]) -> Tensor:
     """A network's output on states of an engine: by tile codes where both know them, else by images."""
     return apply_all_to_states((network,), engine, ids)[0]
 
 
-def apply_all_to_states(networks: Sequence[nn.Module], engine: Engine, ids: NDArray[np.int64]) -> list[Tensor]:
+def apply_all_to_states(networks: Sequence[nn.Module], engine: Pictures, ids: NDArray[np.int64]) -> list[Tensor]:
     """As :func:`apply_to_states`, several networks' outputs on the same states."""
     device = next(networks[0].parameters()).device
     tiles = engine.tiles
@@ -186,7 +190,7 @@ class Pixels:
     There are ``most`` of them at once.
     """
 
-    def __init__(self, engine: Engine, most: int, device: torch.device):
+    def __init__(self, engine: Pictures, most: int, device: torch.device):
         self.engine, self.device = engine, device
         self._images = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
         self._pixels = torch.zeros(self._images.shape) if device.type == "cpu" else None

@@ -11,15 +11,22 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below, load_fitting
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.options.exploration import actions_of
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork
+from hypogoal.options.windows import SIDE, around_agent, localiser_of
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
 Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
 
 
-def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any]) -> Policies:
-    """Greedy policies from an options artefact's weights and configuration, and that of its ensemble (``about``)."""
+def make_policies(
+    config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any], ensemble: Ensemble | None = None
+) -> Policies:
+    """Greedy policies from an options artefact's weights and configuration, that of its ensembles (``about``), and the
+    first of these, which policies need that look at the window around the agent.
+    """
     if config["termination"] == "oracle":
         raise UserError(
             "these options end at the true sub-goals, which only the domain's engine can see",
@@ -36,14 +43,25 @@ def make_policies(config: Mapping[str, Any], weights: dict[str, Tensor], about: 
     actions = actions_of(weights, outputs)
     if not outputs or actions.shape != (outputs,):
         raise UserError("the weights do not fit the manifest", f"{options} options", "Make the artefact again.")
-    make = LightPolicies if config["network"] == "light" else PaperPolicies
-    return make(weights, shape, options, actions)
+    if config["network"] != "light":
+        return PaperPolicies(weights, shape, options, actions)
+    around = localiser_of(ensemble) if ensemble and config.get("policy_view", "full") == "agent-crop" else None
+    return LightPolicies(weights, shape, options, actions, around)
 
 
 class LightPolicies:
     """Policies of options that share one network (Spec D8), which chooses among the primitive ``actions``."""
 
-    def __init__(self, weights: Mapping[str, Tensor], shape: tuple[int, ...], options: int, actions: NDArray[np.int64]):
+    def __init__(
+        self,
+        weights: Mapping[str, Tensor],
+        shape: tuple[int, ...],
+        options: int,
+        actions: NDArray[np.int64],
+        localiser: Localiser | None = None,
+    ):
+        self.localiser = localiser
+        shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
         make = partial(LightQNetwork, shape, options, len(actions))
         self.network = load_fitting(make, below("online.", weights), "options.safetensors")
         self.actions = actions
@@ -54,6 +72,8 @@ class LightPolicies:
 
     @torch.no_grad()
     def _act(self, option: int, observation: NDArray[np.uint8]) -> int:
+        if self.localiser:
+            observation = around_agent(self.localiser, observation[None])[0]
         values = self.network(_as_batch(observation))[0, option]
         return int(self.actions[int(values.argmax())])
 

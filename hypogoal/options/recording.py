@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.domains.base import Engine
+from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import Episodes
 from hypogoal.options.choosers import Outcome
 
@@ -30,7 +30,7 @@ class Execution(NamedTuple):
         reached: its own classifier ended it.
         inside_at_start: its own classifier said yes where it began.
         terminated: it ended in a terminal state of the episode.
-        state: the id of the state it ended in.
+        states: the ids of those that it came to, the last one that it ended in.
     """
 
     step: int
@@ -39,10 +39,11 @@ class Execution(NamedTuple):
     reached: bool
     inside_at_start: bool
     terminated: bool
-    state: int
+    states: list[int]
 
 
 EXECUTION_COLUMNS = (*Execution._fields[:-1], "room", "x", "y", "distance")
+EXPLOIT_COLUMNS = ("step", "option", "reached", "near", "best_near", "best_far")
 
 
 class Recorder(Resumable):
@@ -54,7 +55,7 @@ class Recorder(Resumable):
         window: steps per row of ``choices.csv``.
     """
 
-    CHANGING = ("episodes", "choices", "stops", "executions", "_pictures", "_window", "_window_start")
+    CHANGING = ("episodes", "choices", "stops", "executions", "_pictures", "_states", "_window", "_window_start")
 
     def __init__(self, options: int, engine: Engine, window: int = 5_000):
         self.options, self.engine, self.window = options, engine, window
@@ -63,6 +64,7 @@ class Recorder(Resumable):
         self.stops: list[deque[int]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
         self.executions: list[deque[Execution]] = [deque(maxlen=EXECUTIONS_KEPT) for _ in range(options)]
         self._pictures: list[deque[NDArray[np.uint8]]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
+        self._states: list[list[int]] = [[] for _ in range(engine.count)]  # that running executions came to
         self._window_start = 0
         self._window = np.zeros((options, len(CHOICE_COLUMNS) - 2))  # but for step and option
 
@@ -74,6 +76,12 @@ class Recorder(Resumable):
     def start_at(self, steps: int) -> None:
         """Environment steps spent before (those of ``train-options``) count in every curve."""
         self.episodes.steps = self._window_start = steps
+
+    def see(self, step: Step) -> None:
+        """A step of every environment."""
+        self.episodes.see(step)
+        for states, state in zip(self._states, step.next_ids.tolist(), strict=True):
+            states.append(state)
 
     def chose(self, options: NDArray[np.int64], offered: NDArray[np.bool_]) -> None:
         """Decisions: the options chosen (n,) among those offered, bool (n, O)."""
@@ -88,9 +96,12 @@ class Recorder(Resumable):
         options, reached, ids = outcome.options, outcome.reached, outcome.next_ids
         np.add.at(self._window[:, 3], options, reached)
         np.add.at(self._window[:, 4], options, outcome.durations)
-        columns = (options, outcome.durations, reached, outcome.inside, outcome.terminated, ids)
-        for row in zip(*(values[outcome.counted].tolist() for values in columns), strict=True):
+        columns = (options, outcome.durations, reached, outcome.inside, outcome.terminated)
+        states = [self._states[place] for place in outcome.environments[outcome.counted].tolist()]
+        for row in zip(*(values[outcome.counted].tolist() for values in columns), states, strict=True):
             self.executions[row[0]].append(Execution(self.steps, *row))
+        for place in outcome.environments.tolist():
+            self._states[place] = []
         for option, identity in zip(options[reached], ids[reached], strict=True):
             self.stops[option].append(int(identity))
         if self.engine.memory is not None and reached.any():
@@ -141,10 +152,30 @@ class Recorder(Resumable):
         ``distance`` is of positions (n, 3) from where the sub-goal truly holds, int (n,).
         """
         rows = [row for option in self.executions for row in option]
-        at = self.engine.positions(np.array([row.state for row in rows], dtype=np.int64).reshape(-1))
+        at = self.engine.positions(np.array([row.states[-1] for row in rows], dtype=np.int64).reshape(-1))
         away = distance(at)
         write_table(
             folder / "executions.csv",
             EXECUTION_COLUMNS,
             [(*map(int, row[:-1]), *map(int, at[n]), int(away[n])) for n, row in enumerate(rows)],
         )
+
+    def write_exploits(
+        self,
+        folder: Path,
+        near: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]],
+        log_odds: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float32]],
+    ) -> None:
+        """Spec H5: ``exploits.csv`` into ``folder``, of the same executions: how sure its own classifier was at most.
+
+        Of states (n,) and the options (n,) that came to them ``near`` says whether these options' true sub-goals hold
+        there, or nearly, ``log_odds`` how sure their classifiers are. A cell is empty where there was no such state.
+        """
+        rows = []
+        for row in (row for option in self.executions for row in option):
+            states = np.array(row.states, dtype=np.int64)
+            options = np.full_like(states, row.option)
+            there, sure = near(states, options), log_odds(states, options)
+            best = [sure[part].max().item() if part.any() else "" for part in (there, ~there)]
+            rows.append((row.step, row.option, int(row.reached), int(there[-1]), *best))
+        write_table(folder / "exploits.csv", EXPLOIT_COLUMNS, rows)

@@ -61,9 +61,7 @@ def _files(folder: Path) -> list[Path]:
 
 def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Path]:
     """The files of a folder for :func:`read_image`, by name; where there are none a ``UserError`` that says ``do``."""
-    files = sorted(
-        file for file in folder.iterdir() if file.suffix.lower() in (*SUFFIXES, ARRAY) and file.name[0] != "."
-    )
+    files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in (*SUFFIXES, ARRAY))
     if not files:
         raise UserError(f"no images ({', '.join(SUFFIXES)})", folder, do)
     return files

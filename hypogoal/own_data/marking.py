@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import inside, replace_file, sync
+from hypogoal.core.files import inside, replacing, sync
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.gymnasium_engine import as_image, begun, make_checked, shape_of, stepped
@@ -60,9 +60,7 @@ class Marks:
         return file.parent.name if file else None
 
     def mark(self, state: NDArray[np.uint8], kind: str) -> None:
-        """Mark a state, uint8 (H, W, C), of the shape of those before (else a ``UserError``); another mark of it is
-        taken back.
-        """
+        """Mark a state, uint8 (H, W, C), or mark it anew; a ``UserError`` where those before have another shape."""
         name, before = _name(state), self.of(state)
         if before is not None:
             self._move(name, kind)
@@ -75,12 +73,8 @@ class Marks:
             (self.folder / each).mkdir(parents=True, exist_ok=True)
         suffix, content = _encoded(state)
         file = self.folder / kind / f"{name}{suffix}"
-        fresh = file.with_name(f".{file.name}.new")
-        try:
+        with replacing(file) as fresh:
             fresh.write_bytes(content)
-            replace_file(fresh, file)
-        finally:
-            fresh.unlink(missing_ok=True)
         self._files[name] = file
         self._before.append((name, None))
 
@@ -210,9 +204,8 @@ class _Window:
             self._surface = pygame.display.set_mode((WIDTH, PICTURE))
         except pygame.error as error:
             pygame.quit()
-            raise UserError(
-                f"no window can be opened: {error}", None, "Use a machine with a screen, or ssh -X."
-            ) from None
+            do = "Use a machine with a screen, or ssh -X."
+            raise UserError(f"no window can be opened: {error}", None, do) from None
         self._font = pygame.font.SysFont("dejavusans, arial, sans", TEXT)
         return self
 
@@ -275,24 +268,19 @@ GRID_KEYS = {
 }
 """Keys of actions that have these names, as MiniGrid's have; the first as MiniGrid's own manual control."""
 
-DIRECTIONS = {"UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s")}
-FIRE = ("space",)
+DIRECTIONS = {
+    "UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s"), "FIRE": ("space",)
+}  # fmt: skip
 FALLBACK = tuple("0123456789bcfghijkotvxyz")
 """Keys of actions without one by their name: their number, from 10 on a letter that nothing above has, nor marking."""
 
 
 class Source:
-    """A state at a time.
+    """A state at a time."""
 
-    Attributes:
-        state: the one that is shown, uint8 (H, W, C).
-        note: where it is from.
-        help: which keys do what, in lines.
-    """
-
-    state: NDArray[np.uint8]
-    note: str
-    help: tuple[str, ...]
+    state: NDArray[np.uint8]  # the one that is shown, (H, W, C)
+    note: str  # where it is from
+    help: tuple[str, ...]  # which keys do what, in lines
 
     def press(self, key: str, held: Set[str]) -> bool:
         """What a key does, of those ``held`` down; false where nothing."""
@@ -361,9 +349,7 @@ class Played(Source):
             self._begin()
             return True
         action = action_of(self._names, key, held)
-        if action is None:
-            return False
-        return self._play(action)
+        return action is not None and self._play(action)
 
     def idle(self) -> bool:
         """Play NOOP where there is one."""
@@ -394,10 +380,8 @@ def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
     """The action that a key stands for: by name as MiniGrid's, by the keys held together as Atari's, else by number."""
     if "NOOP" in names:
         down = {key, *held}
-        parts = [name for name, keys in DIRECTIONS.items() if down & set(keys)]
-        vertical = next((name for name in parts if name in ("UP", "DOWN")), "")
-        level = next((name for name in parts if name in ("RIGHT", "LEFT")), "")
-        name = vertical + level + ("FIRE" if down & set(FIRE) else "")
+        axes = (("UP", "DOWN"), ("RIGHT", "LEFT"), ("FIRE",))  # of each the first one that is held
+        name = "".join(next((part for part in axis if down & set(DIRECTIONS[part])), "") for axis in axes)
         return names.index(name) if name in names else None
     return next((index for index, keys in enumerate(keys_of(names)) if key in keys), None)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json
-from hypogoal.core.hdf5 import Foreign, create_hdf5, find, members, open_hdf5, read_array, size_of
+from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import write_observations
@@ -21,30 +21,19 @@ MAIN_FILE = Path("data") / "main_data.hdf5"
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
 MINARI_VERSION = "0.5.4"  # whose layout is written
-SHARES = (0.4, 0.4, 0.2)
+SHARES = (0.4, 0.4, 0.2)  # of the episodes that are labelled, unlabelled and held out
 
-Label = Callable[[NDArray[Any]], bool]
+Label = Callable[[NDArray[Any]], bool]  # from an observation to whether the sub-goal holds
 
 
-def read_minari(
-    folder: Path, labels: Sequence[Label], *, key: str = "", shares: Sequence[float] = SHARES, seed: int = 0
-) -> Parts:
-    """The observations of a dataset's episodes, each episode's either labelled, unlabelled or held out.
+def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: int = 0) -> Parts:
+    """The observations of a dataset's episodes, each episode's either labelled, unlabelled or held out, by ``seed``.
 
-    Args:
-        folder: of the dataset, the one with ``data/`` in it.
-        labels: G functions from an observation to whether the sub-goal holds.
-        key: of observations that are dictionaries, which part is the image.
-        shares: of the episodes that are labelled, unlabelled and held out.
-        seed: of which ones.
-
-    Raises:
-        UserError: no such dataset, another storage format, too few episodes, or a label function that fails.
+    ``folder`` is the one with ``data/`` in it, ``key`` which part of observations that are dictionaries is the image.
+    No such dataset, another storage format, too few episodes, or a label function that fails is a ``UserError``.
     """
     if not labels:
         raise UserError("a Minari dataset has no labels", folder, "Give --label NAME=module:function.")
-    if len(shares) != 3 or min(shares) <= 0:
-        raise UserError("no such shares", ",".join(map(str, shares)), "Give three positive numbers.")
     about = read_json(folder / METADATA, "the metadata are", DO)
     stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
     if stored != "hdf5":
@@ -53,7 +42,7 @@ def read_minari(
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
     order = rng_for(seed, "minari").permutation(len(episodes))
-    ends = np.round(np.cumsum(shares)[:2] / sum(shares) * len(episodes)).astype(int)
+    ends = np.round(np.cumsum(SHARES)[:2] / sum(SHARES) * len(episodes)).astype(int)
     ends = np.clip(ends, (1, 2), (len(episodes) - 2, len(episodes) - 1))
     labelled, unlabelled, heldout = (np.concatenate([episodes[i] for i in part]) for part in np.split(order, ends))
     return Parts(labelled, _told(labels, labelled), unlabelled, heldout, _told(labels, heldout))
@@ -61,21 +50,18 @@ def read_minari(
 
 def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
     with open_hdf5(path, "the dataset", DO) as file:
-        try:
-            names = [name for name in members(file) if name.startswith("episode_")]
-            place = f"observations/{key}" if key else "observations"
-            if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
-                keys = ", ".join(members(find(file, f"{names[0]}/observations")))
-                raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
-            stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
-            if stored is not None and stored[1:] != shape:
-                what = "its images are not stored as they were seen, but as JPEG"
-                raise UserError(what, path, "Make it with jpeg_encoding=False.")
-            places = [f"{name}/{place}" for name in sorted(names, key=_number)]
-            require_memory(sum(size_of(file, name, "uif") for name in places), path)
-            episodes = [read_array(file, name, "uif") for name in places]
-        except Foreign as error:
-            raise UserError(f"the dataset cannot be used: {error}", path, DO) from None
+        names = [name for name in members(file) if name.startswith("episode_")]
+        place = f"observations/{key}" if key else "observations"
+        if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
+            keys = ", ".join(members(find(file, f"{names[0]}/observations")))
+            raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
+        stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
+        if stored is not None and stored[1:] != shape:
+            what = "its images are not stored as they were seen, but as JPEG"
+            raise UserError(what, path, "Make it with jpeg_encoding=False.")
+        places = [f"{name}/{place}" for name in sorted(names, key=_number)]
+        require_memory(sum(size_of(file, name, "uif") for name in places), path)
+        episodes = [read_array(file, name, "uif") for name in places]
     if len({episode.shape[1:] for episode in episodes}) > 1 or not all(episode.ndim for episode in episodes):
         raise UserError("its episodes have observations of different shapes", path, "Give those of one shape.")
     return episodes

@@ -22,22 +22,14 @@ RARE = 0.05  # share of a class, below which one is warned
 
 @dataclass(frozen=True)
 class Parts:
-    """States as they were found, not yet looked at.
+    """States as they were found, not yet looked at. Where none are held out, a share of the labelled ones is."""
 
-    Attributes:
-        observations: (N, H, W, C) or (N, H, W), with labels.
-        labels: (N,) or (N, G).
-        unlabelled: (M, H, W, C) or (M, H, W).
-        heldout_observations, heldout_labels: as the first two; None, a share of the labelled states is held out.
-        sub_goals: their names, where they were found with them.
-    """
-
-    observations: NDArray[Any]
-    labels: NDArray[Any]
-    unlabelled: NDArray[Any]
-    heldout_observations: NDArray[Any] | None = None
+    observations: NDArray[Any]  # (N, H, W, C) or (N, H, W), with labels
+    labels: NDArray[Any]  # (N,) or (N, G)
+    unlabelled: NDArray[Any]  # (M, H, W, C) or (M, H, W)
+    heldout_observations: NDArray[Any] | None = None  # as the first two
     heldout_labels: NDArray[Any] | None = None
-    sub_goals: tuple[str, ...] = ()
+    sub_goals: tuple[str, ...] = ()  # their names, where they were found with them
 
 
 def collected_of(
@@ -95,9 +87,7 @@ def require_memory(size: int, where: Path) -> None:
 def _apart(
     states: States, others: Sequence[NDArray[np.uint8]], kind: str, of: str, do: str, warned: list[str]
 ) -> States:
-    """Those of a kind of states that look like none of the others, which are ``of`` another kind; none left: a
-    ``UserError``.
-    """
+    """States of a ``kind`` that look like none of the others, which are ``of`` another; none left: a ``UserError``."""
     kept = leave_out(states, *others)
     count = len(states.labels)
     if len(kept.labels) < count:
@@ -181,9 +171,7 @@ def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.b
 
 
 def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], warned: list[str]) -> None:
-    """Each sub-goal (G,) must hold in some labelled states (N, G) and not in others (else a ``UserError``); where few
-    do, one is warned.
-    """
+    """Refuse (``UserError``) a sub-goal that all or none of the labels (N, G) say is reached; warn where few do."""
     for column, goal in enumerate(goals):
         positives, among = int(labels[:, column].sum()), f"among {len(labels)} labelled states"
         fewest, which = min((positives, "positives"), (len(labels) - positives, "negatives"), key=itemgetter(0))

@@ -1,7 +1,5 @@
 """Spec F5, F7: several evaluated runs side by side, as one page and its numbers."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,21 +10,13 @@ from hypogoal.core.errors import UserError
 from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.run import fitting, read_evaluation
 
+TABLES = ("agents", "hypotheses", "rooms", "distance")
+
 
 def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
-    """Compare evaluated runs: seeds, methods or settings.
+    """Compare evaluated runs, the others with the first, in an artefact with ``figures/*.svg``; returns its page.
 
-    Args:
-        runs: folders with an evaluation in each; the others are compared with the first.
-        out: the artefact to write: ``index.html``, ``metrics.json`` and ``figures/*.svg``.
-        force: replace an existing comparison.
-
-    Returns:
-        The page.
-
-    Raises:
-        UserError: fewer than two runs, one twice, one that was not evaluated, runs that cannot be compared, or ``out``
-            exists.
+    Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """
     from hypogoal.evaluation import compare as beside
     from hypogoal.evaluation.page import Material, draw_page
@@ -44,29 +34,22 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
         reason = beside.why_not(metrics)
         if reason is not None:
             raise UserError("these runs cannot be compared", reason, "Choose runs of one experiment, evaluated alike.")
+        named = zip(labels, runs, strict=True)
         about = {
-            "runs": [
-                {"label": label, "path": str(run), **_about(metrics[label])}
-                for label, run in zip(labels, runs, strict=True)
-            ],
+            "runs": [{"label": label, "path": str(run), **_about(metrics[label])} for label, run in named],
             "domains": domains_of(metrics[labels[0]]),
             "shared": beside.shared(metrics),
             "differences": beside.differences(metrics),
             "comparisons": plain(beside.compare_runs(metrics)),
-            **{
-                table: {label: own[table] for label, own in metrics.items()}
-                for table in ("agents", "hypotheses", "rooms", "distance")
-            },
+            **{table: {label: own[table] for label, own in metrics.items()} for table in TABLES},
             "quantities": meanings(),
         }
         material = Material(about, {})
-        sections = beside.compared_sections(
-            metrics, {label: one.arrays for label, one in found.items()}, about, material
-        )
+        arrays = {label: one.arrays for label, one in found.items()}
+        sections = beside.compared_sections(metrics, arrays, about, material)
         version = versions().get("hypogoal", "unknown")
-        page = draw_page(
-            f"hypogoal: {len(runs)} runs compared", f"{', '.join(labels)}; hypogoal {version}", sections, version
-        )
+        title = f"hypogoal: {len(runs)} runs compared"
+        page = draw_page(title, f"{', '.join(labels)}; hypogoal {version}", sections, version)
     inputs = [one.source.path for one in found.values()]
     with create_artefact(out, kind="comparison", config={}, seed=0, inputs=inputs, force=force) as folder:
         (folder / "index.html").write_text(page, encoding="utf-8")

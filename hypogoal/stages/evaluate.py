@@ -1,7 +1,5 @@
 """Spec A5, F: every number of the report, from whatever artefacts a run has; what is missing is named."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence
@@ -37,16 +35,8 @@ LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # setting
 def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
     """Compute every number of the report and write an artefact: ``metrics.json``, ``numbers.csv``, ``arrays.h5``.
 
-    Args:
-        run: a folder with ensemble, options, meta and baseline artefacts, any of them.
-        out: the artefact to write.
-        force, resume, quiet: as for every stage.
-
-    Returns:
-        What ``metrics.json`` holds, see its ``quantities``.
-
-    Raises:
-        UserError: nothing to evaluate, a damaged artefact, or ``out`` exists.
+    ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them; none, or a damaged one, is a
+    ``UserError``. Returns what ``metrics.json`` holds, see its ``quantities``.
     """
     prepare()
     out = claim(out, kind="evaluation", force=force, resume=resume)
@@ -62,10 +52,8 @@ def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False,
     with create_artefact(
         out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:
-        with (
-            create_hdf5(folder / "arrays.h5") as arrays,
-            Progress("evaluate", total=len(inputs), quiet=quiet) as progress,
-        ):
+        steps = Progress("evaluate", total=len(inputs), quiet=quiet)
+        with create_hdf5(folder / "arrays.h5") as arrays, steps as progress:
             work = Work(contents, arrays, progress)
             judge_ensembles(work, cases, workers)
             for question in QUESTIONS:

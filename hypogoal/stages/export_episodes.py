@@ -12,7 +12,7 @@ from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.meta.episodes import Episode, agent_of, play_episodes
-from hypogoal.own_data import write_minari
+from hypogoal.own_data.minari import write_minari
 
 NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")
 
@@ -59,5 +59,5 @@ def dataset_id(out: Path) -> str:
     """By which id minari finds a dataset's folder: ``namespace/name-v0`` below where it looks, else ``name-v0``."""
     told = os.environ.get("MINARI_DATASETS_PATH")
     root = Path(os.path.expanduser("~"), ".minari", "datasets") if told is None else Path(told)
-    inside = out.resolve().is_relative_to(root.resolve())
-    return out.resolve().relative_to(root.resolve()).as_posix() if inside else out.name
+    place, root = out.resolve(), root.resolve()
+    return place.relative_to(root).as_posix() if place.is_relative_to(root) else out.name

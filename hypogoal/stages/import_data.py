@@ -13,7 +13,10 @@ from hypogoal.core.seeding import torch_generator
 from hypogoal.core.terminal import say
 from hypogoal.dataset import open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
-from hypogoal.own_data import MAIN_FILE, collected_of, read_arrays, read_images, read_minari, write_arrays
+from hypogoal.own_data.arrays import read_arrays, write_arrays
+from hypogoal.own_data.images import read_images
+from hypogoal.own_data.minari import MAIN_FILE, read_minari
+from hypogoal.own_data.parts import collected_of
 
 LABELS = "hypogoal.labels"  # entry points of label functions
 

@@ -12,7 +12,7 @@ from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import require_names
 from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS, Domain
-from hypogoal.own_data import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
+from hypogoal.own_data.marking import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
 
 HELD_OUT = "heldout"
 
@@ -51,9 +51,7 @@ def label(
 
 
 def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
-    """An environment by its id (``ALE/Freeway-v5``), of a domain, or by the function that makes it; else a
-    ``UserError``.
-    """
+    """An environment by its id, of a domain, or by the function that makes it; none such is a ``UserError``."""
     import ale_py
     import minigrid  # noqa: F401 - registers its environments when it is loaded
 

@@ -19,24 +19,10 @@ from hypogoal.core.files import replace_text
 from hypogoal.core.terminal import say
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
+from hypogoal.experiments import records
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
 from hypogoal.experiments.format import Experiment, make_plan, read_experiment
-from hypogoal.experiments.records import (
-    FINISHED,
-    LOGS,
-    PLAN,
-    RESULTS,
-    LostPlan,
-    check_same,
-    excuse,
-    forget_records,
-    preset_digests,
-    read_plan,
-    read_record,
-    write_plan,
-)
-from hypogoal.experiments.results import write_results
 from hypogoal.experiments.runners import slurm
 from hypogoal.experiments.runners.local import run_cells
 from hypogoal.experiments.status import done_of, left_of, stamp_of
@@ -53,9 +39,7 @@ AGAIN = "give the same command again to go on"
 
 
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
-    """The settings of a stage, by its command's name; of ``run``, those of the domain's experiment. Else a
-    ``UserError``.
-    """
+    """The settings of a stage, by its command's name; of ``run``, the domain's experiment's. Else a ``UserError``."""
     if stage == "collect":
         return load_domain(domain, given=True).config_class
     if stage == "run":
@@ -103,16 +87,14 @@ def plan(
 def _short(out: Path, *, wanted: bool) -> bool:
     """Whether names are to be short: as in the run's folder, where there is something."""
     try:
-        before, _ = read_plan(out)
+        before, _ = records.read_plan(out)
     except UserError:  # none, or a damaged one, which is told when it is to be gone on with
         return wanted
     return out / "ensemble" in {cell.out for cell in before.cells}
 
 
 def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> None:
-    """Spec A6: :func:`sweep` with the manners of a stage: what is there is refused (``UserError``) unless resumed or
-    forced.
-    """
+    """Spec A6: :func:`sweep`, but what is there is refused (``UserError``) unless resumed or forced."""
     if out.exists() and not (force or resume):
         raise UserError("the run exists already", out, "Give --resume to finish it, --force to make it anew.")
     sweep(planned, out, force=force and not (resume and _begun(out, planned)), quiet=quiet, go_on=GO_ON)
@@ -121,9 +103,9 @@ def run(planned: Plan, out: Path, *, force: bool = False, resume: bool = False, 
 def _begun(out: Path, planned: Plan) -> bool:
     """Whether these cells were begun and are not all done: what ``--force --resume`` goes on with."""
     try:
-        before, _ = read_plan(out)
-        check_same(out, planned.cells)
-    except LostPlan:
+        before, _ = records.read_plan(out)
+        records.check_same(out, planned.cells)
+    except records.LostPlan:
         raise
     except UserError:
         return False
@@ -163,7 +145,7 @@ def sweep(
         what = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {why}"
         raise UserError(what, None, "Mend it, then start again: what is done is kept.")
     say(f"all {len(planned.cells)} cells done")
-    return out / RESULTS
+    return out / records.RESULTS
 
 
 def submit(
@@ -206,16 +188,16 @@ def _begin(
         raise UserError(f"this sweep is in Slurm's queue (job {alive[0]})", out, "End it with --cancel first.")
     anew = frozenset(cell.name for cell in planned.cells) if force else frozenset()
     unsure = [] if force else [cell for cell in planned.cells if cell.stage not in DERIVED and stamp_of(cell)]
-    lost = "the sweep's plan is gone" if (out / LOGS).is_dir() and not (out / PLAN).exists() else ""
-    if not force and (out / PLAN).is_file():
+    lost = "the sweep's plan is gone" if (out / records.LOGS).is_dir() and not (out / records.PLAN).exists() else ""
+    if not force and (out / records.PLAN).is_file():
         try:
-            check_same(out, planned.cells)
-            before = read_plan(out)[0]
+            records.check_same(out, planned.cells)
+            before = records.read_plan(out)[0]
             anew, known = before.anew, {cell.name for cell in before.cells}
             unsure = [cell for cell in unsure if cell.name not in known]
-        except LostPlan as error:
+        except records.LostPlan as error:
             lost = error.what
-    planned = replace(planned, anew=anew, presets=preset_digests(planned.cells))
+    planned = replace(planned, anew=anew, presets=records.preset_digests(planned.cells))
     done = done_of(planned)
     todo = [cell for cell in planned.cells if cell.out not in done]
     factor = machine_factor() if todo else 1.0
@@ -227,18 +209,19 @@ def _begin(
     seconds = wall_seconds(todo, planned.workers, factor)
     if confirm is not None and seconds > LONG_SECONDS:
         confirm(cost_lines(todo, planned.workers, factor)[-1])
-    (out / LOGS).mkdir(parents=True, exist_ok=True)
+    (out / records.LOGS).mkdir(parents=True, exist_ok=True)
     if lost and unsure:  # said to who asked for quiet, too
         _say(f"{lost}, and is written anew: what is complete is kept where its command makes it")
-        if old := [cell.name for cell in unsure if read_record(out, cell).code != 0]:
+        if old := [cell.name for cell in unsure if records.read_record(out, cell).code != 0]:
             _say(f"kept, though 'run --force' may have been about to make them again: {', '.join(old)}")
     _check(unsure, planned, out, say)
     if force:
-        forget_records(out, planned.cells)  # before the plan: what an attempt of now began is known by its record
+        for cell in planned.cells:  # before the plan: what an attempt of now began is known by its record
+            (out / records.LOGS / f"{cell.name}.json").unlink(missing_ok=True)
     if todo:
-        excuse(out, todo)
-        (out / FINISHED).unlink(missing_ok=True)
-    write_plan(out, planned, factor)
+        records.excuse(out, todo)
+        (out / records.FINISHED).unlink(missing_ok=True)
+    records.write_plan(out, planned, factor)
     return planned
 
 
@@ -252,15 +235,15 @@ def _check(cells: Sequence[Cell], planned: Plan, out: Path, say: Callable[[str],
 
 
 def gather(out: Path) -> Path:
-    """Write ``results.csv`` of what is done, and where that is all, ``run.json``; returns the former. No sweep, a
-    damaged artefact: a ``UserError``.
-    """
-    planned, _ = read_plan(out)
+    """Write ``results.csv`` of what is done, which it returns, and where that is all, ``run.json``; or UserError."""
+    from hypogoal.experiments.results import write_results  # with SciPy, which a plan needs not
+
+    planned, _ = records.read_plan(out)
     results = write_results(planned, out)
     if len(done_of(planned)) == len(planned.cells):
-        seconds = sum(read_record(out, cell).seconds for cell in planned.cells)
+        seconds = sum(records.read_record(out, cell).seconds for cell in planned.cells)
         about = {"cells": [cell.text for cell in planned.cells], "seconds": round(seconds, 1)}
-        replace_text(out / FINISHED, json.dumps(about, indent=1) + "\n")
+        replace_text(out / records.FINISHED, json.dumps(about, indent=1) + "\n")
     return results
 
 

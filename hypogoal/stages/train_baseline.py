@@ -54,12 +54,8 @@ def train_baseline(
     size = math.prod(env.observation_space.shape or (1,))
     replay = chosen.replay if isinstance(chosen, DQNSettings) else 0
     preflight("train-baseline", out, baseline_needs(size, replay), resume=resume, quiet=quiet)
-    about = as_dict(config) | {
-        "domain": domain,
-        "domain_config": world,
-        "environments": chosen.environments,
-        "hyperparameters": as_dict(chosen),
-    }
+    about = as_dict(config) | {"domain": domain, "domain_config": world}
+    about |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
     with create_artefact(
         out, kind="baseline", config=about, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:
@@ -79,7 +75,6 @@ def _world_of(data: Path, name: str, domain: Domain) -> dict[str, Any]:
     """The settings of the world that states are of; a ``UserError`` where they are of another domain."""
     dataset = open_dataset(data)
     if dataset.domain != name:
-        raise UserError(
-            f"these are states of {dataset.domain!r}, not of {name!r}", data, "Name the domain they are of."
-        )
+        what = f"these are states of {dataset.domain!r}, not of {name!r}"
+        raise UserError(what, data, "Name the domain they are of.")
     return domain.world(dataset.config)

@@ -1,7 +1,5 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -33,6 +31,8 @@ from hypogoal.hypotheses.views import positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
+PARTS = {LOG: ".jsonl", SCORES: ".scores"}  # a sub-goal's, while others are trained: beside its checkpoint
+
 
 def train_ensemble(
     data: Path,
@@ -48,20 +48,9 @@ def train_ensemble(
 ) -> list[dict[str, Any]]:
     """Train the ensembles of every sub-goal of a data file and write the artefact ``out``.
 
-    Args:
-        data: the data file.
-        config: see :class:`TrainEnsembleConfig`.
-        out: the artefact to write.
-        unlabelled: spec B7: data files, or artefacts with visited states, whose unlabelled states are taken instead
-            of those of ``data``.
-        seed, force, resume, quiet, device: as for every stage.
-
-    Returns:
-        Per sub-goal, the last losses.
-
-    Raises:
-        UserError: unknown sub-goal, unusable data, or ``out`` exists.
-        NumericalError: a loss became NaN or Inf.
+    Spec B7: ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
+    of those of ``data``. Returns the last losses per sub-goal. An unknown sub-goal, unusable data, or an ``out`` that
+    exists is a ``UserError``, a loss that became NaN or Inf a ``NumericalError``.
     """
     device = prepare(device)
     load_objective(config.diversity)
@@ -75,12 +64,8 @@ def train_ensemble(
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
     out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
-    about = as_dict(config) | {
-        "sub_goals": list(sub_goals),
-        "observation_shape": list(dataset.observation_shape),
-        "domain": dataset.domain,
-        "domain_config": dataset.config,
-    }
+    about = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
+    about |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, len(sub_goals), workers)
     preflight("train-ensemble", out, needs, resume=resume, quiet=quiet)
@@ -97,17 +82,16 @@ def train_ensemble(
                 progress.advance(1)
 
             in_processes(jobs, workers, done)
-        for log, part_of in ((LOG, _metrics), (SCORES, _scores))[: 2 if config.score_every else 1]:
-            parts = [part_of(folder, sub_goal).read_text(encoding="utf-8") for sub_goal in sub_goals]
-            (folder / log).write_text("".join(parts), encoding="utf-8")
+        for log, part in [*PARTS.items()][: 2 if config.score_every else 1]:
+            parts = (folder.parent / FOLDER / f"{sub_goal}{part}" for sub_goal in sub_goals)
+            (folder / log).write_text("".join(path.read_text(encoding="utf-8") for path in parts), encoding="utf-8")
     return summaries
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:
     """Spec B7: the data file whose unlabelled states to take: ``path``, or that of an artefact with visited states.
 
-    Raises:
-        UserError: there is none, or it is of another domain or shape than ``dataset``.
+    None, or one of another domain or shape than ``dataset``, is a ``UserError``.
     """
     file = path / VISITED if path.is_dir() else path
     if path.is_dir() and VISITED not in open_artefact(path, ("options", "meta")).whole().manifest["files"]:
@@ -130,28 +114,15 @@ def joined_unlabelled(files: Sequence[Path]) -> tuple[NDArray[np.uint8], dict[st
     return np.concatenate([states for states, _ in found]), joined
 
 
-def _metrics(folder: Path, sub_goal: str) -> Path:
-    """Where a sub-goal's part of ``metrics.jsonl`` is while others are trained: beside its checkpoint."""
-    return folder.parent / FOLDER / f"{sub_goal}.jsonl"
-
-
-def _scores(folder: Path, sub_goal: str) -> Path:
-    """The same of ``scores.jsonl``."""
-    return folder.parent / FOLDER / f"{sub_goal}.scores"
-
-
 def score_rows(
     ensemble: Ensemble, split: Split, unlabelled: NDArray[np.uint8], positions: NDArray[np.int64] | None
 ) -> Iterator[dict[str, Any]]:
     """What members know of the held-out states, one row a member and scope.
 
-    ``all`` states, and those of the ``first`` and of the ``second`` half of their contexts (layouts or rooms: see
-    :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one and scored on the other.
-
-    Yields:
-        ``scope``, ``member``, ``states``, ``positives``, ``ranking`` (area under the ROC curve), and balanced accuracy
-        at 0.5 (``balanced_accuracy``, with ``precision`` and ``recall``), above the 95th percentile of unlabelled
-        states (``at_q95``) and at the best threshold that there is (``at_best``).
+    Scopes: ``all`` states, and those of the ``first`` and of the ``second`` half of their contexts (layouts or rooms:
+    see :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one and scored on the other.
+    Balanced accuracy is at 0.5, above the 95th percentile of unlabelled states (``at_q95``) and at the best threshold
+    that there is (``at_best``).
     """
     probabilities = ensemble.predict(split.observations, positions_of(split.origins))
     elsewhere = ensemble.predict(unlabelled, positions)
@@ -226,7 +197,7 @@ def _train_one(
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
-    report = _Report(sub_goal, MetricsLog(_metrics(folder, sub_goal)), MetricsLog(_scores(folder, sub_goal)))
+    report = _Report(sub_goal, *(MetricsLog(folder.parent / FOLDER / f"{sub_goal}{part}") for part in PARTS.values()))
     if not checkpoints.saved:
         report.log.restore(0)
         report.scores.restore(0)

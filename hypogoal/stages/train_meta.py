@@ -7,18 +7,19 @@ count in every curve.
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import Artefact, claim, create_artefact, open_artefact, sha256_of
+from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import run as tables
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import assemble, description, start_arguments, train, write_trained
+from hypogoal.meta.training import assemble, check_fit, description, start_arguments, train, write_trained
 from hypogoal.needs import play_needs
+
+FIXED = ("network", "termination", "policy_view", "layout_seed", "start", "option_timeout")  # as of the options
 
 
 def train_meta(
@@ -42,7 +43,7 @@ def train_meta(
     source = open_artefact(ensemble, "ensemble").whole()
     trained = open_artefact(options, "options").whole() if options else None
     if trained:
-        _check_fit(trained, source, config)
+        check_fit(trained, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="meta", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
@@ -66,12 +67,8 @@ def train_meta(
         with Progress("train-meta", total=config.steps, quiet=quiet) as progress:
             train(loop, config.steps, log, progress, checkpoints_of(folder))
         write_trained(folder, loop, domain, source.config, config, seed)
-    return {
-        "steps": recorder.steps,
-        "episodes": len(recorder.episodes),
-        "success": recorder.episodes.success(),
-        "length": recorder.episodes.length(),
-    }
+    counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
+    return counted | {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
 
 
 def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
@@ -79,20 +76,3 @@ def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
     table = tables.read_episodes(path)
     columns = (table.step, table.length, table.reward, table.terminated.astype(int))
     return list(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _check_fit(trained: Artefact, source: Artefact, config: TrainMetaConfig) -> None:
-    made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
-    if sha256_of(source.path / "manifest.json") not in made_from:
-        raise UserError(
-            "these options were trained with another ensemble",
-            trained.path,
-            f"Train them from {source.path}.",
-        )
-    for key in ("network", "termination", "layout_seed", "start", "option_timeout"):
-        if trained.config[key] != getattr(config, key):
-            raise UserError(
-                f"these options were trained with {key}={trained.config[key]}, train-meta has {getattr(config, key)}",
-                trained.path,
-                f"Give --set {key}={trained.config[key]}.",
-            )

@@ -8,9 +8,10 @@ from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.meta.training import assemble, description, start_arguments, train, write_trained
+from hypogoal.meta.training import assemble, check_fit, description, start_arguments, train, write_trained
 from hypogoal.needs import play_needs
 
 
@@ -19,29 +20,38 @@ def train_options(
     config: TrainOptionsConfig,
     out: Path,
     *,
+    options: Path | None = None,
     seed: int = 0,
     force: bool = False,
     resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Train the options of an ensemble artefact and write the artefact ``out``.
+    """Train the options of an ensemble artefact, or those of ``options`` further, and write the artefact ``out``.
 
     Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
     begins an episode, instead of these two the shares of ``recorder.recent``.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
-    out = claim(out, kind="options", inputs=[ensemble], force=force, resume=resume)
+    trained = open_artefact(options, "options").whole() if options else None
+    if trained:
+        check_fit(trained, source, config, ("network", "termination", "policy_view"))
+    inputs = [ensemble, options] if options else [ensemble]
+    out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
     start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
     preflight("train-options", out, play_needs(domain, source.config, config), resume=resume, quiet=quiet)
     loop = assemble(domain, source.path, source.config, config, seed, device)
+    if trained:
+        learned = load_tensors(trained.path / "options.safetensors")
+        loop.learner.load(learned)
+        loop.terminations.load(learned)
     recorder = loop.recorder
     steps = config.steps * (loop.terminations.options if config.steps_for == "each" else 1)
     about = description(loop, domain, source.config, config, steps=steps)
     with create_artefact(
-        out, kind="options", config=about, seed=seed, inputs=[ensemble], force=force, resume=resume
+        out, kind="options", config=about, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:

@@ -1,7 +1,5 @@
 """The contract of a domain, as a test that its author runs (Spec B6; see ``hypogoal.domains.base``)."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import warnings
@@ -67,9 +65,8 @@ class _Contract:
             near = difflib.get_close_matches(str(stage), known, n=1)
             do = f"Did you mean {near[0]!r}?" if near else f"The stages are {', '.join(known)}."
             promise(stage in known, f"defaults are of {stage!r}, which is no stage", do)
-            promise(
-                isinstance(values, Mapping), f"defaults of {stage} are {values!r}", "Give a table: setting to value."
-            )
+            kept = isinstance(values, Mapping)
+            promise(kept, f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
             from_values(known[stage], values, stage)
         return ", ".join(f"{stage} {len(values)}" for stage, values in self.domain.defaults.items())
 
@@ -127,10 +124,9 @@ class _Contract:
             over = step.terminated | step.truncated
             cut = before + 1 >= MAX_STEPS
             promise(bool((over | ~cut).all()), "an episode went on after max_steps", "Truncate it there.")
+            counted = bool((engine.elapsed == np.where(over, 0, before + 1)).all())
             text = f"elapsed is {engine.elapsed} after {before}, ended {over}"
-            promise(
-                bool((engine.elapsed == np.where(over, 0, before + 1)).all()), text, "Count the steps of each episode."
-            )
+            promise(counted, text, "Count the steps of each episode.")
             same = engine.ids[~over] == step.next_ids[~over]
             promise(bool(same.all()), "ids differ from next_ids", "They differ only where an episode ended.")
             ended += int(over.sum())
@@ -151,10 +147,8 @@ class _Contract:
                 rows.setdefault(image.tobytes(), set()).add(label.tobytes())
         torn = sum(len(labels) > 1 for labels in rows.values())
         if torn:
-            warnings.warn(
-                f"{torn} of {len(rows)} pictures were met with different labels: no classifier can tell those apart",
-                stacklevel=2,
-            )
+            text = f"{torn} of {len(rows)} pictures were met with different labels: no classifier can tell those apart"
+            warnings.warn(text, stacklevel=2)
         counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, met, strict=True))
         return f"held in random play, of {STEPS * COUNT} states: {counts}"
 
@@ -212,8 +206,7 @@ class _Contract:
 
     def collected_again(self) -> str:
         for (name, states), (_, again) in zip(_sets(self.collected), _sets(self.collect()), strict=True):
-            same = np.array_equal(states.observations, again.observations)
-            same = same and np.array_equal(states.labels, again.labels)
+            same = all(np.array_equal(getattr(states, of), getattr(again, of)) for of in ("observations", "labels"))
             promise(same, f"{name} states differ when collected again with seed {self.seed}", DETERMINISM)
         return "the same states for the same seed"
 
@@ -221,13 +214,11 @@ class _Contract:
         known = {image.tobytes() for _, states in _sets(self.collected)[:2] for image in states.observations}
         states = self.collected.heldout
         double = sum(image.tobytes() in known for image in states.observations)
-        if double:
-            warnings.warn(
-                f"{double} of {len(states.observations)} held-out states look like one of those for learning: "
-                "scores on them say less about other contexts",
-                stacklevel=2,
-            )
-        return "held-out states are others than those for learning" if not double else "some are known"
+        if not double:
+            return "held-out states are others than those for learning"
+        text = f"{double} of {len(states.observations)} held-out states look like one of those for learning: "
+        warnings.warn(f"{text}scores on them say less about other contexts", stacklevel=2)
+        return "some are known"
 
     def network(self) -> str:
         from hypogoal.hypotheses.config import EnsembleConfig

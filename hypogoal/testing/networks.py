@@ -1,7 +1,5 @@
 """What a member network must keep to, as a test that its author runs (Spec C5; ``hypogoal.hypotheses.networks``)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

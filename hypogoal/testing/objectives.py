@@ -1,8 +1,7 @@
 """The laws of a diversity objective, as a test that its author runs (Spec C1, C2; see ``hypogoal.diversity``)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -163,15 +162,14 @@ def context_of(
 def rearranged(context: Context, members: Tensor, states: Tensor) -> Context:
     """The same batch with its members and its unlabelled states in another order."""
     gradients = context.input_gradients()
-    return Context(
-        context.labels,
-        context.labelled[members],
-        context.unlabelled[members][:, states],
-        context.labelled_features[members],
-        context.unlabelled_features[members][:, states],
-        context.frozen[:, states],
-        context.positives,
-        lambda: gradients[members],
+    return replace(
+        context,
+        labelled=context.labelled[members],
+        unlabelled=context.unlabelled[members][:, states],
+        labelled_features=context.labelled_features[members],
+        unlabelled_features=context.unlabelled_features[members][:, states],
+        frozen=context.frozen[:, states],
+        input_gradients=lambda: gradients[members],
     )
 
 
@@ -230,9 +228,8 @@ def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
     leaves = [context.labelled, context.unlabelled, context.labelled_features, context.unlabelled_features]
     leaves.append(context.input_gradients())
     found = torch.autograd.grad(loss, leaves, allow_unused=True) if loss.requires_grad else [None] * len(leaves)
-    return [
-        torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(leaves, found, strict=True)
-    ]
+    both = zip(leaves, found, strict=True)
+    return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in both]
 
 
 OF_ENSEMBLES = (

@@ -1,7 +1,5 @@
 """What one check found, and how checks are run: one that fails ends those that build on it, not the program."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -13,17 +11,10 @@ from hypogoal.core.terminal import printable
 Test = tuple[str, Callable[[], str]]
 
 
-class Broken(UserError):
-    """A promise that is not kept: what was found, and what to do about it."""
-
-    def __init__(self, what: str, do: str):
-        super().__init__(what, do=do)
-
-
 def promise(kept: bool, what: str, do: str) -> None:
-    """Raises ``Broken`` where a promise is not kept: what was found, and what to do about it."""
+    """A ``UserError`` where a promise is not kept: what was found, and what to do about it."""
     if not kept:
-        raise Broken(what, do)
+        raise UserError(what, do=do)
 
 
 @dataclass(frozen=True)
@@ -68,11 +59,7 @@ def run(tests: Iterable[Test]) -> Iterator[Verdict]:
 
 
 def require(verdicts: Iterable[Verdict]) -> None:
-    """For a test-suite: pass where all promises are kept.
-
-    Raises:
-        AssertionError: one is not; it says which.
-    """
+    """For a test-suite: pass where all promises are kept, else an ``AssertionError`` that says which is not."""
     for verdict in verdicts:
         if not verdict.ok:
             raise AssertionError("\n".join(verdict.lines))

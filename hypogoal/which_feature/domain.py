@@ -6,7 +6,6 @@ of them the reward asks for only the reward can tell: ``truth`` of the world an 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,19 @@ from hypogoal.which_feature.states import FACTORS, KNOWN, MOVED, SIDE, crossed_s
 DECKS = 64  # sets of rooms of a layout; episodes go round them
 SUB_GOALS = ("right-room",)
 HELDOUT = 20  # layouts' worth of held-out states
+
+
+DEFAULTS: Mapping[str, Mapping[str, Any]] = {
+    "train-ensemble": {
+        "network": "tiles",
+        "schedule": "sequential",
+        "diversity_weight": 0.03,
+        "steps": 600,
+        "batch_size": 32,
+        "threshold": "unlabelled-split",
+    },
+    "train-meta": {"network": "planned", "steps": 10_000},
+}
 
 
 @dataclass(frozen=True)
@@ -43,12 +55,7 @@ class RoomsEngine(Engine):
     The right room has the true feature, none of the others has; every other feature is drawn evenly. Going into a room
     ends the episode, with a reward of 1 if it is the right one. Before them the agent sees a scene in which no feature
     holds. States are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck.
-
-    Args:
-        layout_seed: draws the rooms.
-        count: environments (E).
-        max_steps: an episode has one step, so it is never cut.
-        factors, truth, rooms: see ``RoomsConfig``.
+    ``layout_seed`` draws the rooms. An episode has one step, so it is never cut.
     """
 
     resumes = True
@@ -114,25 +121,8 @@ class RoomsDomain(Domain):
     sub_goals = SUB_GOALS
     config_class = RoomsConfig
     engine_settings = ("factors", "truth", "rooms")
-    defaults = MappingProxyType(
-        {
-            "train-ensemble": MappingProxyType(
-                {
-                    "network": "tiles",
-                    "schedule": "sequential",
-                    "diversity_weight": 0.03,
-                    "steps": 600,
-                    "batch_size": 32,
-                    "threshold": "unlabelled-split",
-                }
-            ),
-            "train-meta": MappingProxyType({"network": "planned", "steps": 10_000}),
-        }
-    )
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        return (SIDE, SIDE, 3)
+    defaults = DEFAULTS
+    observation_shape = (SIDE, SIDE, 3)
 
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and fully crossed held-out states; ``layout_seed`` of the latter parts them in 20."""
@@ -143,8 +133,9 @@ class RoomsDomain(Domain):
             states.unlabelled_states(config.unlabelled, config.mix, seed, names),
             crossed_states(HELDOUT * 4, seed, names),
         ]
-        told = [States(one.observations, one.factors[:, [column]], _origins(len(one.factors))) for one in sets]
         progress.advance()
+        parts = [{"layout_seed": np.arange(len(one.factors)) % HELDOUT} for one in sets]
+        told = [States(one.observations, one.factors[:, [column]], of) for one, of in zip(sets, parts, strict=True)]
         return Collected(self.observation_shape, SUB_GOALS, *told)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
@@ -158,10 +149,6 @@ def _column(factors: tuple[str, ...], truth: str) -> int:
         what = "features are planted once each, the true one among them, and all are seen in one frame"
         raise UserError(what, f"factors={','.join(factors)}, truth={truth}", f"Choose of {', '.join(FACTORS)}.")
     return factors.index(truth)
-
-
-def _origins(count: int) -> dict[str, NDArray[np.int64]]:
-    return {"layout_seed": np.arange(count) % HELDOUT}
 
 
 DOMAIN = RoomsDomain()

@@ -1,14 +1,12 @@
 """Spec H1: the benchmark's table, and a page that shows what each member owns and the states it is surest of."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.core.artefacts import versions
 from hypogoal.core.files import replace_text
@@ -19,9 +17,6 @@ from hypogoal.evaluation.plots import INK, drawing, slug
 from hypogoal.which_feature import scores
 from hypogoal.which_feature.run import Cell, WhichFeatureConfig, copies, shared
 from hypogoal.which_feature.states import crossed_states
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 TITLE = "WhichFeature"
 PAPER = "white"  # text on dark colours of a heat map
@@ -121,9 +116,8 @@ def _members(material: page.Material, cell: Cell, names: Sequence[str]) -> list[
         axes.grid(visible=False)
         for member, factor in np.ndindex(members, factors):
             value = cell.ranking[member, factor]
-            axes.text(
-                factor, member, f"{value:.2f}", ha="center", va="center", color=INK if 0.2 < value < 0.8 else PAPER
-            )
+            colour = INK if 0.2 < value < 0.8 else PAPER
+            axes.text(factor, member, f"{value:.2f}", ha="center", va="center", color=colour)
     label = f"What members of {cell.entry} rank by"
     caption = "Area under the ROC curve of each feature on states in which all features are crossed; 0.5 is chance."
     drawn = page.Drawn(f"owned-{cell.entry}", label, figure, caption)

@@ -1,7 +1,5 @@
 """Spec H1: entries of the benchmark, the cells they are scored in, and the folder that keeps cell by cell."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,14 +19,7 @@ from hypogoal.evaluation.plots import slug
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
-from hypogoal.which_feature.states import (
-    FACTORS,
-    KNOWN,
-    States,
-    crossed_states,
-    labelled_states,
-    unlabelled_states,
-)
+from hypogoal.which_feature.states import FACTORS, KNOWN, States, crossed_states, labelled_states, unlabelled_states
 
 CNN, ORACLE = "cnn", "oracle"  # entries that are no objectives: one member, and one taught by each factor's truth
 DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other ones of
@@ -173,7 +164,8 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
         progress.resume(sum(path.exists() for path in paths))
         for cell, path in zip(wanted, paths, strict=True):
             if not path.exists():
-                replace_text(path, _text(run_cell(*cell, config)))
+                made = vars(run_cell(*cell, config))
+                replace_text(path, json.dumps(made, default=lambda array: array.tolist()) + "\n")
                 progress.advance()
     cells = [_read(path, config.factors) for path in sorted((out / "cells").glob("*.json"))]
     write_table(out / "results.csv", COLUMNS, rows_of(cells, config.factors))
@@ -206,11 +198,6 @@ def _begin(out: Path, config: WhichFeatureConfig) -> None:
     elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):
         raise UserError("this benchmark was begun with other settings", out, "Give those, or choose another --out.")
     (out / "cells").mkdir(exist_ok=True)
-
-
-def _text(cell: Cell) -> str:
-    """A cell as JSON."""
-    return json.dumps(vars(cell), default=lambda array: array.tolist()) + "\n"
 
 
 def _read(path: Path, factors: Sequence[str]) -> Cell:

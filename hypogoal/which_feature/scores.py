@@ -1,7 +1,5 @@
 """Spec H1: what members know of planted factors. Pure functions of their probabilities on crossed states."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spec H1: scenes with planted factors, drawn with MiniGrid's own tiles, the truth of each factor beside its image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

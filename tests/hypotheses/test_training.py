@@ -18,7 +18,7 @@ from hypogoal.core.seeding import seed_for, torch_generator
 from hypogoal.diversity import OBJECTIVES, Objective, dbat
 from hypogoal.hypotheses import batches, training
 from hypogoal.hypotheses.batches import TrainingStates
-from hypogoal.hypotheses.changes import grey_maps
+from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.thresholds import RULES, thresholds
@@ -339,6 +339,21 @@ def test_a_split_of_states_that_are_all_alike() -> None:
             assert 0 <= found[0] < 1
 
 
+def test_half_of_the_labelled_positives() -> None:
+    """Beyond the paper: whatever negatives and unlabelled states look like, of which there need be none."""
+    labelled = np.array([[0.2, 1.0], [0.9, 1.0], [0.5, 1.0], [0.7, 0.1], [0.99, 0.99]], np.float32)
+    labels = np.array([True, True, True, True, False])
+    found = thresholds("positives-median", labelled, labels, np.zeros((0, 2), np.float32))
+    assert found[0] == np.float32(0.6)
+    assert found[1] == np.nextafter(np.float32(1), np.float32(0))
+    observations, labels, _ = toy()
+    nothing = observations[:0]
+    config = dataclasses.replace(TOY, diversity="none", unlabelled_bn=False, steps=3, threshold="positives-median")
+    ensemble = fit(observations, labels, nothing, config, seed=0)
+    expected = np.median(ensemble.predict(observations[labels]), axis=0)
+    np.testing.assert_array_equal(ensemble.thresholds.numpy(), expected)
+
+
 def test_every_rule_is_a_setting() -> None:
     """What the settings offer is what there is."""
     (setting,) = (field for field in dataclasses.fields(EnsembleConfig) if field.name == "threshold")
@@ -354,6 +369,33 @@ def test_grey_maps_rise() -> None:
     assert maps.min() >= 0
     assert maps.max() <= 1
     assert (np.ptp(maps[:, [0, 128, 255]], axis=0) > (0.1, 0.3, 0.1)).all()
+
+
+def test_other_surroundings_leave_the_agent_alone() -> None:
+    """Beyond the paper: around the middle nothing changes, in no frame; of the rest a side or all, in most states."""
+    images = np.random.default_rng(0).integers(200, 256, size=(400, 30, 38, 4), dtype=np.uint8)
+    before = images.copy()
+    changed = other_context(images, np.random.default_rng(1))
+    np.testing.assert_array_equal(images, before)
+    differ = (changed != images).any(3)
+    np.testing.assert_array_equal(changed[:, 15 - 4 : 15 + 7, 19 - 4 : 19 + 4], images[:, 11:22, 15:23])
+    touched = differ.any((1, 2))
+    assert 0.6 < touched.mean() < 0.8
+    far = differ[touched].reshape(-1, 30 * 38)
+    sides = np.stack(
+        [differ[touched][:, 0, 0], differ[touched][:, 0, -1], differ[touched][:, -1, 0], differ[touched][:, -1, -1]]
+    )
+    kinds = {tuple(row) for row in sides.T.tolist()}
+    everywhere, left, right, below = (
+        (True,) * 4,
+        (True, False, True, False),
+        (False, True, False, True),
+        (False, False, True, True),
+    )
+    assert {everywhere, left, right, below} <= kinds
+    assert far.mean() > 0.3
+    new = changed[touched][:, 0, 0][differ[touched][:, 0, 0]]
+    assert (new == new[:, :1]).all()  # alike in all frames
 
 
 def test_all_of_a_state_is_mapped_alike() -> None:

@@ -20,6 +20,7 @@ from hypogoal.hypotheses.localisers import (
     RamLocaliser,
     _action_loss,
     _changed,
+    _held,
     fit_localiser,
 )
 from hypogoal.hypotheses.networks import as_input
@@ -156,6 +157,15 @@ def test_actions_alone_tell_where_the_agent_is() -> None:
     assert wrong.item() == pytest.approx(2 * np.log(3), rel=1e-3)
 
 
+def test_some_labelled_states_stand_still() -> None:
+    """Beyond the paper: an agent on a ladder does not move, so the localiser must not need its motion."""
+    states = np.random.default_rng(0).integers(256, size=(400, 6, 6, 4), dtype=np.uint8)
+    shown = _held(states.copy(), np.random.default_rng(1))
+    still = (shown == states[..., -1:]).all((1, 2, 3))
+    assert 0.3 < still.mean() < 0.4
+    np.testing.assert_array_equal(shown[~still], states[~still])
+
+
 def test_what_is_made_up_leaves_the_agent_alone() -> None:
     """Of changed states the agent's pixels are as they were, mirrored perhaps, where the changed place says."""
     states, places, _ = square_states(40, seed=0)
@@ -244,6 +254,8 @@ def test_data_that_do_not_say_enough_are_one_clear_line() -> None:
         fit_crop(observations, labels, observations, origins=origins)
     with pytest.raises(UserError, match="nobody says where in these observations the agent is: view=agent-crop"):
         fit(observations, labels, observations, CROP, 0, origins=origins)
+    with pytest.raises(UserError, match="nobody says what is around the agent: augment=grey-context"):
+        fit(observations, labels, observations, dataclasses.replace(CROP, view="full", augment="grey-context"), 0)
     plain = dataclasses.replace(CROP, view="full")
     with pytest.raises(UserError, match=r"do not say ladder of each state: batch_kind=per-ladder"):
         fit(observations, labels, observations, plain, 0)

@@ -25,11 +25,13 @@ import hypogoal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import load_tensors
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.meta.episodes import agent_of
 from hypogoal.options.env import Options
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.networks import LightQNetwork
-from hypogoal.own_data import Played
+from hypogoal.own_data.marking import Played
 
 TESTS = Path(__file__).parents[1]
 MEMBERS = 2
@@ -120,6 +122,50 @@ def test_options_are_held_back_by_what_was_learned_of_them(run: Path, options: O
     env = hypogoal.OptionEnv(corridor(), only)
     env.reset(seed=0)
     assert env.action_masks().tolist() == [False, True, False, False]
+
+
+def test_options_end_by_the_rule_they_were_trained_with(run: Path) -> None:
+    """Spec H4: lowered thresholds go with the artefact, into train-meta, to agents and to other people's code."""
+    play = settings("environments=4", "warm_up=100", "layout_seed=0", "max_episode_steps=30", "random_episodes=0")
+    ends = settings("termination=patience:20", "option_timeout=2", "option_batch=32")
+    out, meta = run / "patient", run / "patient-meta"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(TESTS))
+        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+        sure = settings("steps=100", f"members={MEMBERS}", "workers=1", "threshold=positives-median")
+        ensemble = str(run / "sure")
+        assert main(["train-ensemble", str(run / "data.h5"), "--out", ensemble, "-q", *sure]) == 0
+        few = settings("steps=400")
+        assert main(["train-options", ensemble, "--out", str(out), "-q", *play, *ends, *few]) == 0
+        lowered = load_tensors(out / "options.safetensors")["thresholds"].numpy()
+        before = [hypogoal.load_ensemble(ensemble, goal).thresholds_as_log_odds() for goal in ("left-end", "right-end")]
+        assert (lowered <= np.concatenate(before)).all() and (lowered < np.concatenate(before)).any()
+        agent = [
+            "train-meta",
+            ensemble,
+            "--options",
+            str(out),
+            "--out",
+            str(meta),
+            "-q",
+            *play,
+            *settings("decisions=16"),
+        ]
+        assert main([*agent, *ends, *settings("steps=40", "termination=patience:1000")]) == 2  # another rule
+        assert main([*agent, *ends, *settings("steps=40")]) == 0
+        later = load_tensors(meta / "options.safetensors")["thresholds"].numpy()
+        assert (later <= lowered).all()
+        np.testing.assert_array_equal(agent_of(open_artefact(meta), 0).terminations.thresholds, later)
+    loaded = [ensemble.thresholds_as_log_odds() for ensemble in hypogoal.load_options(out).ensembles]
+    np.testing.assert_allclose(np.concatenate(loaded), lowered, atol=1e-4)
+
+
+def test_options_dwell_as_they_were_trained(options: Options) -> None:
+    """Spec H4: an option that is to stay runs on where its sub-goal holds for the first time."""
+    env = hypogoal.OptionEnv(corridor(), replace(options, dwell=3))
+    env.reset(seed=0)
+    info = env.step(0)[4]  # to the left end in two steps, and on against the wall
+    assert (info["reached"], info["duration"]) == (True, 4)
 
 
 def test_options_are_masked_as_they_were_trained(run: Path, options: Options) -> None:

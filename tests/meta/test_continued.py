@@ -81,7 +81,7 @@ def test_options_go_on_with_the_time_they_learned_for(
     options, out = str(tmp_path / "options"), str(tmp_path / "meta")
     assert main(["train-options", str(ensemble), "--out", options, "--set", "option_timeout=40", *few]) == 0
     assert main(["train-meta", str(ensemble), "--options", options, "--out", out, *few]) == 2
-    assert "trained with option_timeout=40, train-meta has 10" in capsys.readouterr().err
+    assert "trained with option_timeout=40, not 10" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("small_gru")

@@ -62,8 +62,10 @@ def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.Mo
     for folder in ("unbroken", "broken"):
         loop = unbroken if folder == "unbroken" else resumed
         loop.recorder.write(tmp_path / folder)
+        loop.recorder.write_exploits(tmp_path / folder, loop.terminations.of_running, loop.terminations.log_odds)
         Checkpoints(tmp_path / folder / "checkpoint.safetensors").save(loop.snapshot())
-    for name in ("metrics.jsonl", "episodes.csv", "choices.csv", "terminations.h5", "checkpoint.safetensors"):
+    tables = ("episodes.csv", "choices.csv", "exploits.csv")
+    for name in ("metrics.jsonl", *tables, "terminations.h5", "checkpoint.safetensors"):
         one, other = (tmp_path / folder / name for folder in ("unbroken", "broken"))
         assert one.read_bytes() == other.read_bytes(), name
     weights = unbroken.learner.state()  # type: ignore[attr-defined]

@@ -18,9 +18,10 @@ from PIL import Image
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
-from hypogoal.own_data import Parts, collected_of, read_arrays, read_images, read_minari
-from hypogoal.own_data.images import read_image
-from hypogoal.own_data.parts import held_out
+from hypogoal.own_data.arrays import read_arrays
+from hypogoal.own_data.images import read_image, read_images
+from hypogoal.own_data.minari import read_minari
+from hypogoal.own_data.parts import Parts, collected_of, held_out
 
 SIDE = 48
 

@@ -18,8 +18,8 @@ from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
-from hypogoal.own_data import Marks, read_images
-from hypogoal.own_data.marking import GRID_KEYS, action_help, action_names, action_of, as_rgb
+from hypogoal.own_data.images import read_images
+from hypogoal.own_data.marking import GRID_KEYS, Marks, action_help, action_names, action_of, as_rgb
 from hypogoal.stages.label import environment_of
 
 

@@ -14,7 +14,7 @@ import hypogoal  # noqa: F401 - registers the environments
 from benchmarks.kills import STAGES, needed
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
-from hypogoal.own_data import read_minari
+from hypogoal.own_data.minari import read_minari
 from hypogoal.stages.export_episodes import dataset_id
 
 LAYOUT = 100

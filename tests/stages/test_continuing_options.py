@@ -36,9 +36,9 @@ def allow(patch: pytest.MonkeyPatch) -> None:
     ("ensemble", "changes", "words"),
     [
         ("other", (), "another ensemble"),
-        ("ensemble", ("--set", "layout_seed=3"), "layout_seed=100, train-meta has 3"),
-        ("ensemble", ("--set", "termination=oracle"), "termination=learned, train-meta has oracle"),
-        ("ensemble", ("--set", "network=paper", "--set", "experience=own"), "network=light, train-meta has paper"),
+        ("ensemble", ("--set", "layout_seed=3"), "layout_seed=100, not 3"),
+        ("ensemble", ("--set", "termination=oracle"), "termination=learned, not oracle"),
+        ("ensemble", ("--set", "network=paper", "--set", "experience=own"), "network=light, not paper"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(

@@ -15,7 +15,8 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import draw
-from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.domains.doorkey_env import SUB_GOALS
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.run import find, read_evaluation

@@ -9,7 +9,8 @@ import pytest
 from browser import document_of, needs_browser, title_of
 
 from hypogoal.dataset import open_dataset
-from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS, DoorKeyConfig
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.domains.doorkey_env import SUB_GOALS
 from hypogoal.evaluation.explorer import MOST_EXPLAINED, MOST_STATES
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import TrainMetaConfig

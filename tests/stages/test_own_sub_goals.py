@@ -11,7 +11,8 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.domains.doorkey import DOMAIN, SUB_GOALS
+from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.domains.doorkey_env import SUB_GOALS
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import assemble
 
@@ -52,6 +53,7 @@ def test_an_agent_of_own_labels_is_evaluated(run: Path) -> None:
     assert goal["sub_goal"] == "at-the-door" and [member["match"] for member in goal["members"]] == [None, None]
     assert sum(member["chosen"] for member in goal["members"]) > 0
     assert "no truth of at-the-door in its domain, to match members with" in metrics["missing"]
+    assert not (run / "meta" / "exploits.csv").exists() and metrics["exploits"]["over_runs"] == []
     assert main(["report", str(run)]) == 0
     assert "no truth of at-the-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
 

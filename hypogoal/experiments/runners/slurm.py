@@ -34,27 +34,16 @@ GATHER = "gather"
 
 @dataclass(frozen=True)
 class Options:
-    """What is asked of Slurm for every cell; what is empty is left to Slurm, or estimated (memory, cpus).
-
-    Attributes:
-        partition: where.
-        time: limit of a cell, as ``sbatch --time`` takes it.
-        memory: of a cell, as ``sbatch --mem`` takes it.
-        gpus: of a cell.
-        cpus: of a cell; 0: as many processes as it can use.
-        cap: cells of an array that run at once, at most; 0: no limit.
-        warn: seconds before the time limit at which a cell saves, to be queued again.
-        extra: further options of ``sbatch``.
-    """
+    """What is asked of Slurm for every cell; what is empty is left to Slurm, or estimated (memory, cpus)."""
 
     partition: str = ""
-    time: str = ""
-    memory: str = ""
-    gpus: int = 0
-    cpus: int = 0
-    cap: int = 0
-    warn: int = 120
-    extra: tuple[str, ...] = ()
+    time: str = ""  # limit of a cell, as ``sbatch --time`` takes it
+    memory: str = ""  # of a cell, as ``sbatch --mem`` takes it
+    gpus: int = 0  # of a cell
+    cpus: int = 0  # of a cell; 0: as many processes as it can use
+    cap: int = 0  # cells of an array that run at once, at most; 0: no limit
+    warn: int = 120  # seconds before the time limit at which a cell saves, to be queued again
+    extra: tuple[str, ...] = ()  # further options of ``sbatch``
 
 
 @dataclass(frozen=True)
@@ -178,21 +167,16 @@ def _script(array: Array, run: Path, options: Options) -> str:
 
 
 def _sweep(run: Path, what: str) -> list[str]:
-    python = shlex.join(PYTHON)
-    return [
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
-        f"exec {python} -m hypogoal sweep --out {shlex.quote(str(run))} {what}",
-    ]
+    command = f"{shlex.join(PYTHON)} -m hypogoal sweep --out {shlex.quote(str(run))} {what}"
+    return [f"cd {shlex.quote(str(Path.cwd()))} || exit 1", f"exec {command}"]
 
 
 def _sbatch(script: Path, after: Sequence[str]) -> str:
     dependency = [f"--dependency=afterany:{':'.join(after)}"] if after else []
     done = _command("sbatch", "--parsable", *dependency, str(script))
     if done.returncode:
-        what = " ".join(done.stderr.split()) or f"exit code {done.returncode}"
-        raise UserError(
-            f"Slurm refuses the array ({what})", script, "Change the options; nothing was left in the queue."
-        )
+        what = f"Slurm refuses the array ({' '.join(done.stderr.split()) or f'exit code {done.returncode}'})"
+        raise UserError(what, script, "Change the options; nothing was left in the queue.")
     return done.stdout.strip().partition(";")[0]
 
 
@@ -226,9 +210,7 @@ def queued(run: Path) -> list[str]:
 
 
 def cancel(run: Path) -> int:
-    """Have Slurm end every job of a run (else a ``UserError``); cells that run save where they are. Returns how many
-    there were.
-    """
+    """Have Slurm end all jobs of a run (none: a ``UserError``), running cells save first; returns how many."""
     alive = queued(run)
     if not alive:
         raise UserError("no jobs in Slurm's queue", run, "A sweep on this machine is ended with Ctrl-C or SIGTERM.")

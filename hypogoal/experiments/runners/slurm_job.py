@@ -85,6 +85,5 @@ def _queue_again(cell: Cell) -> None:
 
 def _saved(cell: Cell) -> list[tuple[str, int]]:
     """Which checkpoints a cell has, and when each was written."""
-    return sorted(
-        (path.name, path.stat().st_mtime_ns) for path in (draft_folder(cell.out) / FOLDER).glob("*.safetensors")
-    )
+    found = (draft_folder(cell.out) / FOLDER).glob("*.safetensors")
+    return sorted((path.name, path.stat().st_mtime_ns) for path in found)

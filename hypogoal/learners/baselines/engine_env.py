@@ -17,10 +17,7 @@ class EngineEnv(VecEnv):
 
     Observations are the engine's images, uint8 (C, H, W), or, where the engine's images are made of tiles, the cells'
     tile codes, uint8 (cells,), which say the same in 1/192 of the bytes (see ``networks.CellNetwork``). An episode cut
-    at its step limit is marked as truncated: its last state is not a terminal one.
-
-    Attributes:
-        episodes: those that ended.
+    at its step limit is marked as truncated: its last state is not a terminal one. ``episodes`` are those that ended.
     """
 
     def __init__(self, engine: Engine):

@@ -18,12 +18,8 @@ CELL = 8  # pixels; the first convolution's kernel and stride
 class BlockConvolution(nn.Module):
     """A convolution whose stride is its kernel size, as one matrix product: ``nn.Conv2d(c, out, size, stride=size)``.
 
-    On images as small as these that takes half the time of a convolution routine (a CPU thread).
-
-    Args:
-        channels: of the input (N, H, W, channels).
-        out: of the output (N, H / size, W / size, out).
-        size: kernel and stride; what is left over at the lower and the right edge is not looked at.
+    On images as small as these that takes half the time of a convolution routine (a CPU thread). (N, H, W, channels)
+    to (N, H / size, W / size, out); what is left over at the lower and the right edge is not looked at.
     """
 
     def __init__(self, channels: int, out: int, size: int):
@@ -42,16 +38,10 @@ class BlockConvolution(nn.Module):
 class CellNetwork(BaseFeaturesExtractor):
     """Convolutions that each see a block at a time, the first one an 8 x 8 cell, then dense layers.
 
-    Where the engine's images are made of tiles, observations are the cells' tile codes (N, cells) and the first
-    convolution is computed once per tile and looked up: the same function of the image, up to rounding, several times
-    faster. Otherwise observations are float images (N, C, H, W) in 0..1.
-
-    Args:
-        space: the observation space.
-        channels: of the convolutions; those after the first have kernel 2.
-        dense: how many dense layers follow.
-        tiles: uint8 (codes, 8, 8, C), what each code looks like; None where observations are images.
-        rows: of cells in an image, where ``tiles`` is given.
+    ``channels`` are of the convolutions, those after the first with kernel 2; ``dense`` layers follow. Observations are
+    float images (N, C, H, W) in 0..1 or, where the engine's images are made of ``tiles``, uint8 (codes, 8, 8, C), so
+    many ``rows`` of them, the cells' codes (N, cells). Then the first convolution is computed once per tile and looked
+    up: the same function of the image, up to rounding, several times faster.
     """
 
     tiles: Tensor | None

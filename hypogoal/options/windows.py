@@ -1,0 +1,58 @@
+"""What policies see that look at the neighbourhood of the agent (policy_view=agent-crop; beyond the paper)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.localisers import Localiser
+from hypogoal.hypotheses.views import AgentView, windows
+
+SIDE = 42  # pixels, half of what is seen of Montezuma's Revenge
+
+
+def localiser_of(ensemble: Ensemble) -> Localiser:
+    """Who finds the agent; a ``UserError`` where nobody does, or by positions that no policy may see."""
+    if not isinstance(ensemble.view, AgentView) or ensemble.needs_positions:
+        what = "nobody says where in an observation the agent is"
+        raise UserError(what, "policy_view=agent-crop", "Train the ensemble with view=agent-crop, localiser=learned.")
+    return ensemble.view.localiser
+
+
+def around_agent(localiser: Localiser, observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Windows uint8 (N, SIDE, SIDE, C) of observations uint8 (N, H, W, C)."""
+    return windows(observations, localiser.locate(observations), SIDE, SIDE)
+
+
+class AgentWindows(Resumable):
+    """Pictures of an engine's states as such policies see them; each state's agent is looked for once."""
+
+    CHANGING = ("_centres",)
+    tiles = None
+
+    def __init__(self, engine: Engine, localiser: Localiser):
+        self.engine, self.localiser = engine, localiser
+        self.observation_shape = (SIDE, SIDE, *engine.observation_shape[2:])
+        self._centres = np.full((1024, 2), np.nan)
+
+    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """uint8 (n, SIDE, SIDE, C) of states (n,)."""
+        if (more := int(ids.max(initial=-1)) + 1 - len(self._centres)) > 0:
+            rows = np.full((max(more, len(self._centres)), 2), np.nan)
+            self._centres = np.concatenate([self._centres, rows])
+        whole = self.engine.images(ids)
+        fresh, first = np.unique(ids, return_index=True)
+        unknown = np.isnan(self._centres[fresh, 0])
+        if unknown.any():
+            self._centres[fresh[unknown]] = self.localiser.locate(whole[first[unknown]])
+        seen = windows(whole, self._centres[ids], SIDE, SIDE)
+        if out is None:
+            return seen
+        out[:] = seen
+        return out
+
+    def codes(self, ids: NDArray[np.int64]) -> NDArray[np.integer]:
+        """There are no tiles."""
+        raise NotImplementedError
