@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.meta.config import AuditConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
+from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.recording import STOPS_KEPT
 
 BASE = 450e6
@@ -54,22 +54,18 @@ def ensemble_disk(sub_goals: int, members: int) -> float:
     return sub_goals * (members * MEMBER + training) + CHECKPOINTS * training + LOGS
 
 
-def play_needs(
-    domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig | AuditConfig
-) -> Needs:
-    """``train-options``, ``train-meta``, ``audit`` in a domain; ``about`` is the ensemble manifest's configuration."""
+def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
+    """``train-options`` and ``train-meta`` in a domain; ``about`` is the ensemble manifest's configuration."""
     from hypogoal.meta.training import frames_kept  # with torch, which nobody else here needs
 
-    oracle, visited = False, 0
-    if isinstance(config, PlayConfig):
-        oracle, visited = config.termination == "oracle", config.save_visited
+    oracle = config.termination == "oracle"
     options = len(about["sub_goals"]) * (1 if oracle else about["members"])
     picture = prod(domain.observation_shape)
     paper = config.network == "paper"
     replays = options if paper else 1
     weights = options * PAPER_POLICY if paper else 8e6
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
-    stops = STOPS_KEPT * options * picture + visited * picture
+    stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
     members = len(about["sub_goals"]) * about["members"] * (MEMBER + WINDOWS)
     # A checkpoint is a copy of the state, in memory while it is written.

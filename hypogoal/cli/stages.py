@@ -173,16 +173,11 @@ def train_baseline(
 
 @app.command()
 def audit(
-    classifier: Annotated[
-        str, typer.Argument(help="ENSEMBLE:SUB_GOAL/MEMBER, or module:function: uint8 (N, H, W, C) -> probabilities.")
-    ],
+    classifier: Annotated[str, typer.Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
     out: Out,
-    domain: Annotated[
-        str | None, typer.Option(help="Where it is played: a name or module:object; a member's own where left out.")
-    ] = None,
-    sub_goal: Annotated[
-        str, typer.Option(help="Of the domain, whose truth counts; a member's own where left out.")
-    ] = "",
+    domain: Annotated[str, typer.Option(help="Where it is played: doorkey, montezuma, or module:object.")],
+    sub_goal: Annotated[str, typer.Option(help="Of the domain, whose truth counts.")] = "",
+    member: Annotated[int, typer.Option(min=0, help="Of the ensemble.")] = 0,
     layout_seed: LayoutSeed = None,
     preset: Preset = None,
     set_: Set = None,
@@ -192,30 +187,20 @@ def audit(
     resume: Resume = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train a policy against a success classifier: how often is it fooled, and where?
-
-    An option is learned that ends where the classifier says yes. Of its last
-    executions the truth is asked. The same again with a mend (--set mend).
-    """
+    """Train a policy against a success classifier: how often is it fooled, and where?"""
     from hypogoal.core import own_code
-    from hypogoal.core.errors import UserError
-    from hypogoal.evaluation.audit import lines_of, member_in
+    from hypogoal.evaluation.audit import lines_of
     from hypogoal.settings import configuration
     from hypogoal.stages.audit import audit as stage
 
-    member, given = member_in(classifier), {"layout_seed": layout_seed}
-    if domain is None and member is None:
-        raise UserError("where is this classifier to be played?", classifier, "Give --domain.")
-    with own_code.given(classifier, *([domain] if domain else [])):
-        world = domain or domain_of(member[0] if member else Path(), "ensemble")
-        config = configuration("audit", world, preset, set_, given)
+    config = configuration("audit", domain, preset, set_, {"layout_seed": layout_seed}, given=True)
+    with own_code.given(classifier, domain):
         report = stage(
-            classifier, config, out, domain=world, sub_goal=sub_goal, seed=seed, force=force, resume=resume,
-            quiet=quiet, device=device,
+            classifier, config, out, domain=domain, sub_goal=sub_goal, member=member,
+            seed=seed, force=force, resume=resume, quiet=quiet, device=device,
         )  # fmt: skip
-    if not quiet:
-        for line in lines_of(report):
-            say(line)
+    for line in () if quiet else lines_of(report):
+        say(line)
     give(out)
 
 

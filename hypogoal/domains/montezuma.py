@@ -52,6 +52,17 @@ LEARNING: Mapping[str, Any] = {
     "exploration": "persistent",
     "epsilon_steps": 10_000,
     "epsilon_final": 0.01,
+    "random_episodes": 0,
+}
+# And where they are learned by themselves, ladder by ladder.
+ALONE: Mapping[str, Any] = {
+    **LEARNING,
+    "max_episode_steps": MAX_STEPS,
+    "restart_options": True,
+    "mask_reached": False,
+    "chooser": "even",
+    "steps": 40_000,
+    "steps_for": "each",
 }
 
 
@@ -146,18 +157,9 @@ class MontezumaDomain(Domain):
                 "class_weight_negative": 0.8,
                 "class_weight_positive": 0.2,
             },
-            "train-options": {
-                **LEARNING,
-                "random_episodes": 0,
-                "max_episode_steps": MAX_STEPS,
-                "restart_options": True,
-                "mask_reached": False,
-                "chooser": "even",
-                "steps": 40_000,
-                "steps_for": "each",
-            },
-            "train-meta": {**LEARNING, "random_episodes": 0},
-            "audit": {**LEARNING, "max_episode_steps": MAX_STEPS},
+            "train-options": ALONE,
+            "train-meta": LEARNING,
+            "audit": ALONE,
         }
     )
 

@@ -27,7 +27,7 @@ CAPTION_HEIGHT, GAP = 14, 4  # pixels
 BACKGROUND, INK = 40, 230  # grey levels
 SIDE = 336  # pixels that a moving state is enlarged to, or a little less
 LINE, MARGIN, BAR = 18, 8, 8  # pixels below it
-FONT, MARK = 13, 6  # pixels of letters, and of the frame round a marked state
+FONT = 13
 PAPER, DARK, SOFT = (255, 255, 255), (36, 39, 43), (212, 215, 220)
 STEP, END, LAST = 140, 600, 1_500  # milliseconds of a step, of an option's end, of the last frame
 PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
@@ -171,7 +171,7 @@ def _caption(origins: Mapping[str, NDArray[np.int64]], index: int, kinds: Sequen
 
 
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
-    """What is written below a frame: option and member, if there are several; verdict and time left; why it ended."""
+    """What is written below a frame: option and member, of several; verdict and time left; why it ended."""
     sub_goal, member = sub_goals[frame.option // members], frame.option % members
     verdict = "yes" if frame.says_yes else "no"
     return [
@@ -197,8 +197,6 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     picture.paste(Image.fromarray(large))
     draw = ImageDraw.Draw(picture)
     colour = PALETTE[frame.option // members % len(PALETTE)]
-    if frame.marked:
-        draw.rectangle((0, 0, width - 1, height - 1), outline=FOR, width=MARK)
     draw.rectangle((0, height, width, height + BAR), fill=SOFT)
     draw.rectangle((0, height, width * frame.left / timeout, height + BAR), fill=colour)
     font = ImageFont.load_default(FONT)

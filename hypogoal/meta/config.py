@@ -45,8 +45,8 @@ class MetaConfig:
 
 
 @dataclass(frozen=True)
-class WorldConfig(OptionConfig):
-    """Where options are played."""
+class PlayConfig(OptionConfig):
+    """Where options are played, and for how long."""
 
     start: str = setting(
         "",
@@ -76,12 +76,6 @@ class WorldConfig(OptionConfig):
         "what is otherwise in the world than where the states were collected: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
-
-
-@dataclass(frozen=True)
-class PlayConfig(WorldConfig):
-    """When options end there, and what is kept of it."""
-
     termination: str = setting(
         "learned",
         "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
@@ -134,18 +128,20 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
 
 
 @dataclass(frozen=True)
-class AuditConfig(WorldConfig):
-    """How the policy is trained that is to fool a classifier, what is kept of it, and what is tried against it."""
+class AuditConfig(TrainOptionsConfig):
+    """How the policies are learned that are to fool a classifier, and what is tried against them."""
 
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
-    restart_options: bool = setting(True, "every execution begins a new episode, where the domain's engine can do that")
-    steps: int = setting(40_000, "environment steps of each policy, all environments together", unit="steps", low=1)
-    executions: int = setting(100, "the last executions, which are counted", low=1, high=10_000)
+    restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
+    mask_reached: bool = setting(False, "do not begin executions where the classifier says yes already")
+    steps: int = setting(80_000, "environment steps, those of all policies together", unit="steps", low=1)
+    chooser: str = setting("even", "the policy with the fewest steps so far plays, or any", choices=("random", "even"))
     threshold: float = setting(
-        0.0, "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers", low=0.0, high=1
+        0.0,
+        "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers",
+        low=0.0,
+        high=1.0,
     )
-    mend: str = setting(
-        "threshold:0.95",
-        "tried with a policy learned anew: threshold:P; positives-median, of a member, the median of its own "
-        "probabilities on the labelled positives; or none",
+    mend: float = setting(
+        0.95, "a second policy is learned against yes above this higher probability; 0: none", low=0.0, high=1.0
     )

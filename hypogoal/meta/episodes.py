@@ -27,7 +27,6 @@ class Frame:
         says_yes: its own classifier's verdict on the state.
         left: steps until its timeout.
         ended: why it ended in this state; empty where it goes on.
-        marked: a frame is drawn round it.
     """
 
     observation: NDArray[np.uint8]
@@ -36,7 +35,6 @@ class Frame:
     says_yes: bool
     left: int
     ended: str
-    marked: bool = False
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import AuditConfig, MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, WorldConfig
+from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
@@ -46,26 +46,34 @@ def assemble(
     config: TrainOptionsConfig | TrainMetaConfig,
     seed: int,
     device: str = "cpu",
+    ends: Callable[[Engine], Terminations] | None = None,
 ) -> OptionLoop:
     """The environments of one layout, an ensemble's options in them, fresh policies of these and over these.
 
     ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, start states. Where the domain has no such start, or not the true sub-goals at which options are to end, it
-    is a ``UserError``.
+    several, start states; ``ends`` gives terminations that are no ensemble's. Where the domain has no such start, or
+    not the true sub-goals at which options are to end, it is a ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = _columns(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
-    engine = make_engine(domain, about, config, options, seed)
-    if oracle:
+    arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
+    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
+    if config.cap:
+        if (shortest := engine.shortest_path()) is None:
+            raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
+        engine.max_steps = math.ceil(config.cap * shortest)
+    if ends:
+        terminations = ends(engine)
+    elif oracle:
         terminations = oracle_terminations(engine, columns)
     else:
         ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in sub_goals]
         alone = config.experience == "own" and not config.mask_reached
         terminations = learned_terminations(engine, ensembles, running_only=alone, rule=config.termination)
-        _check_rule(terminations, config)
         if (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
+    _check_rule(terminations, config)
     seen = None
     if config.policy_view == "agent-crop":
         if config.network != "light":
@@ -118,18 +126,7 @@ def nearness(
     return near
 
 
-def make_engine(domain: Domain, about: Mapping[str, Any], config: WorldConfig, options: int, seed: int) -> Engine:
-    """The environments of one layout; ``about`` says in which world, ``seed`` is of several start states."""
-    arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
-    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
-    if config.cap:
-        if (shortest := engine.shortest_path()) is None:
-            raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
-        engine.max_steps = math.ceil(config.cap * shortest)
-    return engine
-
-
-def played_world(domain: Domain, about: Mapping[str, Any], config: WorldConfig) -> dict[str, Any]:
+def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -> dict[str, Any]:
     """The domain's settings that an ensemble's states were collected with, but for what ``config.world`` changes."""
     changed = parse_assignments(config.world)
     for name in changed:
@@ -161,7 +158,7 @@ def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 
-def start_arguments(domain: Domain, config: WorldConfig, options: int, seed: int) -> dict[str, Any]:
+def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
     """Spec D4: what an engine of a domain with named starts is told; nothing where there is one place only.
 
     Where the domain has no such start, or has several and none is given, it is a ``UserError``.
@@ -179,10 +176,9 @@ def start_arguments(domain: Domain, config: WorldConfig, options: int, seed: int
     return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
 
 
-def frames_kept(config: WorldConfig, options: int) -> int:
-    """How many states back an engine must remember: what the replays hold, and open decisions or kept executions."""
+def frames_kept(config: PlayConfig, options: int) -> int:
+    """How many states back an engine must remember: what the replays hold, and the meta-policy's open decisions."""
     decisions = config.decisions if isinstance(config, MetaConfig) else 0
-    decisions = config.executions if isinstance(config, AuditConfig) else decisions
     asked = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
     return max(LEARNERS[config.network].reach(config, options), asked)
 

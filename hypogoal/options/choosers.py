@@ -23,6 +23,7 @@ class Outcome:
     Attributes:
         environments: which environments they ran in.
         options: which options they were of.
+        began: the states in which these were chosen.
         reached: the options' own classifiers ended them.
         inside: these said yes already where they began.
         counted: they began where the domain says that they should (Spec D4).
@@ -36,6 +37,7 @@ class Outcome:
 
     environments: NDArray[np.int64]
     options: NDArray[np.int64]
+    began: NDArray[np.int64]
     reached: NDArray[np.bool_]
     inside: NDArray[np.bool_]
     counted: NDArray[np.bool_]

@@ -7,7 +7,7 @@ D4), the end of an option is also that of its episode.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class OptionLoop(Resumable):
     ``visited`` is shown every state (B7).
     """
 
-    CHANGING: ClassVar[tuple[str, ...]] = (
+    CHANGING = (
         *("terminations", "learner", "chooser", "recorder", "initiation", "visited"),
         *("option", "began", "age", "inside", "returns", "counted"),
     )
@@ -136,6 +136,7 @@ class OptionLoop(Resumable):
         outcome = Outcome(
             environments=done,
             options=self.option[done],
+            began=self.began[done],
             reached=reached[done],
             inside=self.inside[done],
             counted=self.counted[done],

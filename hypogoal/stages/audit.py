@@ -1,23 +1,30 @@
-"""Spec H5: how often a policy fools a success classifier, where, and what a mend changes."""
+"""Spec H5: how often policies fool a success classifier, where, and what a mend changes."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim, create_artefact
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import write_table
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Domain, load_domain
-from hypogoal.evaluation.audit import COLUMNS, Adversary, findings, load_classifier, mended_threshold
+from hypogoal.domains.base import Engine, load_domain
+from hypogoal.evaluation import exploits
+from hypogoal.evaluation.audit import POLICIES, findings, member_of, own_classifier, random_play
+from hypogoal.evaluation.numbers import plain
+from hypogoal.evaluation.run import read_table
+from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
+from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.meta.config import AuditConfig
-from hypogoal.meta.training import make_engine, train
+from hypogoal.meta.training import assemble, description, start_arguments, train, write_trained
 from hypogoal.needs import play_needs
+from hypogoal.options.termination import Terminations, rule_of
 
 
 def audit(
@@ -27,64 +34,67 @@ def audit(
     *,
     domain: str,
     sub_goal: str = "",
+    member: int = 0,
     seed: int = 0,
     force: bool = False,
     resume: bool = False,
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Train a policy against a classifier, and against the mended one; write the artefact ``out``.
+    """Train a policy against a classifier, beside it one against the mended one; write ``out``, return its audit.json.
 
-    Args:
-        classifier: ``ENSEMBLE_FOLDER:SUB_GOAL/MEMBER``, or ``module:function`` from uint8 (N, *obs) to probabilities
-            (N,).
-        domain: where it is played.
-        sub_goal: whose truth counts; that of the member, or the domain's only one, where empty.
-
-    Returns:
-        The content of ``audit.json``.
+    The classifier is a ``member`` of an ensemble artefact, or ``module:function`` from observations uint8 (N, *obs) to
+    probabilities (N,). The truth is that of the domain's ``sub_goal``, the only one where empty.
     """
-    device = prepare(device)
-    found, world = load_classifier(classifier), load_domain(domain)
-    column = _column(world, sub_goal or found.sub_goal)
-    threshold = config.threshold or found.threshold
-    higher = mended_threshold(config.mend, found, threshold)
-    inputs = [found.source.path] if found.source else []
+    device, world = prepare(device), load_domain(domain)
+    of = sub_goal or (world.sub_goals[0] if len(world.sub_goals) == 1 else "")
+    if of not in world.sub_goals:
+        raise UserError(
+            "whose truth is to count?", of or None, f"Give --sub-goal, one of {', '.join(world.sub_goals)}."
+        )
+    about: dict[str, Any] = {"sub_goals": [of], "members": 1 + (config.mend > 0), "domain": domain, "domain_config": {}}
+    inputs, threshold = [], config.threshold or THRESHOLD
+    if ":" in classifier and not Path(classifier).is_dir():
+        classify = own_classifier(classifier)
+    else:
+        source = open_artefact(Path(classifier), "ensemble").whole()
+        ensemble = read_ensemble(source.path, source.config, of).to(device)
+        classify, inputs = member_of(ensemble, member), [source.path]
+        threshold = config.threshold or float(ensemble.thresholds[member])
+        if source.config["domain"] == domain:
+            about["domain_config"] = source.config["domain_config"]
+    if 0 < config.mend <= threshold:
+        raise UserError(
+            f"this mends no threshold of {threshold:g}", f"mend={config.mend:g}", "Give a higher one, or 0."
+        )
+    for name, value in (("termination", "oracle"), ("policy_view", "agent-crop")):
+        if getattr(config, name) == value:
+            raise UserError("an audit is of one classifier alone", f"{name}={value}", "Leave it out.")
     out = claim(out, kind="audit", inputs=inputs, force=force, resume=resume)
-    own = found.source.config if found.source else {}
-    lived = own["domain_config"] if own and own["domain"] == domain else {}
-    about = {"sub_goals": [world.sub_goals[column]], "members": 1, "domain": domain, "domain_config": lived}
+    start_arguments(world, config, 1, seed)  # what cannot be is told before what it would need
     preflight("audit", out, play_needs(world, about, config), resume=resume, quiet=quiet)
-    report: dict[str, Any] = {"classifier": classifier, "sub_goal": world.sub_goals[column], "domain": domain}
-    settings = as_dict(config) | about | {"classifier": classifier}
+    edges = (threshold, config.mend)[: about["members"]]
+
+    def ends(engine: Engine) -> Terminations:
+        def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
+            return np.repeat(classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
+
+        rule, length = rule_of(config.termination)
+        return rule(log_odds, len(edges), None, log_odds_of(np.array(edges)).astype(np.float32), engine.count, length)
+
+    loop = assemble(world, Path(), about, config, seed, device, ends)
+    steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
+    settings = description(loop, world, about, config, classifier=classifier, member=member, steps=steps)
     with create_artefact(
         out, kind="audit", config=settings, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:
-        chance = Adversary(make_engine(world, about, config, 1, seed), found, threshold, config, seed, device)
-        report["random_play"] = chance.random_play(column, rng_for(seed, "random-play"))
-        rows: list[tuple[int, ...]] = []
-        for number, (name, edge) in enumerate((("before", threshold), ("mended", higher))):
-            report[name] = None
-            if edge is None:
-                continue
-            loop = Adversary(make_engine(world, about, config, 1, seed), found, edge, config, seed, device)
-            log = MetricsLog(folder / f"metrics{'-mended' * number}.jsonl")
-            with Progress(f"audit, {name}", total=config.steps, quiet=quiet) as progress:
-                train(loop, config.steps, log, progress, checkpoints_of(folder, name))
-            numbers, table, films = findings(loop, world.sub_goals, column, found.name, name)
-            report[name] = {"threshold": edge, **numbers}
-            rows += [(number, *row) for row in table]
-            for film, gif in films.items():
-                (folder / film).write_bytes(gif)
-        (folder / "audit.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-        write_table(folder / "executions.csv", COLUMNS, rows)
+        log = MetricsLog(folder / "metrics.jsonl")
+        with Progress("audit", total=steps, quiet=quiet) as progress:
+            train(loop, steps, log, progress, checkpoints_of(folder))
+        write_trained(folder, loop, world, about, config, seed)
+        table, report = read_table(folder / exploits.TABLE, exploits.COLUMNS), dict.fromkeys(POLICIES)
+        for option, (name, edge) in enumerate(zip(POLICIES, edges, strict=False)):
+            report[name] = {"threshold": edge, **findings(loop, table, option, world.sub_goals, folder)}
+        report["random_play"] = random_play(loop, world.sub_goals.index(of), rng_for(seed, "random-play"))
+        (folder / "audit.json").write_text(json.dumps(plain(report), indent=1) + "\n", encoding="utf-8")
     return report
-
-
-def _column(domain: Domain, sub_goal: str) -> int:
-    """Which of the domain's sub-goals is meant: the only one where none is named."""
-    known = domain.sub_goals
-    if sub_goal not in known and (sub_goal or len(known) > 1):
-        what = f"{domain.name} does not know where this is true" if sub_goal else "which sub-goal is it to be?"
-        raise UserError(what, sub_goal or None, f"Give --sub-goal, one of {', '.join(known)}.")
-    return known.index(sub_goal) if sub_goal else 0

@@ -1,24 +1,27 @@
-"""Spec H5: a policy is trained against a success classifier; what it is fooled by is told, and what a mend changes."""
+"""Spec H5: policies are trained against a success classifier; what they are fooled by is told, and what a mend changes."""
 
 from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from corridor import Corridor, LongCorridor
 from numpy.typing import NDArray
+from own_domain import CorridorDomain, TallCorridor
 from PIL import Image
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.manifests import files_of
 from hypogoal.core.own_code import OF_FILE
-from hypogoal.dataset import open_dataset
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
-from hypogoal.evaluation.audit import CELL, Execution, kinds_of, lines_of
+from hypogoal.evaluation.audit import CELL, FILMS, lines_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.stages.collect import collect
@@ -53,6 +56,10 @@ def too_soon(pictures: Pictures) -> list[float]:
     return [0.6 if soon else 0.1 for soon in white_at(pictures, 1)]
 
 
+def beside_the_start(pictures: Pictures) -> NDArray[np.bool_]:
+    return white_at(pictures, 1) | white_at(pictures, 3)
+
+
 def of_no_shape(pictures: Pictures) -> NDArray[np.float64]:
     return np.full((len(pictures), 2), 0.5)
 
@@ -61,169 +68,176 @@ def no_probability(pictures: Pictures) -> NDArray[np.float64]:
     return np.full(len(pictures), np.nan)
 
 
-def audited(out: Path, name: str, *words: str) -> tuple[dict, list[dict[str, int]]]:
-    """``audit.json`` and ``executions.csv`` of an audit of a function of this module."""
-    target = name if ":" in name else f"{__name__}:{name}"
-    assert main(["audit", target, "--out", str(out), "-q", *words]) == 0
-    assert main(["verify", str(out)]) == 0
-    report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
-    with (out / "executions.csv").open(newline="", encoding="utf-8") as file:
-        return report, [{column: int(value) for column, value in row.items()} for row in csv.DictReader(file)]
+class Placed(TallCorridor):
+    """The corridor, which begins episodes when asked and knows where the agent is: a cell of it is one place."""
+
+    restarts, position_names = True, ("x",)
+
+    def restart(self, where: NDArray[np.bool_]) -> None:
+        self.ids, self.elapsed = np.where(where, 2, self.ids), np.where(where, 0, self.elapsed)
+
+    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.asarray(ids)[:, None] * CELL
 
 
-def setting(*pairs: str) -> list[str]:
+class PlacedDomain(CorridorDomain):
+    """The corridor with these."""
+
+    name = f"{__name__}:PLACED"
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> TallCorridor:
+        return Placed(count, max_steps)
+
+
+PLACED = PlacedDomain()
+
+
+def settings(*pairs: str) -> list[str]:
     return [word for pair in pairs for word in ("--set", pair)]
 
 
-@pytest.fixture
-def corridor(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The words for a small audit in the corridor."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
-    few = setting(
-        "steps=1500", "environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10", "option_batch=24"
-    )
-    return ["--domain", "own_domain:DOMAIN", "--sub-goal", "left-end", *few]
+QUICK = settings("environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10", "option_batch=24")
+CORRIDOR = ["--domain", PLACED.name, "--sub-goal", "left-end", *QUICK]
+
+
+def audited(out: Path, classifier: str, *words: str) -> tuple[dict[str, Any], list[dict[str, str]]]:
+    """``audit.json`` and ``exploits.csv`` of an audit of an ensemble or of a function of this module."""
+    target = classifier if "/" in classifier else f"{__name__}:{classifier}"
+    assert main(["audit", target, "--out", str(out), "-q", *words]) == 0
+    assert main(["verify", str(out)]) == 0
+    report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
+    with (out / "exploits.csv").open(newline="", encoding="utf-8") as file:
+        return report, list(csv.DictReader(file))
 
 
 def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Path) -> None:
     """Spec H5: on the shortest ways, where all can be said: the planted kind, its film, and that the mend ends it."""
-    shortest = setting("network=planned", "steps=320", "executions=20")
-    where = ["--domain", "doorkey", "--sub-goal", "collect-red-key", "--layout-seed", BLUE_FIRST, *shortest]
-    report, rows = audited(tmp_path / "audit", "takes_blue_for_red", *where)
+    where = ["--domain", "doorkey", "--sub-goal", "collect-red-key", "--layout-seed", BLUE_FIRST]
+    out = tmp_path / "audit"
+    report, rows = audited(out, "takes_blue_for_red", *where, *settings("network=planned", "steps=1600"))
     before, mended = report["before"], report["mended"]
-    assert (before["threshold"], before["exploit_rate"], before["fooled"], before["executions"]) == (0.5, 1.0, 20, 20)
-    assert before["kinds"] == [
-        {"executions": 20, "holds": ["collect-blue-key"], "position": {}, "film": "before-1.gif"}
-    ]
-    assert (mended["threshold"], mended["exploit_rate"], mended["said_yes"], mended["kinds"]) == (0.95, 0.0, 20, [])
-    assert 0.5 < report["random_play"]["accuracy"] < 1 and report["random_play"]["false_yes"] > 0
-    assert report["random_play"]["false_no"] == 0
-    assert {(row["mended"], row["said_yes"], row["holds"], row["kind"]) for row in rows} == {
-        (0, 1, 0, 0),
-        (1, 1, 1, -1),
-    }
+    assert (before["threshold"], before["fires_far"], before["there"]) == (0.5, 1.0, 0)
+    assert before["fooled"] == before["executions"] >= 40
+    film = "before-1.gif"
+    kind = {"executions": before["fooled"], "holds": ["collect-blue-key"], "position": {}, "film": film}
+    assert before["kinds"] == [kind]
+    assert (mended["threshold"], mended["fires_far"], mended["fires_near"], mended["kinds"]) == (0.95, 0.0, 1.0, [])
+    assert mended["there"] == mended["executions"] >= 40
+    chance = report["random_play"]
+    assert 0.5 < chance["accuracy"] < 1 and chance["precision"] < 1 and chance["recall"] == 1
+    assert {(row["option"], row["reached"], row["near"]) for row in rows} == {("0", "1", "0"), ("1", "1", "1")}
 
     engine = DoorKeyEngine(int(BLUE_FIRST))
     ids, away = engine.distances()
     steps = int(away[engine.labels(ids)[:, 0]].min())
-    assert {row["steps"] for row in rows if not row["mended"]} == {steps}
-    with Image.open(tmp_path / "audit" / "before-1.gif") as film:
-        assert film.n_frames == steps + 1
-        corners = []
-        for number in range(film.n_frames):
-            film.seek(number)
-            corners.append(film.convert("RGB").getpixel((1, 1)))
-    assert len({*corners[:-1]}) == 1 and corners[-1] not in corners[:-1], "the last picture alone is marked"
-    lines = list(lines_of(report))
-    assert "  before-1.gif   20 x  while collect-blue-key holds" in lines
-    assert max(map(len, lines)) <= 80
+    with Image.open(out / film) as drawn:
+        assert drawn.n_frames == steps + 1, "from where it began"
+    artefact = open_artefact(out, "audit")
+    more = artefact.manifest["files"].keys() - files_of("audit", artefact.config)
+    assert more == {film}
+    assert f"  {film} {before['fooled']:4d} x  while collect-blue-key holds" in list(lines_of(report))
+    assert max(map(len, lines_of(report))) <= 80
 
 
-def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path, corridor: list[str]) -> None:
-    """Spec H5: learned, on an engine that cannot begin episodes when asked; the same seed gives the same bytes."""
-    report, rows = audited(tmp_path / "soon", "too_soon", *corridor)
-    assert report["before"]["exploit_rate"] == 1.0 and report["before"]["fooled"] >= 90
-    assert [kind["holds"] for kind in report["before"]["kinds"]] == [[]]
-    stays = [row for row in rows if row["yes_at_start"] and row["said_yes"] and row["steps"] == 1]
-    assert not stays, "they follow from the executions before"
-    mended = report["mended"]
-    assert (mended["said_yes"], mended["fooled"], mended["exploit_rate"]) == (0, 0, None)
+def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> None:
+    """Spec H5: learned; where it was fooled is told by place; without a mend there is one policy."""
+    report, _ = audited(tmp_path / "soon", "too_soon", *CORRIDOR, *settings("steps=2000"))
+    before, mended = report["before"], report["mended"]
+    assert before["fires_far"] >= 0.9 and before["came_near"] <= 0.05
+    assert [(kind["holds"], kind["position"]) for kind in before["kinds"]] == [([], {"x": CELL})]
+    assert (mended["fooled"], mended["there"], mended["kinds"]) == (0, 0, []) and mended["executions"] > 20
 
-    truth, _ = audited(tmp_path / "truth", "left_end", *corridor, "--set", "mend=none")
+    truth, _ = audited(tmp_path / "truth", "left_end", *CORRIDOR, *settings("steps=1500", "mend=0"))
     assert truth["mended"] is None
-    assert (truth["random_play"]["accuracy"], truth["before"]["exploit_rate"]) == (1.0, 0.0)
-    assert truth["before"]["said_yes"] >= 50
+    assert (truth["random_play"]["accuracy"], truth["before"]["fires_far"]) == (1.0, 0.0)
+    assert truth["before"]["there"] >= 50
 
-    audited(tmp_path / "again", "too_soon", *corridor)
-    for name in ("audit.json", "executions.csv", "before-1.gif"):
-        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "soon" / name).read_bytes()
+
+def test_places_are_kinds_of_their_own(tmp_path: Path) -> None:
+    """Spec H5: two places that look like success to it are two kinds, the more frequent first, each with its film."""
+    played = settings("steps=400", "mend=0", "warm_up=400", "option_timeout=1")  # nothing is learned, so both are met
+    report, _ = audited(tmp_path / "audit", "beside_the_start", *CORRIDOR, *played)
+    kinds = report["before"]["kinds"]
+    assert {kind["position"]["x"] for kind in kinds} == {1 * CELL, 3 * CELL} and FILMS > 1
+    assert sum(kind["executions"] for kind in kinds) == 100 and kinds[0]["executions"] >= kinds[1]["executions"]
+    assert [kind["film"] for kind in kinds] == ["before-1.gif", "before-2.gif"]
+
+
+def test_a_broken_audit_is_resumed_to_the_last_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1."""
+    words = ["audit", f"{__name__}:too_soon", *CORRIDOR, "-q", *settings("steps=800")]
+    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+
+    seen: list[Checkpoints] = []
+
+    def offer(checkpoints: Checkpoints, state: Callable[[], State]) -> None:
+        seen.append(checkpoints)
+        if len(seen) == 120:
+            checkpoints.save(state())
+        if len(seen) == 150:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "offer", offer)
+        assert main([*words, "--out", str(tmp_path / "broken")]) == 130
+    assert not (tmp_path / "broken").exists()
+    assert main([*words, "--out", str(tmp_path / "broken"), "--resume"]) == 0
+    names = {file.name for file in (tmp_path / "whole").iterdir()} - {"manifest.json"}
+    assert {"audit.json", "exploits.csv", "options.safetensors", "before-1.gif"} <= names
+    for name in names:
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "broken" / name).read_bytes(), name
 
 
 @pytest.fixture(scope="module")
 def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two members, barely trained."""
     folder = tmp_path_factory.mktemp("member")
-    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,)), folder / "data.h5", quiet=True)
-    few = TrainEnsembleConfig(steps=10, members=2, workers=1, sub_goals=("open-red-door",))
-    train_ensemble(folder / "data.h5", few, folder / "ensemble", quiet=True)
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,), keyring=False), folder / "d.h5", quiet=True)
+    rule = "positives-median"
+    few = TrainEnsembleConfig(steps=10, members=2, workers=1, sub_goals=("open-red-door",), threshold=rule)
+    train_ensemble(folder / "d.h5", few, folder / "ensemble", quiet=True)
     return folder / "ensemble"
 
 
-def test_a_member_is_audited_in_its_domain(ensemble: Path, tmp_path: Path) -> None:
-    """Spec H5: its sub-goal, its domain, its threshold; the mend of the labelled positives."""
-    few = setting("steps=640", "warm_up=100")
+def test_a_member_is_audited_at_its_own_threshold(ensemble: Path, tmp_path: Path) -> None:
+    """Spec H5: in the world of its data; the states that fooled it can be kept, to label them."""
     source = open_artefact(ensemble)
-    members = read_ensemble(ensemble, source.config, "open-red-door")
-    before = float(members.thresholds[1])
-    low = ["--set", "threshold=0.001", "--set", "mend=positives-median"]
-    report, _ = audited(tmp_path / "audit", f"{ensemble}:open-red-door/1", *few, *low)
-    assert before == 0.5
-    assert report["sub_goal"] == "open-red-door" and report["domain"] == "doorkey"
+    wanted = read_ensemble(ensemble, source.config, "open-red-door").thresholds[1].item()
+    few = settings("steps=640", "warm_up=100", "random_episodes=2", "save_visited=20", "mend=0.999999")
+    words = ["--domain", "doorkey", "--sub-goal", "open-red-door", "--member", "1", *few]
+    report, _ = audited(tmp_path / "audit", str(ensemble), *words)
+    assert report["before"]["threshold"] == pytest.approx(wanted) and wanted != 0.5
     manifest = open_artefact(tmp_path / "audit", "audit").manifest
-    assert [entry["kind"] for entry in manifest["inputs"]] == ["ensemble"]
+    assert [entry["kind"] for entry in manifest["inputs"]] == ["ensemble"] and manifest["config"]["member"] == 1
     assert manifest["config"]["domain_config"] == source.config["domain_config"]
-    split = open_dataset(source.input("data")).labelled("open-red-door")
-    median = np.median(members.predict(split.observations)[split.labels, 1])
-    assert report["mended"]["threshold"] == pytest.approx(median)
+    assert manifest["config"]["domain_config"]["keyring"] is False and "visited.h5" in manifest["files"]
 
 
-def test_kinds_of_false_yes() -> None:
-    """What looks alike is one kind, unless other sub-goals hold there; the most frequent comes first."""
-    engine = Corridor(1)
-
-    def fooled(*cells: int) -> list[Execution]:
-        return [Execution(0, [2, cell], True, [cell == 0, False], False, False) for cell in cells]
-
-    assert kinds_of(engine, fooled(1, 3, 3), 0.0) == [1, 0, 0]
-    assert kinds_of(engine, fooled(1, 3, 3, 0), 1.0) == [0, 0, 0, 1]
-    assert kinds_of(engine, [], 0.1) == []
-
-
-class Wide(LongCorridor):
-    """A cell of the corridor is as wide as a place."""
-
-    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        return super().positions(ids) * CELL
-
-
-def test_kinds_are_places_where_positions_are_known() -> None:
-    """Whatever else the pictures show: states 0 and 2 are in the same cell, 1 in another."""
-    engine = Wide(1)
-    for action in (3, 2):  # right, and back
-        engine.step(np.array([action]))
-    rows = [Execution(0, [0, state], True, [False, False], False, False) for state in (1, 0, 2)]
-    assert kinds_of(engine, rows, 1.0) == [1, 0, 0]
+DOOR = "--domain doorkey --sub-goal go-to-goal"
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("{here}:left_end", "Give --domain."),
-        ("{here}:left_end --domain own_domain:DOMAIN", "which sub-goal"),
-        ("{here}:left_end --domain own_domain:DOMAIN --sub-goal fly", "does not know where this is true: fly"),
-        ("{here}:nothing --domain doorkey", "the classifier cannot be loaded"),
-        ("{here}:BLUE_FIRST --domain doorkey", "this is no classifier"),
-        ("left_end --domain doorkey", "this is no classifier"),
-        ("{here}:of_no_shape --domain doorkey --sub-goal go-to-goal", "gave float64 ("),
-        ("{here}:no_probability --domain doorkey --sub-goal go-to-goal", "Give probabilities, 0 to 1."),
-        (
-            "{here}:left_end --domain doorkey --sub-goal go-to-goal --set mend=threshold:0.4",
-            "mends no threshold",
-        ),
-        ("{here}:left_end --domain doorkey --sub-goal go-to-goal --set mend=often", "mends no threshold"),
-        ("{here}:left_end --domain doorkey --sub-goal go-to-goal --set mend=positives-median", "mends no threshold"),
-        ("{ensemble}:open-red-door/2", "has members 0 to 1"),
-        ("{ensemble}:fly/0", "unknown sub-goal: fly"),
-        ("{ensemble}/none:open-red-door/0", "no such artefact"),
+        (f"{__name__}:left_end --domain doorkey", "whose truth is to count?"),
+        (f"{__name__}:left_end --domain doorkey --sub-goal fly", "whose truth is to count?: fly"),
+        (f"{__name__}:nothing {DOOR}", "the classifier cannot be loaded"),
+        (f"{__name__}:BLUE_FIRST {DOOR}", "this is no function"),
+        (f"left_end {DOOR}", "no such artefact"),
+        (f"{__name__}:of_no_shape {DOOR}", "gave float64 ("),
+        (f"{__name__}:no_probability {DOOR}", "Give probabilities, 0 to 1."),
+        (f"{__name__}:left_end {DOOR} --set mend=0.4", "mends no threshold of 0.5"),
+        (f"{__name__}:left_end {DOOR} --set termination=oracle", "an audit is of one classifier alone"),
+        (f"{__name__}:left_end {DOOR} --set policy_view=agent-crop", "an audit is of one classifier alone"),
+        (f"{__name__}:left_end {DOOR} --set termination=dwell:2", "Give --set experience=own."),
+        (f"{__name__}:left_end --domain own_domain:DOMAIN --sub-goal left-end", "cannot begin an episode when asked"),
+        ("{ensemble} --domain doorkey --sub-goal open-red-door --member 2", "no such member: 2"),
+        ("{ensemble} --domain doorkey --sub-goal go-to-goal", "unknown sub-goal: go-to-goal"),
     ],
 )
-def test_mistakes(
-    words: str, told: str, ensemble: Path, tmp_path: Path, corridor: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes(words: str, told: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G2: one line that says what to do, exit code 2, nothing written."""
-    assert corridor
-    given = words.format(here=__name__, ensemble=ensemble).split()
-    assert main(["audit", *given, "--out", str(tmp_path / "audit"), "-q"]) == 2
+    assert main(["audit", *words.format(ensemble=ensemble).split(), "--out", str(tmp_path / "audit"), "-q"]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and told in lines[0], lines
     assert not any(tmp_path.iterdir())
