@@ -82,7 +82,10 @@ _ALL = (
     Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
     Stage(
         "audit",
-        ("audit", "{ensemble}:open-red-door/0", *_set("steps=800", "environments=8", *QUICK[:2])),
+        (
+            *("audit", "{ensemble}", "--domain", "doorkey", "--sub-goal", "open-red-door"),
+            *_set("steps=800", "environments=8", *QUICK),
+        ),
         ("ensemble",),
     ),
     Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),

@@ -19,8 +19,8 @@ from hypogoal.stages.train_ensemble import unlabelled_file
 
 TESTS = Path(__file__).parent
 FEW = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
-KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison")
-MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/")  # what settings do not say
+KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
+MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")  # what settings do not say
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             made("train-meta", run / "ensemble", "--out", run / name, *settings, *FEW)
         played = ("--set", "steps=128", "--set", "max_episode_steps=20", "-q")
         made("train-baseline", "own_domain:ODD", "--out", run / "ppo", *played)
+        where = ("--domain", "own_domain:DOMAIN", "--sub-goal", "left-end", "--set", "restart_options=false")
+        made("audit", run / "ensemble", "--out", run / "audit", *where, *FEW)
         made("evaluate", run, "-q")
         made("report", run)
         shutil.copytree(run, run.with_name("other"))

@@ -176,7 +176,7 @@ def audit(
     classifier: Annotated[str, typer.Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
     out: Out,
     domain: Annotated[str, typer.Option(help="Where it is played: doorkey, montezuma, or module:object.")],
-    sub_goal: Annotated[str, typer.Option(help="Of the domain, whose truth counts.")] = "",
+    sub_goal: Annotated[str, typer.Option(help="Of the domain: whose truth counts.")],
     member: Annotated[int, typer.Option(min=0, help="Of the ensemble.")] = 0,
     layout_seed: LayoutSeed = None,
     preset: Preset = None,

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine, step_of
+from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.pictures import episode_gif
+from hypogoal.evaluation.selection import states_met
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import member_scores
 from hypogoal.hypotheses.thresholds import log_odds_of
@@ -45,11 +46,10 @@ def own_classifier(name: str) -> Classifier:
         told = []
         for some in np.split(ids, range(CHUNK, len(ids), CHUNK)):
             with own_code.UsersCode(f"the classifier {name}", function) as code:
-                given = np.asarray(function(engine.images(some)))
-                if given.shape != some.shape or given.dtype.kind not in "biuf":
-                    code.refuse(f"gave {given.dtype} {given.shape}", f"Give probabilities, float ({len(some)},).")
-                if not ((given >= 0) & (given <= 1)).all():
-                    code.refuse(f"gave numbers from {given.min()} to {given.max()}", "Give probabilities, 0 to 1.")
+                given = np.asarray(function(engine.images(some)), dtype=np.float64)
+                if given.shape != some.shape or not ((given >= 0) & (given <= 1)).all():
+                    gave = f"gave {given.shape}, {given.min():g} to {given.max():g}" if given.size else "gave nothing"
+                    code.refuse(gave, f"Give probabilities, 0 to 1, float ({len(some)},).")
             told.append(log_odds_of(given))
         return np.concatenate(told)
 
@@ -71,10 +71,8 @@ def member_of(ensemble: Ensemble, member: int) -> Classifier:
 def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict[str, Any]:
     """The classifier's scores, of sub-goal number ``column``, on the states that random actions lead to, each once."""
     engine = loop.engine
-    met = [engine.reset()]
-    for _ in range(-(-RANDOM_STEPS // engine.count)):
-        met.append(step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids)
-    ids = np.unique(np.concatenate(met))
+    engine.reset()
+    ids = states_met(engine, RANDOM_STEPS, rng)
     ids = ids[engine.remembers(ids)]
     truth, says_yes = engine.labels(ids)[:, column], loop.terminations.of(ids)[:, :1]
     scores = {name: score.item() for name, score in member_scores(says_yes, truth).items()}

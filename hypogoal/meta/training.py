@@ -55,7 +55,7 @@ def assemble(
     not the true sub-goals at which options are to end, it is a ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
-    columns = _columns(domain, sub_goals) if oracle else []
+    columns = columns_of(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
     arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
@@ -114,7 +114,7 @@ def nearness(
     sub_goals = about["sub_goals"]
     if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
         return None
-    columns = np.repeat(_columns(domain, sub_goals), about["members"])
+    columns = np.repeat(columns_of(domain, sub_goals), about["members"])
 
     def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
         with UsersCode("the engine's labels", engine, "labels"):
@@ -146,15 +146,12 @@ def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
         raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
 
 
-def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
-    """Where among the domain's own these sub-goals are."""
+def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
+    """Where among the domain's own these sub-goals are; a ``UserError`` that says ``do`` where one is not."""
     for sub_goal in sub_goals:
         if sub_goal not in domain.sub_goals:
-            raise UserError(
-                f"{domain.name} does not know where {sub_goal!r} is true",
-                "termination=oracle",
-                f"It knows of {', '.join(domain.sub_goals)}; leave the setting out for members' verdicts.",
-            )
+            what, known = f"{domain.name} does not know where this is true", ", ".join(domain.sub_goals)
+            raise UserError(what, sub_goal, f"It knows of {known}. {do}")
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 

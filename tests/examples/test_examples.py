@@ -95,10 +95,10 @@ def test_the_audits_page_audits_its_classifier(tmp_path: Path) -> None:
     page = EXAMPLES.parent / "docs" / "audit.md"
     words = commands(page)[0]
     out = tmp_path / "audit"
-    quick = settings("network=planned", "steps=160", "executions=10")
+    quick = settings("network=planned", "steps=320")
     assert main([*words[1 : words.index("--out")], "--out", str(out), *quick]) == 0
     report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
-    assert (report["before"]["exploit_rate"], report["mended"]["exploit_rate"]) == (1.0, 0.0)
+    assert (report["before"]["fires_far"], report["mended"]["fires_far"]) == (1.0, 0.0)
     assert [kind["holds"] for kind in report["before"]["kinds"]] == [[]]
     film = page.with_name("audit.gif")
     assert film.stat().st_size < 300_000

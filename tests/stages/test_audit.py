@@ -1,4 +1,4 @@
-"""Spec H5: policies are trained against a success classifier; what they are fooled by is told, and what a mend changes."""
+"""Spec H5: policies are trained against a success classifier: what they are fooled by, and what a mend changes."""
 
 from __future__ import annotations
 
@@ -219,13 +219,12 @@ DOOR = "--domain doorkey --sub-goal go-to-goal"
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (f"{__name__}:left_end --domain doorkey", "whose truth is to count?"),
-        (f"{__name__}:left_end --domain doorkey --sub-goal fly", "whose truth is to count?: fly"),
+        (f"{__name__}:left_end --domain doorkey --sub-goal fly", "does not know where this is true: fly"),
         (f"{__name__}:nothing {DOOR}", "the classifier cannot be loaded"),
         (f"{__name__}:BLUE_FIRST {DOOR}", "this is no function"),
         (f"left_end {DOOR}", "no such artefact"),
-        (f"{__name__}:of_no_shape {DOOR}", "gave float64 ("),
-        (f"{__name__}:no_probability {DOOR}", "Give probabilities, 0 to 1."),
+        (f"{__name__}:of_no_shape {DOOR}", "gave ("),
+        (f"{__name__}:no_probability {DOOR}", "Give probabilities, 0 to 1,"),
         (f"{__name__}:left_end {DOOR} --set mend=0.4", "mends no threshold of 0.5"),
         (f"{__name__}:left_end {DOOR} --set termination=oracle", "an audit is of one classifier alone"),
         (f"{__name__}:left_end {DOOR} --set policy_view=agent-crop", "an audit is of one classifier alone"),
