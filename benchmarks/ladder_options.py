@@ -63,9 +63,8 @@ METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of t
 ENSEMBLES = {CARRIED: "holds-dbat", "no-patience": "holds-dbat", "oracle": "dbat"}  # of another method
 MEMBERS, STEPS = 3, 40_000
 FEWEST = 8  # ladders of which a mean is shown
-# The paper's Figure 4 has twelve, the last three among them.
+# The paper's Figure 4 has twelve; the tops of the last three are bases themselves.
 LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13", "4-10", "11-19", "13-21")
-TOP_IS_BASE = ("4-10", "11-19", "13-21")
 RUN_ON = ("0-4", "5-11", "7-13")  # their bases are tops of the next ladder
 KEYS = ("groups", "method", "seed", "ladder", "step", "member")
 NUMBERS = ("distance", "reached_base", "inside_at_start", "timed_out", "died", "duration")
@@ -203,9 +202,12 @@ def tables_that_hold(path: Path) -> Iterator[str]:
             for ladder in _ladders(found, "holds-dbat")
         ),
     )
+    inside = read(path, 1, "inside_at_start")
+    # Where the true sub-goal itself is counted as missed: most of its executions begin inside.
+    missed = [ladder for ladder in LADDERS if np.mean([*inside.get(("oracle", ladder), {}).values()] or 0) > 0.5]
     groups = {
         "nine whose base does not run on": [ladder for ladder in LADDERS if ladder not in RUN_ON],
-        "of these six whose top is no base": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *TOP_IS_BASE)],
+        f"of these without {' and '.join(missed)}": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *missed)],
         "three whose base runs on": list(RUN_ON),
     }
     yield "Mean member, mean over ladders; Student's 95 % interval over the seeds that have all of these ladders."

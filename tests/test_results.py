@@ -1,5 +1,6 @@
 """Published tables are drawn from the committed cells (Spec F5)."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -31,6 +32,30 @@ def test_tables_are_those_of_the_cells(name: str) -> None:
     drawn = [line for line in PAGES[name](cells) if line.startswith("|")] if cells.exists() else []
     page = (RESULTS / f"{name}.md").read_text(encoding="utf-8")
     assert drawn == [line for line in page.splitlines() if line.startswith("|")]
+
+
+def test_no_page_has_a_table_without_cells() -> None:
+    """What nothing redraws is told in sentences."""
+    with_tables = {page.stem for page in RESULTS.glob("*.md") if "\n|" in page.read_text(encoding="utf-8")}
+    assert with_tables == PAGES.keys()
+
+
+def test_tables_of_the_readme_have_the_numbers_of_the_pages() -> None:
+    """Every decimal in a table of the README's results stands in a table of a page that its section links."""
+    readme = (RESULTS.parents[1] / "README.md").read_text(encoding="utf-8")
+    sections = readme.partition("## Results")[2].partition("## What is in it")[0].split("\n### ")[2:]  # not the claims
+    tables = 0
+    for section in sections:
+        pages = {name for name in PAGES if f"results/{name}.md" in section}
+        known = {number for name in pages for number in _numbers((RESULTS / f"{name}.md").read_text(encoding="utf-8"))}
+        tables += bool(said := _numbers(section))
+        assert said <= known, section.partition("\n")[0]
+    assert tables >= 4
+
+
+def _numbers(text: str) -> set[str]:
+    lines = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    return {number.lstrip("0") for number in re.findall(r"\d*\.\d+", lines)}
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
