@@ -247,14 +247,8 @@ def student_interval(values: NDArray[np.float64]) -> tuple[float, float]:
 def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, str]:
     """Spec F5: a 95 % interval: of few values Student's, of the mean; of 8 or more a bootstrap, of the middle half's.
 
-    A percentile bootstrap of few values is too narrow: of two it would hold in every second case.
-
-    Args:
-        values: float (n,), independent of each other.
-        rng: draws the resamples.
-
-    Returns:
-        Lower and upper bound, NaN for fewer than two values, and its kind.
+    A percentile bootstrap of few values is too narrow: of two it would hold in every second case. Of values (n,),
+    independent of each other, the lower and the upper bound, NaN for fewer than two, and its kind.
     """
     if len(values) < BOOTSTRAP_FROM:
         return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
@@ -272,16 +266,10 @@ def over(
 ) -> dict[str, Any]:
     """Spec F5: everything said of a number over runs, of which those of one layout count once, by their mean.
 
-    Args:
-        values: one per run. Runs whose number is NaN are left out and ``n`` says so.
-        unit: theirs.
-        cell: names of this number among all; they seed the resamples.
-        layouts: a mark per run, see :func:`by_layout`.
-        deviation: with the standard deviation (n - 1), the bands of Figures 3 and 4.
-
-    Returns:
-        mean, standard_error, iqm, interval (95 %, see :func:`interval`), interval_over (of what, and its kind), n
-        (runs), unit.
+    There is a value per run; those that are NaN are left out. ``cell`` names this number among all, which seeds the
+    resamples; ``layouts`` are a mark per run, see :func:`by_layout`. Gives mean, standard_error, iqm, interval (95 %,
+    see :func:`interval`), interval_over (of what, and its kind), n (runs with a value), unit, and with ``deviation``
+    the standard deviation (n - 1), the bands of Figures 3 and 4.
     """
     defined = [index for index, value in enumerate(values) if not np.isnan(value)]
     numbers, of = by_layout([values[index] for index in defined], [layouts[index] for index in defined if layouts])

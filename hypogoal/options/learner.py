@@ -28,26 +28,17 @@ COUNTERS = ("option_steps", "steps_since_positive")
 
 @dataclass(frozen=True)
 class Transitions:
-    """One step of every environment, arrays (E,): what intra-option policies learn from.
-
-    Attributes:
-        ids, actions, next_ids, rewards: the step.
-        options: the options that were running.
-        terminated: the task is over.
-        timed_out: the option's time was up without reaching its sub-goal.
-        reached: it reached its sub-goal.
-        ended: the option stopped here for whatever reason.
-    """
+    """One step of every environment, arrays (E,): what intra-option policies learn from."""
 
     ids: NDArray[np.int64]
     actions: NDArray[np.int64]
     next_ids: NDArray[np.int64]
     rewards: NDArray[np.float32]
-    options: NDArray[np.int64]
-    terminated: NDArray[np.bool_]
-    timed_out: NDArray[np.bool_]
-    reached: NDArray[np.bool_]
-    ended: NDArray[np.bool_]
+    options: NDArray[np.int64]  # that were running
+    terminated: NDArray[np.bool_]  # the task is over
+    timed_out: NDArray[np.bool_]  # the option's time was up without reaching its sub-goal
+    reached: NDArray[np.bool_]  # it reached its sub-goal
+    ended: NDArray[np.bool_]  # the option stopped here for whatever reason
 
 
 class Learner(Resumable, ABC):

@@ -21,27 +21,16 @@ CHOICE_COLUMNS = ("step", "option", "offered", "chosen", "expected", "reached", 
 
 
 class Execution(NamedTuple):
-    """One option from its beginning to its end.
+    """One option from its beginning to its end."""
 
-    Attributes:
-        step: when it ended.
-        option: g*K + k.
-        duration: its steps.
-        reached: its own classifier ended it.
-        inside_at_start: its own classifier said yes where it began.
-        terminated: it ended in a terminal state of the episode.
-        states: the ids of those that it came to, the last one that it ended in.
-        began: the id of the one before them.
-    """
-
-    step: int
-    option: int
-    duration: int
-    reached: bool
-    inside_at_start: bool
-    terminated: bool
-    states: list[int]
-    began: int = -1  # of a checkpoint from before it was kept
+    step: int  # when it ended
+    option: int  # g*K + k
+    duration: int  # its steps
+    reached: bool  # its own classifier ended it
+    inside_at_start: bool  # its own classifier said yes where it began
+    terminated: bool  # it ended in a terminal state of the episode
+    states: list[int]  # the ids of those that it came to, the last one that it ended in
+    began: int = -1  # the id of the one before them; -1 of a checkpoint from before it was kept
 
 
 EXECUTION_COLUMNS = (*Execution._fields[:-2], "room", "x", "y", "distance")
