@@ -90,7 +90,7 @@ def test_every_file_that_is_gone_is_named(copy: Path) -> None:
             (copy / "aside").rename(artefact.path / name)
             (artefact.path / MANIFEST).write_bytes(before)
             count += 1
-    assert count == 26 and faults_of(copy) == []
+    assert count == 34 and faults_of(copy) == []
     (copy / "ensemble" / "left-end.safetensors").unlink()
     reseal(copy / "ensemble", files={})
     with pytest.raises(UserError, match=r"the artefact is damaged \(left-end\.safetensors: missing"):
@@ -194,7 +194,7 @@ def test_verify_looks_inside_the_folder_only(run: Path, copy: Path, capsys: pyte
     ]
     shutil.rmtree(copy / "ensemble")
     gone = [fault for fault in faults_of(copy) if f"its input {run}/ensemble (ensemble) is gone" in fault]
-    assert len(gone) == 6  # options and metas, and the evaluation
+    assert len(gone) == 7  # options, metas, the audit, and the evaluation
     assert open_artefact(copy / "meta").input("ensemble") == run / "ensemble"  # to a stage it is not
     assert main(["verify", str(copy / "meta"), "--json"]) == 0
     about = json.loads(capsys.readouterr().out)
