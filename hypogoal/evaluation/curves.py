@@ -95,7 +95,8 @@ class Run:
     @property
     def budget(self) -> int:
         """Environment steps, those of earlier stages included."""
-        return int(self.config["steps"]) + int(self.config.get("options_steps", 0))
+        of = self.config.get  # practice may have ended before its limit
+        return int(of("ended_at", of("steps"))) + int(of("options_ended_at", of("options_steps", 0)))
 
 
 def read_run(artefact: Artefact, path: str) -> Run:
