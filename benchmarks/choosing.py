@@ -65,7 +65,7 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
     rows = [row for artefact in find_artefacts(run, "meta") for row in _played(artefact)]
     if baselines:
         rows += [row for row in _numbers(baselines) if row["seed"] and not row["step"] and row["quantity"] in OF_PLAY]
-    kept = []
+    kept: list[tuple[str, ...]] = []
     for row in rows:
         method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
         chooser = "uniform" if row["method"] == UNIFORM else "agent"
