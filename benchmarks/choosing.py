@@ -121,7 +121,7 @@ def _numbers(run: Path) -> list[dict[str, str]]:
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
     rows = _read(path)
-    layouts = list(dict.fromkeys(row["layout"] for row in rows))
+    layouts = sorted({row["layout"] for row in rows}, key=int)
     there = {(row["method"], row["policy"]) for row in rows}
     both = set(POLICIES) <= {policy for _, policy in there}
     agents = {
@@ -145,11 +145,11 @@ def tables(path: Path) -> Iterator[str]:
 
     def shares(agent: tuple[str, str]) -> Iterator[str]:
         for solved, chance in zip(of(agent, "agent", "success"), of(agent, "uniform", "success"), strict=True):
-            yield f"{solved:.2f} / {chance:.2f}"
+            yield "-" if np.isnan(solved) else f"{solved:.2f} / {chance:.2f}"
 
     def practice(agent: tuple[str, str]) -> Iterator[str]:
         for steps, solved in zip(of(agent, "agent", PRACTICE), of(agent, "agent", PRACTISED), strict=True):
-            yield f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
+            yield "-" if np.isnan(steps) else f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
 
     yield f"Mean over {len(layouts)} layouts and Student's 95 % interval; of choices, where they are defined."
     yield ""

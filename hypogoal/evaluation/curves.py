@@ -95,8 +95,9 @@ class Run:
     @property
     def budget(self) -> int:
         """Environment steps, those of earlier stages included."""
-        of = self.config.get  # practice may have ended before its limit
-        return int(of("ended_at", of("steps"))) + int(of("options_ended_at", of("options_steps", 0)))
+        about = self.config  # practice may have ended before its limit
+        own = about["ended_at" if "ended_at" in about else "steps"]
+        return int(own) + int(about.get("options_ended_at", about.get("options_steps", 0)))
 
 
 def read_run(artefact: Artefact, path: str) -> Run:
