@@ -95,7 +95,9 @@ class Run:
     @property
     def budget(self) -> int:
         """Environment steps, those of earlier stages included."""
-        return int(self.config["steps"]) + int(self.config.get("options_steps", 0))
+        about = self.config  # practice may have ended before its limit
+        own = about["ended_at" if "ended_at" in about else "steps"]
+        return int(own) + int(about.get("options_ended_at", about.get("options_steps", 0)))
 
 
 def read_run(artefact: Artefact, path: str) -> Run:

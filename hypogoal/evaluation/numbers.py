@@ -33,6 +33,7 @@ NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
         *("world", "members"),  # which the domain's settings and the ensemble's name say
+        *("ended_at", "until_reached", "options_ended_at"),  # which came out
     }
 )
 # Settings of ensembles without effect.
