@@ -18,42 +18,25 @@ REPLAY = 1_000  # nothing is learned: a small one
 
 @dataclass(frozen=True)
 class Frame:
-    """One state of an episode.
+    """One state of an episode."""
 
-    Attributes:
-        observation: uint8 (H, W, C).
-        step: of the episode.
-        option: that runs in this state, or ended in it.
-        says_yes: its own classifier's verdict on the state.
-        left: steps until its timeout.
-        ended: why it ended in this state; empty where it goes on.
-    """
-
-    observation: NDArray[np.uint8]
-    step: int
-    option: int
-    says_yes: bool
-    left: int
-    ended: str
+    observation: NDArray[np.uint8]  # (H, W, C)
+    step: int  # of the episode
+    option: int  # that runs in this state, or ended in it
+    says_yes: bool  # its own classifier's verdict on the state
+    left: int  # steps until its timeout
+    ended: str  # why it ended in this state; empty where it goes on
 
 
 @dataclass(frozen=True)
 class Episode:
-    """T steps.
+    """T steps."""
 
-    Attributes:
-        observations: uint8 (T + 1, *obs), the last one that of the state it ended in.
-        actions: int64 (T,), primitive ones.
-        options: int64 (T,), which option ran.
-        rewards: float32 (T,).
-        terminated: the task was over; otherwise the episode was cut.
-    """
-
-    observations: NDArray[np.uint8]
-    actions: NDArray[np.int64]
-    options: NDArray[np.int64]
-    rewards: NDArray[np.float32]
-    terminated: bool
+    observations: NDArray[np.uint8]  # (T + 1, *obs), the last one that of the state it ended in
+    actions: NDArray[np.int64]  # (T,), primitive ones
+    options: NDArray[np.int64]  # (T,), which option ran
+    rewards: NDArray[np.float32]  # (T,)
+    terminated: bool  # the task was over; otherwise the episode was cut
 
 
 def agent_of(artefact: Artefact, seed: int, environments: int = 1) -> OptionLoop:

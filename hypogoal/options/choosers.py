@@ -18,33 +18,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Finished option executions, arrays of length n.
+    """Finished option executions, arrays of length n."""
 
-    Attributes:
-        environments: which environments they ran in.
-        options: which options they were of.
-        reached: the options' own classifiers ended them.
-        inside: these said yes already where they began.
-        counted: they began where the domain says that they should (Spec D4).
-        returns: the environment's rewards inside the option, discounted from its start.
-        durations: tau, the options' steps.
-        discounts: gamma ** tau, for the state reached.
-        next_ids: the states reached.
-        terminated: the task is over, nothing follows.
-        truncated: the episode was cut, at its step limit or because the next option begins at a start state.
-    """
-
-    environments: NDArray[np.int64]
-    options: NDArray[np.int64]
-    reached: NDArray[np.bool_]
-    inside: NDArray[np.bool_]
-    counted: NDArray[np.bool_]
-    returns: NDArray[np.float64]
-    durations: NDArray[np.int64]
-    discounts: NDArray[np.float64]
-    next_ids: NDArray[np.int64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
+    environments: NDArray[np.int64]  # in which they ran
+    options: NDArray[np.int64]  # that they were of
+    reached: NDArray[np.bool_]  # the options' own classifiers ended them
+    inside: NDArray[np.bool_]  # these said yes already where they began
+    counted: NDArray[np.bool_]  # they began where the domain says that they should (Spec D4)
+    returns: NDArray[np.float64]  # the environment's rewards inside the option, discounted from its start
+    durations: NDArray[np.int64]  # tau, the options' steps
+    discounts: NDArray[np.float64]  # gamma ** tau, for the state reached
+    next_ids: NDArray[np.int64]  # the states reached
+    terminated: NDArray[np.bool_]  # the task is over, nothing follows
+    truncated: NDArray[np.bool_]  # the episode was cut, at its limit or because the next option begins at a start
 
 
 class Chooser(Resumable, ABC):

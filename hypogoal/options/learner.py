@@ -18,7 +18,7 @@ from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
 from hypogoal.options.termination import Terminations
 from hypogoal.options.windows import AgentWindows
@@ -28,38 +28,21 @@ COUNTERS = ("option_steps", "steps_since_positive")
 
 @dataclass(frozen=True)
 class Transitions:
-    """One step of every environment, arrays (E,): what intra-option policies learn from.
-
-    Attributes:
-        ids, actions, next_ids, rewards: the step.
-        options: the options that were running.
-        terminated: the task is over.
-        timed_out: the option's time was up without reaching its sub-goal.
-        reached: it reached its sub-goal.
-        ended: the option stopped here for whatever reason.
-    """
+    """One step of every environment, arrays (E,): what intra-option policies learn from."""
 
     ids: NDArray[np.int64]
     actions: NDArray[np.int64]
     next_ids: NDArray[np.int64]
     rewards: NDArray[np.float32]
-    options: NDArray[np.int64]
-    terminated: NDArray[np.bool_]
-    timed_out: NDArray[np.bool_]
-    reached: NDArray[np.bool_]
-    ended: NDArray[np.bool_]
+    options: NDArray[np.int64]  # that were running
+    terminated: NDArray[np.bool_]  # the task is over
+    timed_out: NDArray[np.bool_]  # the option's time was up without reaching its sub-goal
+    reached: NDArray[np.bool_]  # it reached its sub-goal
+    ended: NDArray[np.bool_]  # the option stopped here for whatever reason
 
 
 class Learner(Resumable, ABC):
-    """The intra-option policies of all O options.
-
-    Args:
-        engine: gives observations of state ids.
-        terminations: whether each option's sub-goal holds in a state.
-        config: see :class:`OptionConfig`.
-        seed: of weights, exploration and sampling.
-        device: where the networks are.
-        windows: what the policies see of states; all of it where None.
+    """The intra-option policies of all O options; ``windows``: what they see of states, all of it where None.
 
     Attributes:
         actions: the engine's actions that the policies choose among, int64 (A,).
@@ -164,7 +147,9 @@ class Learner(Resumable, ABC):
         """Continue from the weights and counters of an artefact; replays start empty. What does not fit is a
         ``UserError``.
         """
-        check_actions(state, self.actions, self.config.actions)
+        if not np.array_equal(actions_of(state, len(self.actions)), self.actions):
+            where = f"actions={self.config.actions}"
+            raise UserError("these options were trained with other actions", where, "Give the same --set.")
         self.load_weights(state)
         for name in COUNTERS:
             saved = state.get(name)

@@ -21,25 +21,15 @@ CHOICE_COLUMNS = ("step", "option", "offered", "chosen", "expected", "reached", 
 
 
 class Execution(NamedTuple):
-    """One option from its beginning to its end.
+    """One option from its beginning to its end."""
 
-    Attributes:
-        step: when it ended.
-        option: g*K + k.
-        duration: its steps.
-        reached: its own classifier ended it.
-        inside_at_start: its own classifier said yes where it began.
-        terminated: it ended in a terminal state of the episode.
-        states: the ids of those that it came to, the last one that it ended in.
-    """
-
-    step: int
-    option: int
-    duration: int
-    reached: bool
-    inside_at_start: bool
-    terminated: bool
-    states: list[int]
+    step: int  # when it ended
+    option: int  # g*K + k
+    duration: int  # its steps
+    reached: bool  # its own classifier ended it
+    inside_at_start: bool  # its own classifier said yes where it began
+    terminated: bool  # it ended in a terminal state of the episode
+    states: list[int]  # the ids of those that it came to, the last one that it ended in
 
 
 EXECUTION_COLUMNS = (*Execution._fields[:-1], "room", "x", "y", "distance")
@@ -47,12 +37,9 @@ EXPLOIT_COLUMNS = ("step", "option", "reached", "near", "best_near", "best_far")
 
 
 class Recorder(Resumable):
-    """Counts choices per window of steps, lists episodes, keeps the last executions and stops of each option.
+    """Counts choices per ``window`` of steps, lists episodes, keeps the last executions and stops of each of O options.
 
-    Args:
-        options: the number of options, O.
-        engine: where they are played; of one that forgets states, stops are kept as pictures.
-        window: steps per row of ``choices.csv``.
+    Of an engine that forgets states, stops are kept as pictures.
     """
 
     CHANGING = ("episodes", "choices", "stops", "executions", "_pictures", "_states", "_window", "_window_start")
