@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t
 
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
+from hypogoal.evaluation.numbers import student_interval
 
 Row = dict[str, Any]
 Cell = tuple[str, ...]
@@ -63,8 +63,8 @@ def interval(values: NDArray[np.float64], digits: int = 3) -> str:
     """A mean with Student's 95 % interval over seeds."""
     if len(values) < 2:
         return f"{values.mean():.{digits}f}" if len(values) else "-"
-    half = t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    return f"{values.mean():.{digits}f} [{values.mean() - half:.{digits}f}, {values.mean() + half:.{digits}f}]"
+    low, high = student_interval(values)
+    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

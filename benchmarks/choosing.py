@@ -1,6 +1,6 @@
 """What choosing is worth, played by the agents of a sweep: the rows behind the result, and its tables.
 
-hypogoal sweep examples/choosing.toml --out runs/choosing
+hypogoal run doorkey --preset choosing --out runs/choosing
 python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run which-feature --out runs/which-feature
 python -m benchmarks.choosing runs/which-feature docs/results/which-feature-rooms.csv
@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import interval, table
-from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.choosing import ENVIRONMENTS, OF_CHOICE, OF_PLAY, UNIFORM, judge, play, qualities
@@ -42,7 +43,10 @@ METHODS = {  # by what the names of artefacts have in them, the longest first
     "dqn": "DQN on primitive actions",
 }
 BASELINES = ("ppo", "dqn")
-COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
+PLANNED = "planned"
+POLICIES = {"learned": "learned options", PLANNED: "planned options"}  # baselines have none
+PRACTICE, PRACTISED = "practice", "practised"  # steps in the plain world, and whether chance solved it by then
+COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
 SHOWN = {
     "success": "solved",
     "near": "within 1.5 shortest paths",
@@ -55,31 +59,37 @@ SHOWN = {
 def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
     """Play every agent of a run, frozen, as the evaluation does, and chance with its options: a row per number.
 
-    Of evaluated baselines it takes the last training episodes.
+    Of evaluated baselines it takes the last training episodes. Rows that are there of methods and policies that the run
+    has not stay.
     """
-    rows = [row for path in sorted((run / "agent").iterdir()) for row in _played(path)]
+    rows = [row for artefact in find_artefacts(run, "meta") for row in _played(artefact)]
     if baselines:
         rows += [row for row in _numbers(baselines) if row["seed"] and not row["step"] and row["quantity"] in OF_PLAY]
-    kept = []
+    kept: list[tuple[str, ...]] = []
     for row in rows:
         method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
         chooser = "uniform" if row["method"] == UNIFORM else "agent"
         value = f"{float(row['value']):.4f}"
-        kept.append((method, row["layout"], row["seed"], chooser, row["quantity"], value))
-    order = {name: place for place, name in enumerate((*METHODS, "agent", "uniform", *OF_PLAY, *OF_CHOICE))}
-    kept.sort(key=lambda row: (order[row[0]], int(row[1]), order[row[3]], order[row[4]]))
+        kept.append((method, row.get("policy", ""), row["layout"], row["seed"], chooser, row["quantity"], value))
+    made = {row[:2] for row in kept}
+    before = [tuple(row[column] for column in COLUMNS) for row in _read(path)] if path.exists() else []
+    kept += [row for row in before if row[:2] not in made]
+    known = (*METHODS, *POLICIES, "agent", "uniform", *OF_PLAY, *OF_CHOICE, PRACTICE, PRACTISED)
+    order = {name: place for place, name in enumerate(("", *known))}
+    kept.sort(key=lambda row: (order[row[0]], order[row[1]], int(row[2]), order[row[4]], order[row[5]]))
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows(kept)
 
 
-def _played(path: Path) -> list[dict[str, str]]:
-    artefact = open_artefact(path, "meta")
+def _played(artefact: Artefact) -> list[dict[str, str]]:
     config, seed = artefact.config, artefact.manifest["seed"]
     loop = agent_of(artefact, seed, ENVIRONMENTS)
     columns = load_domain(config["domain"]).sub_goals
     goals = np.repeat([columns.index(goal) for goal in config["sub_goals"]], config["members"])
+    policy = PLANNED if config["network"] == PLANNED else "learned"
+    about = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
     rows, quality = [], np.empty(0)
     for method in (LEARNED, UNIFORM):
         if method == UNIFORM:
@@ -87,10 +97,20 @@ def _played(path: Path) -> list[dict[str, str]]:
         played, choices = play(loop)
         quality = qualities(loop, goals, choices.states) if method == LEARNED else quality
         numbers = played | judge(choices, quality, config["members"])
-        place = {"method": method, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": path.name}
         known = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
-        rows += [place | {"quantity": name, "value": str(numbers[name])} for name in known]
+        rows += [about | {"method": method, "quantity": name, "value": str(numbers[name])} for name in known]
+    if "options_ended_at" in config:
+        options = open_artefact(artefact.input("options"), "options").config
+        came = {PRACTICE: options["ended_at"], PRACTISED: int(options["until_reached"])}
+        rows += [about | {"method": LEARNED, "quantity": name, "value": str(value)} for name, value in came.items()]
     return rows
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    """The rows; in files from before there was a policy all options are planned."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [{"policy": "" if row["method"] in BASELINES else PLANNED, **row} for row in rows]
 
 
 def _numbers(run: Path) -> list[dict[str, str]]:
@@ -100,18 +120,36 @@ def _numbers(run: Path) -> list[dict[str, str]]:
 
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    layouts = list(dict.fromkeys(row["layout"] for row in rows))
-    methods = {name: title for name, title in METHODS.items() if any(row["method"] == name for row in rows)}
+    rows = _read(path)
+    layouts = sorted({row["layout"] for row in rows}, key=int)
+    there = {(row["method"], row["policy"]) for row in rows}
+    both = set(POLICIES) <= {policy for _, policy in there}
+    agents = {
+        (method, policy): f"{title}, {POLICIES[policy]}" if both and policy else title
+        for (method, title), policy in product(METHODS.items(), ("", *POLICIES))
+        if (method, policy) in there
+    }
+    optioned = [agent for agent in agents if agent[0] not in BASELINES]
 
-    def of(method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
+    def of(agent: tuple[str, str], chooser: str, quantity: str) -> NDArray[np.float64]:
         found = {
             row["layout"]: float(row["value"])
             for row in rows
-            if (row["method"], row["chooser"], row["quantity"]) == (method, chooser, quantity)
+            if (row["method"], row["policy"], row["chooser"], row["quantity"]) == (*agent, chooser, quantity)
         }
         return np.array([found.get(layout, np.nan) for layout in layouts])
+
+    def by_layout(cells: Callable[[tuple[str, str]], Iterator[str]], shown: list[tuple[str, str]]) -> Iterator[str]:
+        yield ""
+        yield from table(["", *layouts], ([agents[agent], *cells(agent)] for agent in shown))
+
+    def shares(agent: tuple[str, str]) -> Iterator[str]:
+        for solved, chance in zip(of(agent, "agent", "success"), of(agent, "uniform", "success"), strict=True):
+            yield "-" if np.isnan(solved) else f"{solved:.2f} / {chance:.2f}"
+
+    def practice(agent: tuple[str, str]) -> Iterator[str]:
+        for steps, solved in zip(of(agent, "agent", PRACTICE), of(agent, "agent", PRACTISED), strict=True):
+            yield "-" if np.isnan(steps) else f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
 
     yield f"Mean over {len(layouts)} layouts and Student's 95 % interval; of choices, where they are defined."
     yield ""
@@ -121,31 +159,18 @@ def tables(path: Path) -> Iterator[str]:
             [
                 title,
                 "agent" if chooser == "agent" else UNIFORM,
-                *(_mean(of(method, chooser, quantity)) for quantity in SHOWN),
-                *(f"{(of(method, chooser, 'success') >= least).sum()} of {len(layouts)}" for least in (0.95, 0.9)),
+                *(_mean(of(agent, chooser, quantity)) for quantity in SHOWN),
+                *(f"{(of(agent, chooser, 'success') >= least).sum()} of {len(layouts)}" for least in (0.95, 0.9)),
             ]
-            for method, title in methods.items()
-            for chooser in (("agent",) if method in BASELINES else ("agent", "uniform"))
+            for agent, title in agents.items()
+            for chooser in (("agent", "uniform") if agent in optioned else ("agent",))
         ),
     )
     yield "Share of episodes solved, layout by layout: the agent / chance among its own options."
-    yield ""
-    yield from table(
-        ["", *layouts],
-        (
-            [
-                title,
-                *(
-                    f"{agent:.2f} / {chance:.2f}"
-                    for agent, chance in zip(
-                        of(method, "agent", "success"), of(method, "uniform", "success"), strict=True
-                    )
-                ),
-            ]
-            for method, title in methods.items()
-            if method not in BASELINES
-        ),
-    )
+    yield from by_layout(shares, optioned)
+    if practised := [agent for agent in optioned if not np.isnan(of(agent, "agent", PRACTICE)).all()]:
+        yield "Practice, in thousands of steps: until chance solved 95 of the last 100 episodes, or to its limit."
+        yield from by_layout(practice, practised)
 
 
 def rooms(path: Path) -> Iterator[str]:

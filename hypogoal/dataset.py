@@ -252,10 +252,8 @@ class Dataset:
 
     @staticmethod
     def _found(file: Any, name: str) -> Any:
-        found = hdf5.find(file, name)
-        if found is None:
-            raise hdf5.Foreign(f"no readable {name!r}")
-        hdf5.check_dataset(found, "u")
+        hdf5.size_of(file, name, "u")
+        found = file[name]
         if not found.shape:
             raise hdf5.Foreign(f"{name!r} is a single number")
         return found

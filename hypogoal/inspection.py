@@ -17,7 +17,7 @@ from rich.table import Table
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_text
-from hypogoal.core.hdf5 import Foreign, open_hdf5, read_array, walk
+from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
@@ -236,11 +236,8 @@ def _read_lines(path: Path) -> None:
 
 def _read_arrays(path: Path) -> None:
     with open_hdf5(path, "the file of arrays", AGAIN) as file:
-        try:
-            for name in walk(file):
-                read_array(file, name, "uibfS")
-        except Foreign as error:
-            raise UserError(f"the file of arrays is damaged ({error})", path, AGAIN) from None
+        for name in walk(file):
+            read_array(file, name, "uibfS")
 
 
 CONTENTS: dict[str, Callable[[Path], object]] = {

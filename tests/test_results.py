@@ -58,6 +58,23 @@ def _numbers(text: str) -> set[str]:
     return {number.lstrip("0") for number in re.findall(r"\d*\.\d+", lines)}
 
 
+def test_learned_options_stand_beside_planned_ones(tmp_path: Path) -> None:
+    """Rows of both, and how long the learned ones were practised; of planned ones alone nobody says so."""
+    rows = ["method,policy,layout,seed,chooser,quantity,value", "ppo,,1,0,agent,success,0"]
+    for policy, solved in (("planned", 1), ("learned", 0.5)):
+        rows += [f"dbat,{policy},{layout},0,agent,success,{solved}" for layout in (1, 2)]
+        rows += [f"dbat,{policy},{layout},0,uniform,success,0.25" for layout in (1, 2)]
+    for layout, steps, until in ((1, 120016, 1), (2, 400000, 0)):
+        rows += [f"dbat,learned,{layout},0,agent,practice,{steps}", f"dbat,learned,{layout},0,agent,practised,{until}"]
+    (tmp_path / "both.csv").write_text("\n".join(rows) + "\n")
+    lines = list(choosing.tables(tmp_path / "both.csv"))
+    assert "| D-BAT, K = 6, learned options | 0.50 / 0.25 | 0.50 / 0.25 |" in lines
+    assert "| D-BAT, K = 6, planned options | 1.00 / 0.25 | 1.00 / 0.25 |" in lines
+    assert lines.count("| D-BAT, K = 6, learned options | 120 | 400 (limit) |") == 1
+    (tmp_path / "one.csv").write_text("\n".join(row for row in rows if ",learned," not in row) + "\n")
+    assert not any("options" in line.split("|")[1] for line in choosing.tables(tmp_path / "one.csv") if "|" in line)
+
+
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
     """A mean over some of the sub-goals is of no use beside one over all."""
     lines = (RESULTS / "hypotheses-doorkey.csv").read_text(encoding="utf-8").splitlines()

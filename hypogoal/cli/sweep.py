@@ -55,7 +55,7 @@ def sweep(
     experiment: Annotated[
         str | None,
         typer.Argument(
-            help="doorkey, montezuma-ladders, which-feature, figure3, figure4, figure6, or an own .toml file."
+            help="doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or an own .toml file."
         ),
     ] = None,
     preset: Preset = None,

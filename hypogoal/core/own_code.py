@@ -126,10 +126,8 @@ class UsersCode:
     Whatever it raises (``SystemExit`` too, but not Ctrl-C) and whatever it gives that is not as promised is told as one
     line with its place, as the user's to mend. The block is around every step of an environment: keep it cheap.
 
-    Args:
-        what: whose code it is ("the label function of won").
-        of: the function, or the object that has ``method``; or a text, what the user calls it.
-        failed: between ``what`` and the exception.
+    ``what`` says whose code it is ("the label function of won"), ``of`` is the function, or the object that has
+    ``method``, or a text, what the user calls it; ``failed`` stands between ``what`` and the exception.
     """
 
     __slots__ = ("failed", "method", "of", "what")

@@ -101,14 +101,10 @@ class Objective:
 
 
 def load_objective(name: str) -> Objective:
-    """The diversity objective called ``name``: one of :data:`OBJECTIVES`, an installed entry point, or own code.
+    """The diversity objective ``name``: of :data:`OBJECTIVES`, an installed entry point, or ``module:function``.
 
-    Args:
-        name: ``dbat``, ``none``, another of :data:`OBJECTIVES`, an entry point's name, or ``module:function``.
-
-    Raises:
-        UserError: no such objective, it cannot be loaded or is none, or it is code that the user did not allow (see
-            :mod:`hypogoal.core.own_code`).
+    No such objective, one that cannot be loaded or is none, or code that the user did not allow (see
+    :mod:`hypogoal.core.own_code`) is a ``UserError``.
     """
     built_in = {objective: f"{__name__}.{objective.replace('-', '_')}" for objective in OBJECTIVES}
     loaded = load_own(name, "diversity objective", ENTRY_POINTS, built_in)

@@ -173,7 +173,6 @@ class DoorKeyDomain(Domain):
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = env.MAX_STEPS, **arguments: Any
     ) -> DoorKeyEngine:
-        """An engine of ``count`` environments of one layout; ``arguments``: its ``engine_settings``."""
         return DoorKeyEngine(layout_seed, count, max_steps=max_steps, **arguments)
 
 

@@ -37,12 +37,8 @@ def sub_goals_reached(
 ) -> NDArray[np.bool_]:
     """Spec B2: the five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
 
-    Args:
-        held: bool (..., 3), the blue, the green and the red key is held.
-        door_open: bool (...,), the red door is open.
-        facing_door: bool (...,), the agent stands next to the door's cell and looks at it.
-        on_goal: bool (...,), the agent is on the goal cell.
-        door_label: what ``open-red-door`` means: ``open`` (wherever the agent stands) or ``in-front``.
+    ``held`` (..., 3) is of the blue, the green and the red key, all else (...,). ``open-red-door`` holds of an ``open``
+    door, wherever the agent stands, or only ``in-front``, next to it and looking at it.
 
     Source: the paper's text (``in-front``), its authors' check (``open``).
     """

@@ -30,13 +30,10 @@ class MontezumaEngine(TurnEngine):
     Ids 0 .. S-1 are the S start states, for ever; every step of every environment gets a new one. The images of the
     newest ``memory`` of these can be had, positions, labels and who is alive of all.
 
-    Arguments are those of ``MontezumaLadder``, and ``count``, of environments (E). No such ladder, too few start
-    states, too small a memory, or no emulator is a ``UserError``.
-
-    Args:
-        start: the ladder; or some, comma-separated, with ``start_states`` of each.
-        memory: states whose images are kept; 7 kB each, taken when first needed.
-        seed: of the start states (as ``start_seed`` of ``MontezumaLadder``) and of which one each episode begins with.
+    Arguments are those of ``MontezumaLadder``, and ``count``, of environments (E); ``start`` may also be some ladders,
+    comma-separated, with ``start_states`` of each, and ``seed`` is also of which one each episode begins with. An image
+    is 7 kB, taken when first needed. No such ladder, too few start states, too small a memory, or no emulator is a
+    ``UserError``.
     """
 
     n_actions = game.N_ACTIONS
@@ -123,7 +120,6 @@ class MontezumaEngine(TurnEngine):
         return out
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Where the agent is, int64 (n, 3): room, x, y in the RAM's units; of forgotten states too."""
         return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._known(ids)].astype(np.int64)
 
     def alive(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -310,7 +310,9 @@ def _expert_actions(emulator: Emulator, bases: Sequence[Position], rng: np.rando
         if left == 0 and rng.random() < homing:
             action, left = _towards_base(emulator.position(), bases)
         elif left == 0:
-            action, left = _wander(rng)
+            heading = rng.random() < HEADING
+            action = HEADINGS[rng.integers(len(HEADINGS))] if heading else int(rng.integers(N_ACTIONS))
+            left = int(rng.integers(1, LONGEST_REPEAT + 1))
         left -= 1
         yield int(rng.integers(N_ACTIONS)) if rng.random() < JITTER else action
 
@@ -322,13 +324,6 @@ def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, i
     if abs(aside) > CLOSE:
         return (RIGHT if aside > 0 else LEFT), max(1, round(abs(aside) / STRIDE))
     return (DOWN if position.y > base.y else NOOP), 1
-
-
-def _wander(rng: np.random.Generator) -> tuple[int, int]:
-    """An action, and for how many agent steps."""
-    heading = rng.random() < HEADING
-    action = HEADINGS[rng.integers(len(HEADINGS))] if heading else int(rng.integers(N_ACTIONS))
-    return action, int(rng.integers(1, LONGEST_REPEAT + 1))
 
 
 def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> Snapshot:

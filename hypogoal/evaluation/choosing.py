@@ -83,16 +83,12 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
 
 
 def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How often each option's greedy execution brings about its true sub-goal, the episode not lost.
+    """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
 
-    Args:
-        loop: an agent whose policies remember nothing, in an engine that knows what follows.
-        goals: int64 (O,), the column of the engine's labels that each option's true sub-goal is.
-        states: int64 (D,), in which executions begin, each as often as it is there: an option's where it is offered,
-            its sub-goal does not hold, and can be had within the timeout.
-
-    Returns:
-        float64 (O,); NaN for an option that begins nowhere.
+    Of an agent whose policies remember nothing, in an engine that knows what follows. ``goals`` (O,) are the columns of
+    the engine's labels that options' true sub-goals are. Executions begin in ``states`` (D,), each as often as it is
+    there: an option's where it is offered, its sub-goal does not hold, and can be had within the timeout; NaN for an
+    option that begins nowhere.
     """
     from hypogoal.options.planned import distances
 
@@ -135,12 +131,9 @@ def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) ->
 
 
 def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
-    """Whether the better members are taken, where at least two members of the chosen sub-goal were offered.
+    """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
-    Args:
-        choices: the decisions.
-        quality: float (G*K,), see :func:`qualities`; NaN where it is not known.
-        members: K.
+    ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known.
 
     Returns:
         ``preference`` (G*K,): chosen / expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected;

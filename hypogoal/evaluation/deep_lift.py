@@ -69,12 +69,8 @@ def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -
 
 
 def deep_lift(ensemble: Ensemble, observations: NDArray[np.uint8], baseline: NDArray[np.uint8]) -> Attributions:
-    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) of every member on some states.
-
-    Args:
-        ensemble: its members are plain ``nn.Sequential`` of modules used once.
-        observations: uint8 (n, H, W, C), what members see of a few states.
-        baseline: uint8 (H, W, C), what that is compared with.
+    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) of every member, a plain ``nn.Sequential`` of modules
+    used once, on what members see of a few states (n, H, W, C), compared with a baseline (H, W, C).
     """
     inputs = as_input(torch.from_numpy(observations)).double().requires_grad_()
     reference = as_input(torch.from_numpy(baseline[None])).double()

@@ -59,10 +59,11 @@ ROOMS_SHOWN = 3
 NEEDED = "It needs options artefacts with executions.csv: train-options with --set start=LADDER."
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
-STOPS = {
-    HIT: ("at a true base", "o", SKY),
-    MISS: ("elsewhere", "x", ORANGE),
-    BEGAN_INSIDE: ("began inside: counts 300", "s", PURPLE),
+MARK: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5}
+STOPS: dict[int, tuple[str, dict[str, Any]]] = {
+    HIT: ("at a true base", MARK | {"marker": "o", "color": SKY, "markeredgewidth": 0.6, "markeredgecolor": INK}),
+    MISS: ("elsewhere", MARK | {"marker": "x", "color": ORANGE}),
+    BEGAN_INSIDE: ("began inside: counts 300", MARK | {"marker": "s", "color": PURPLE, "fillstyle": "none"}),
 }
 
 
@@ -637,25 +638,16 @@ def stops_over_rooms(
             place = figure.add_axes((left / size[0], bottom / size[1], wide / size[0], high / size[1]))
             place.set_axis_off()
             place.imshow(picture, interpolation="none", aspect="auto")
-            for fate, (_, marker, colour) in STOPS.items():
+            for fate, (_, mark) in STOPS.items():
                 x, y = pixels[(rooms == room) & (ends == fate)].T
-                place.plot(x, y, marker, color=colour, alpha=0.75, **_mark(marker))
+                place.plot(x, y, alpha=0.75, **mark)
             first = room == pictures[0][0]
             place.set_title(
                 f"{title}, room {room}" if first else f"room {room}", pad=3, fontsize=9.5 if columns == 2 else 8
             )
-        handles = [Line2D([], [], marker=marker, color=colour, **_mark(marker)) for _, marker, colour in STOPS.values()]
-        labels = [name for name, _, _ in STOPS.values()]
+        handles, labels = [Line2D([], [], **mark) for _, mark in STOPS.values()], [name for name, _ in STOPS.values()]
         figure.legend(handles, labels, loc="lower left", ncols=3, handletextpad=0.2, columnspacing=1.2, borderpad=0)
         return figure
-
-
-def _mark(marker: str) -> dict[str, Any]:
-    more: dict[str, dict[str, Any]] = {
-        "o": {"markeredgewidth": 0.6, "markeredgecolor": INK},
-        "s": {"fillstyle": "none"},
-    }
-    return {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5, **more.get(marker, {})}
 
 
 QUESTION = Question(

@@ -33,6 +33,7 @@ NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
         *("world", "members"),  # which the domain's settings and the ensemble's name say
+        *("ended_at", "until_reached", "options_ended_at"),  # which came out
     }
 )
 # Settings of ensembles without effect.
@@ -226,12 +227,7 @@ def by_unit(values: ArrayLike, units: Sequence[Hashable]) -> NDArray[np.float64]
 def by_layout(values: ArrayLike, layouts: Sequence[Hashable]) -> tuple[NDArray[np.float64], str]:
     """Spec F5: what is independent: each layout's mean over its runs; where there is one layout, the runs themselves.
 
-    Args:
-        values: (n, ...), one per run.
-        layouts: n hashable marks; none for runs that have no layouts.
-
-    Returns:
-        float64 (U, ...), and "layouts" or "runs".
+    From n runs' values (n, ...) and layouts, none where they have no such thing: (U, ...), and "layouts" or "runs".
     """
     several = len(set(layouts)) > 1
     return by_unit(values, layouts if several else range(len(np.asarray(values)))), "layouts" if several else "runs"
@@ -247,8 +243,8 @@ def student_interval(values: NDArray[np.float64]) -> tuple[float, float]:
 def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, str]:
     """Spec F5: a 95 % interval: of few values Student's, of the mean; of 8 or more a bootstrap, of the middle half's.
 
-    A percentile bootstrap of few values is too narrow: of two it would hold in every second case. Of values (n,),
-    independent of each other, the lower and the upper bound, NaN for fewer than two, and its kind.
+    A percentile bootstrap of few values is too narrow: of two it would hold in every second case. Gives the bounds of
+    (n,) independent values, NaN for fewer than two, and the interval's kind; ``rng`` draws the resamples.
     """
     if len(values) < BOOTSTRAP_FROM:
         return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
@@ -266,10 +262,10 @@ def over(
 ) -> dict[str, Any]:
     """Spec F5: everything said of a number over runs, of which those of one layout count once, by their mean.
 
-    There is a value per run; those that are NaN are left out. ``cell`` names this number among all, which seeds the
-    resamples; ``layouts`` are a mark per run, see :func:`by_layout`. Gives mean, standard_error, iqm, interval (95 %,
-    see :func:`interval`), interval_over (of what, and its kind), n (runs with a value), unit, and with ``deviation``
-    the standard deviation (n - 1), the bands of Figures 3 and 4.
+    Runs whose value is NaN are left out and ``n`` says so. The number's names among all, ``cell``, seed the resamples;
+    ``layouts`` are of :func:`by_layout`. There are mean, standard_error, iqm, interval (95 %, see :func:`interval`),
+    interval_over (of what, and its kind), n (runs), unit, and with ``deviation`` standard_deviation (n - 1): the bands
+    of Figures 3 and 4.
     """
     defined = [index for index, value in enumerate(values) if not np.isnan(value)]
     numbers, of = by_layout([values[index] for index in defined], [layouts[index] for index in defined if layouts])
@@ -302,16 +298,11 @@ def pairs(
     A seed's layout, data and first weights are hard or easy for every method, so pairs that share them tell more than
     two means; and the probability of improvement says how often, where a difference of means may be one run's.
 
-    Args:
-        measured: (method, what is alike, value): layout, sub-goal or ladder, the seed last. What is alike in all of it,
-            options of one seed of several ensembles say, is paired in the order in which it comes.
-        quantity: what the rows say that is compared.
-        where: and of what.
-        higher: the better value is the higher one.
-        layouts: the first mark is the layout; where there are several, they are the units, not the seeds.
-
-    Returns:
-        A row for each method after the first that shares a pair with it, see :func:`compare_pairs`.
+    ``measured`` are (method, what is alike, value): layout, sub-goal or ladder, the seed last. What is alike in all of
+    it, options of one seed of several ensembles say, is paired in the order in which it comes. There is a row, see
+    :func:`compare_pairs`, for each method after the first that shares a pair with it; it says that a ``quantity`` is
+    compared, and ``where``. ``layouts``: the first mark is the layout; where there are several, they are the units, not
+    the seeds.
     """
     values: dict[str, dict[tuple[Hashable, ...], float]] = {}
     for method, key, value in measured:
@@ -366,13 +357,7 @@ def compare_pairs(
     The probability of improvement is the share of pairs in which the first is better, a tie counting half. Pairs of one
     unit (one seed's ensemble on several ladders, one layout with several seeds) are not independent: everything but
     the counts is over units, each of which counts once, by its mean. Where one wins every pair the interval has no
-    width, so the sign test stands beside it, which few units cannot make small.
-
-    Args:
-        first: float (n,), pair by pair; pairs with a NaN are left out.
-        second: float (n,), of the other method.
-        units: n hashable marks.
-        higher: the better value is the higher one.
+    width, so the sign test stands beside it, which few units cannot make small. Pairs with a NaN are left out.
 
     Returns:
         n, units (how many), wins, ties, probability and its interval (Student's 95 %, cut at 0 and 1), interval_over,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, read_text
-from hypogoal.core.hdf5 import Foreign, members, open_hdf5, read_array, walk
+from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
 
 AGAIN = "Evaluate the run again."
 WINDOW = 100  # episodes at the end of training by which an agent is judged
@@ -206,7 +206,7 @@ def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:
     with open_hdf5(path, "the file of terminations", AGAIN) as file:
         try:
             return {int(name): read_array(file, name, "u").astype(np.uint8) for name in members(file)}
-        except (Foreign, ValueError) as error:
+        except ValueError as error:  # a name that is no number
             raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
 
 
@@ -267,7 +267,9 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     source.whole()
     metrics = _metrics(source.path / "metrics.json")
     metrics["missing"] = [*metrics.get("missing", ()), *_since(run, source)]
-    return Evaluated(source, metrics, _arrays(source.path / "arrays.h5", start))
+    with open_hdf5(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
+        arrays = {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
+    return Evaluated(source, metrics, arrays)
 
 
 def read_numbers(source: Artefact) -> Mapping[str, Any]:
@@ -308,11 +310,3 @@ def _sub_goals(part: Any) -> Iterator[Any]:
         yield from [part["sub_goal"]] if "sub_goal" in part else []
     for inner in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
         yield from _sub_goals(inner)
-
-
-def _arrays(path: Path, start: str) -> dict[str, NDArray[Any]]:
-    with open_hdf5(path, "the evaluation's arrays", AGAIN) as file:
-        try:
-            return {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
-        except Foreign as error:
-            raise UserError(f"the evaluation's arrays are damaged ({error})", path, AGAIN) from None

@@ -35,12 +35,10 @@ class TrainingStates:
     """Labelled states followed by unlabelled ones, one numbering for both.
 
     Args:
-        observations: uint8 (N, H, W, C), labelled.
-        labels: bool (N,).
-        unlabelled: uint8 (M, H, W, C).
+        observations, labels: (N, H, W, C) and (N,).
+        unlabelled: (M, H, W, C).
         network: any of the networks that will see them (their layers decide how images are stored).
-        device: where they are to be used.
-        ladders: int64 (N,), at which ladder each labelled state is, where batches are drawn by them.
+        ladders: (N,), at which ladder each labelled state is, where batches are drawn by them.
         grey: whether the shades of each state of a training batch are mapped at random.
         context: whether, before that, what is around its middle is replaced in most: :func:`.changes.other_context`.
         jitter: by how many pixels at most each of them is moved at random; the images have that margin on every side.
@@ -85,20 +83,12 @@ class TrainingStates:
         counted: Sequence[bool] = (),
         changes: Sequence[np.random.Generator] = (),
     ) -> Seen:
-        """What each network makes of groups of states.
+        """What each network makes of groups of states (B,) each.
 
-        BatchNorm sees each group on its own; all else takes them together, which reads the weights once.
-
-        Args:
-            networks: K of them.
-            groups: states (B,) each.
-            counted: for each group whether BatchNorm's running statistics take it in, in training mode; all where
-                empty.
-            changes: for each group what its states are changed at random with, see ``grey`` and ``jitter``; where empty
-                they are not. What one group draws does not depend on the others.
-
-        Returns:
-            Logits and features, see :class:`Seen`.
+        BatchNorm sees each group on its own; all else takes them together, which reads the weights once. In training
+        mode its running statistics take in the groups that are ``counted``, all where that is empty. With ``changes``,
+        a generator for each group, states are changed at random, see ``grey`` and ``jitter``: what one group draws does
+        not depend on the others.
         """
         sizes = [len(group) for group in groups]
         if self._tables is not None:

@@ -31,12 +31,9 @@ Pixels = Callable[[NDArray[np.int64]], NDArray[np.float64]]  # positions (N, 3) 
 
 
 class RamLocaliser(nn.Module):
-    """The agent's pixel from its position in the game's memory; what is seen is not looked at.
+    """The agent's pixel from its position in the game's memory, by the domain's ``agent_pixels``.
 
-    An oracle, to be called one wherever its results are shown.
-
-    Args:
-        pixels: the domain's, see ``Domain.agent_pixels``.
+    What is seen is not looked at: an oracle, to be called one wherever its results are shown.
     """
 
     needs_positions = True
@@ -54,14 +51,11 @@ class RamLocaliser(nn.Module):
 
 
 class LearnedLocaliser(nn.Module):
-    """The agent's pixel from what is seen: the peak of a heat-map.
+    """The agent's pixel from what is seen, (H, W, C) with the latest frame last: the peak of a heat-map.
 
     A fully convolutional network looks at the last frame, where the agent has its looks, and at the differences between
-    the frames, where all that moves stands out.
-
-    Args:
-        observation_shape: (H, W, C) with C at least 2, the last channel the latest frame.
-        network: (N, C, H, W) -> (N, 1, rows, columns), logits of cells of 4 x 4 pixels; one to be loaded where None.
+    the frames, where all that moves stands out: (N, C, H, W) -> (N, 1, rows, columns), logits of cells of 4 x 4 pixels.
+    One to be loaded where None is given.
     """
 
     needs_positions = False
@@ -96,25 +90,15 @@ def fit_localiser(
     *,
     steps: int = STEPS,
 ) -> LearnedLocaliser:
-    """A localiser from states of which the agent's place is known, and from others of which its actions are.
+    """A localiser from states (N, H, W, C) of which the agent's place is known, and others of which its actions are.
 
     It has to find the agent in rooms that it never saw. So each labelled state is mirrored, shifted, filled with
-    made-up patterns and moving things around the agent, and its shades are changed: what stays is the agent and how it
-    moves.
-    In unlabelled states the agent is what tells which actions were taken: each cell of the heat-map guesses them, and
-    the heat-map, a distribution over cells, says which guess counts (inverse dynamics with attention). So it learns
-    that enemies are not the agent.
-
-    Args:
-        observations: uint8 (N, H, W, C).
-        pixels: row and column (N, 2) of the agent in the last frame.
-        unlabelled: uint8 (M, H, W, C); may be empty.
-        actions: int64 (M, 2), the actions, 0 or more, that led to the last frame and to the one before it.
-        seed: of the initial weights and all that is drawn.
-        steps: gradient steps.
-
-    Returns:
-        The localiser; the same bytes for the same arguments on one CPU.
+    made-up patterns and moving things around the agent, and its shades are changed: what stays is the agent, whose row
+    and column in the last frame are ``pixels`` (N, 2), and how it moves.
+    In unlabelled states (M, H, W, C), of which there may be none, the agent is what tells which ``actions`` (M, 2), 0
+    or more, led to the last frame and to the one before it: each cell of the heat-map guesses them, and the heat-map, a
+    distribution over cells, says which guess counts (inverse dynamics with attention). So it learns that enemies are
+    not the agent. On one CPU the same arguments give the same bytes.
     """
     n_actions = int(actions.max(initial=0)) + 1
     with torch.random.fork_rng(devices=[]):

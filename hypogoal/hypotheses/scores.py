@@ -11,19 +11,10 @@ Scores = dict[str, NDArray[np.float64]]
 
 
 def member_scores(verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]) -> Scores:
-    """Spec F1: every member's scores on labelled states.
+    """Spec F1: by name every member's score, float64 (K,), a fraction, from verdicts (N, K) and labels (N,): "reached".
 
-    Args:
-        verdicts: bool (N, K), member k says that the sub-goal is reached.
-        labels: bool (N,), it is.
-
-    Returns:
-        By name float64 (K,), fractions. NaN where a score is not defined: balanced accuracy and
-        recall without positives (or, the former, negatives), precision of a member that never says yes, anything
-        without states.
-
-    Raises:
-        ValueError: the numbers of states differ.
+    NaN where a score is not defined: balanced accuracy and recall without positives (or, the former, negatives),
+    precision of a member that never says yes, anything without states. A ``ValueError`` where their numbers differ.
     """
     if verdicts.shape[0] != labels.shape[0]:
         raise ValueError(f"{verdicts.shape[0]} verdicts for {labels.shape[0]} labels")
@@ -45,13 +36,8 @@ def member_scores(verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]) -> Sco
 def ranking(probabilities: NDArray[np.float32], labels: NDArray[np.bool_]) -> NDArray[np.float64]:
     """How well members tell positives from negatives whatever their thresholds: the area under the ROC curve.
 
-    Args:
-        probabilities: float (N, K), that the sub-goal is reached.
-        labels: bool (N,), it is.
-
-    Returns:
-        float64 (K,): the share of pairs of a positive and a negative in which the positive has the higher probability,
-        ties counted half; NaN where there are no such pairs.
+    From probabilities (N, K) and labels (N,) float64 (K,): the share of pairs of a positive and a negative in which the
+    positive has the higher probability, ties counted half; NaN where there are no such pairs.
     """
     positives = int(labels.sum())
     pairs = positives * (len(labels) - positives)
@@ -67,15 +53,8 @@ def best_threshold(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """The threshold of each member that is best for the true sub-goal: what a member knows but for where to say yes.
 
-    It is set on the labels that it is judged by, so it is a bound and no method.
-
-    Args:
-        probabilities: float32 (N, K), that the sub-goal is reached.
-        labels: bool (N,), it is.
-
-    Returns:
-        float32 (K,), a member says yes above it; float64 (K,), the balanced accuracy there, NaN where a class is
-        missing.
+    It is set on the labels (N,) that it is judged by, so it is a bound and no method. A member with probabilities (N,)
+    says yes above it; beside it (K,) is the balanced accuracy there (K,), NaN where a class is missing.
     """
     positives, members = int(labels.sum()), np.arange(probabilities.shape[1])
     negatives = len(labels) - positives
@@ -104,12 +83,7 @@ def halves(contexts: NDArray[np.int64]) -> NDArray[np.bool_] | None:
 def cross_fitted(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     """The best member's score, picked on other states than it is scored on: no luck of the pick is in it.
 
-    Args:
-        first: float (K,), members' scores on one half of the contexts.
-        second: float (K,), on the other.
-
-    Returns:
-        The mean of both directions; NaN where a half has no score.
+    From members' scores (K,) on two halves of the contexts, the mean of both directions; NaN where one has no score.
     """
     scores = []
     for picking, scoring in ((first, second), (second, first)):
@@ -148,14 +122,7 @@ def most_and_least(values: NDArray[np.float64]) -> tuple[int | None, int | None]
 
 
 def pairwise_disagreement(verdicts: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Spec F2: the share of states on which members i and j differ.
-
-    Args:
-        verdicts: bool (N, K).
-
-    Returns:
-        float64 (K, K), symmetric, 0 on the diagonal; NaN without states.
-    """
+    """Spec F2: of verdicts (N, K) the share of states on which members i and j differ, (K, K); NaN without states."""
     states, members = verdicts.shape
     if states == 0:
         return np.full((members, members), np.nan)

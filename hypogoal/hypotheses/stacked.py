@@ -26,17 +26,11 @@ class StackedMembers:
 
     The first convolution's filters stand side by side, later ones are grouped, dense layers are batched products.
     Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Own networks with layers of other kinds
-    are not joined: each ensemble predicts by itself.
+    are not ``joined``: each ensemble predicts by itself.
 
-    Args:
-        ensembles: G ensembles of K members each, all with one network and observation shape, views of one shape, and on
-            one device.
-        repeats: states are of a grid world: what convolutions make of windows is kept, see :mod:`.windows`. Where
-            members do not see all of a state, or on a GPU, it makes no difference.
-
-    Attributes:
-        needs_positions: whether any of them does, see :attr:`Ensemble.needs_positions`.
-        joined: whether the network's layers are of kinds that can be.
+    The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
+    ``repeats``: states are of a grid world, so what convolutions make of windows is kept, see :mod:`.windows`; where
+    members do not see all of a state, or on a GPU, it makes no difference.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble], *, repeats: bool = False):

@@ -64,11 +64,8 @@ def fit(
     """Eq. (1): the trained members of one sub-goal. On one CPU in one thread the same arguments give the same bytes.
 
     Args:
-        observations: uint8 (N, H, W, C), the labelled states.
-        labels: bool (N,), whether the sub-goal is reached.
-        unlabelled: uint8 (M, H, W, C); may be empty where nothing makes members differ.
-        config: the settings.
-        seed: of the initial weights and the batches.
+        observations, labels: the labelled states (N, H, W, C), and whether the sub-goal is reached (N,).
+        unlabelled: (M, H, W, C); may be empty where nothing makes members differ.
         on_step: called every ``REPORT_EVERY`` steps and at the last one (of each member, where sequential) with the
             number of steps done and with that step's ``loss``, ``labelled`` (mean over the members in training) and
             ``diversity`` (the inner sums of Eq. (1), before their weight).
@@ -79,11 +76,8 @@ def fit(
         unlabelled_origins: int64 (M,), the same of the unlabelled states: ``room``, ``x``, ``y`` for localiser=ram,
             ``action``, ``previous_action`` for localiser=learned.
         agent_pixels: the domain's, for view=agent-crop; None where it does not know.
-        device: where to train; the ensemble stays there.
+        device: where to train; the ensemble stays there, in evaluation mode.
         checkpoints: spec G1; a :class:`Report` is part of them.
-
-    Returns:
-        The ensemble, in evaluation mode.
 
     Raises:
         UserError: labels of one class only, no unlabelled states though members are to differ or thresholds to be set

@@ -25,11 +25,9 @@ BATCH = 4  # windows computed at once, always so many
 
 
 def split_of(network: nn.Sequential) -> tuple[int, int, int] | None:
-    """Where to cut a network, and the windows that what is before the cut looks at.
+    """How many layers of a network there are up to its last convolution, and that one's windows: side, stride (pixels).
 
-    Returns:
-        The number of layers up to the last convolution, with it, and the side and stride of its windows in pixels;
-        None where there is none, or a layer is of a kind that we do not know.
+    None where there is no convolution, or a layer is of a kind that we do not know.
     """
     windows = windows_of(network)
     places = [index for index, layer in enumerate(network) if isinstance(layer, nn.Conv2d)]

@@ -43,6 +43,10 @@ class Episodes(list[tuple[int, int, float, int]], Resumable):
         last = self[-LAST:]
         return sum(bool(row[3]) and row[2] > 0 for row in last) / len(last) if last else float("nan")
 
+    def solved(self, share: float) -> bool:
+        """Whether at least ``share`` of the last ``LAST`` episodes succeeded; never where there are fewer, or at 0."""
+        return share > 0 and len(self) >= LAST and self.success() >= share
+
     def length(self) -> float:
         """Mean steps of the last episodes; NaN before the first."""
         last = self[-LAST:]

@@ -104,6 +104,13 @@ class TrainOptionsConfig(PlayConfig):
         source="paper, policy learning",
         choices=("all", "each"),
     )
+    until: float = setting(
+        0.0,
+        "training ends once this share of the last 100 episodes has succeeded, and at 'steps' at the latest; 0: there",
+        source="ours: practice for a task in which choosing decides",
+        low=0.0,
+        high=1.0,
+    )
     chooser: str = setting(
         "random",
         "uniform choice among the options offered, or the one with the fewest steps so far",

@@ -180,9 +180,12 @@ def frames_kept(config: PlayConfig, options: int) -> int:
     return max(LEARNERS[config.network].reach(config, options), asked)
 
 
-def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, checkpoints: Checkpoints) -> None:
+def train(
+    loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, checkpoints: Checkpoints, until: float = 0.0
+) -> bool:
     """Step ``loop`` until ``steps`` more environment steps were taken, logging every ``LOG_INTERVAL`` steps.
 
+    It ends before where ``until`` of the last episodes have succeeded (0: it does not); returns whether they have.
     ``loop`` is as it was when ``steps`` began; where there is a checkpoint (spec G1), it goes on from there. Those are
     of no use where the engine cannot be resumed.
     """
@@ -202,10 +205,12 @@ def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, che
         loop.restore(saved["loop"])
         logged, numbers = saved["logged"], saved["numbers"]
         progress.resume(recorder.steps - begin)
+    solved = recorder.episodes.solved(until)
     with checkpoints:
-        while recorder.steps < end:
+        while recorder.steps < end and not solved:
             numbers |= loop.step()
-            if recorder.steps - logged >= LOG_INTERVAL or recorder.steps >= end:
+            solved = recorder.episodes.solved(until)
+            if recorder.steps - logged >= LOG_INTERVAL or recorder.steps >= end or solved:
                 logged = recorder.steps
                 shown = recorder.recent(restarted=loop.config.restart_options)
                 log.write(
@@ -214,9 +219,13 @@ def train(loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, che
                     states=loop.engine.n_states,
                     **shown,
                     **numbers,
+                    **({"until_reached": solved} if until else {}),
                 )
                 progress.update(min(recorder.steps - begin, steps), **shown)
             checkpoints.offer(state)
+    if solved:
+        progress.expect(recorder.steps - begin)
+    return solved
 
 
 def check_fit(

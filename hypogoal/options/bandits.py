@@ -25,10 +25,7 @@ MIXING = 0.1
 class Bandit(Chooser):
     """``record`` notes what episodes came to, ``learn`` alone learns from it: a frozen agent does not, as of PPO.
 
-    ``rng`` is of the draws.
-
-    Attributes:
-        credit: float64 (2, O), how much each option was credited with episodes that were solved, and that were not.
+    ``credit`` float64 (2, O) is how much each option was credited with episodes that were solved, and that were not.
     """
 
     CHANGING = ("rng", "credit", "_due", "_taken", "_earned", "_drawn")

@@ -21,7 +21,7 @@ class Outcome:
     """Finished option executions, arrays of length n."""
 
     environments: NDArray[np.int64]  # in which they ran
-    options: NDArray[np.int64]  # of which they were
+    options: NDArray[np.int64]  # that they were of
     began: NDArray[np.int64]  # the states in which these were chosen
     reached: NDArray[np.bool_]  # the options' own classifiers ended them
     inside: NDArray[np.bool_]  # these said yes already where they began
@@ -31,7 +31,7 @@ class Outcome:
     discounts: NDArray[np.float64]  # gamma ** tau, for the state reached
     next_ids: NDArray[np.int64]  # the states reached
     terminated: NDArray[np.bool_]  # the task is over, nothing follows
-    truncated: NDArray[np.bool_]  # the episode was cut: its step limit, or the next option begins at a start state
+    truncated: NDArray[np.bool_]  # the episode was cut, at its limit or because the next option begins at a start
 
 
 class Chooser(Resumable, ABC):

@@ -30,12 +30,6 @@ def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:
     return state["actions"].numpy() if "actions" in state else np.arange(outputs)
 
 
-def check_actions(state: Mapping[str, Tensor], actions: NDArray[np.int64], name: str) -> None:
-    """Refuse (``UserError``) to continue policies that chose among other actions."""
-    if not np.array_equal(actions_of(state, len(actions)), actions):
-        raise UserError("these options were trained with other actions", f"actions={name}", "Give the same --set.")
-
-
 class Exploration(Resumable):
     """Random actions, of A, in place of a policy's own, for each of E environments.
 

@@ -18,7 +18,7 @@ from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.exploration import Exploration, action_set, check_actions
+from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
 from hypogoal.options.termination import Terminations
 from hypogoal.options.windows import AgentWindows
@@ -42,15 +42,7 @@ class Transitions:
 
 
 class Learner(Resumable, ABC):
-    """The intra-option policies of all O options.
-
-    Args:
-        engine: gives observations of state ids.
-        terminations: whether each option's sub-goal holds in a state.
-        config: see :class:`OptionConfig`.
-        seed: of weights, exploration and sampling.
-        device: where the networks are.
-        windows: what the policies see of states; all of it where None.
+    """The intra-option policies of all O options; ``windows``: what they see of states, all of it where None.
 
     Attributes:
         actions: the engine's actions that the policies choose among, int64 (A,).
@@ -155,7 +147,9 @@ class Learner(Resumable, ABC):
         """Continue from the weights and counters of an artefact; replays start empty. What does not fit is a
         ``UserError``.
         """
-        check_actions(state, self.actions, self.config.actions)
+        if not np.array_equal(actions_of(state, len(self.actions)), self.actions):
+            where = f"actions={self.config.actions}"
+            raise UserError("these options were trained with other actions", where, "Give the same --set.")
         self.load_weights(state)
         for name in COUNTERS:
             saved = state.get(name)

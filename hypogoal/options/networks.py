@@ -150,14 +150,9 @@ class PaperQNetwork(nn.Module):
         return self.features(images.permute(0, 3, 1, 2).float() / 255.0)
 
     def forward(self, embedded: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Unroll the GRU over an option's own steps.
+        """Unroll the GRU over an option's own steps, float32 (N, T, features), from :meth:`embed`.
 
-        Args:
-            embedded: float32 (N, T, features), from :meth:`embed`.
-            hidden: float32 (1, N, 512), None at an option's first step.
-
-        Returns:
-            values float32 (N, T, actions) and the hidden state after the last step.
+        Gives values float32 (N, T, actions) and the state after the last step (1, N, 512), ``hidden`` of the next call.
         """
         out, hidden = self.gru(embedded, hidden)
         return self.values(out), hidden

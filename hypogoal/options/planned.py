@@ -72,15 +72,10 @@ class PlannedLearner(Learner):
 
 
 def distances(reached: NDArray[np.bool_], after: NDArray[np.int64], final: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Breadth-first search from all sub-goals at once, against the direction of time.
+    """Breadth-first search from all sub-goals at once, against the direction of time: steps to them, int32 (N, O).
 
-    Args:
-        reached: bool (N, O), each option's sub-goal holds in a state.
-        after: int64 (N, A), the state after each action.
-        final: bool (N,), nothing follows a state.
-
-    Returns:
-        int32 (N, O), steps to the sub-goal; 0 where it holds, ``FAR`` where no way leads there.
+    0 where an option's sub-goal is ``reached`` (N, O), ``FAR`` where no way leads there; states ``after`` each action
+    are (N, A), and nothing follows a ``final`` one (N,).
     """
     steps = np.where(reached, 0, FAR).astype(np.int32)
     going = np.flatnonzero(~final)

@@ -38,12 +38,9 @@ EXPLOIT_COLUMNS = ("step", "option", "reached", "near", "best_near", "best_far")
 
 
 class Recorder(Resumable):
-    """Counts choices per window of steps, lists episodes, keeps the last executions and stops of each option.
+    """Counts choices per ``window`` of steps, lists episodes, keeps the last executions and stops of each of O options.
 
-    Args:
-        options: the number of options, O.
-        engine: where they are played; of one that forgets states, stops are kept as pictures.
-        window: steps per row of ``choices.csv``.
+    Of an engine that forgets states, stops are kept as pictures.
     """
 
     CHANGING = ("episodes", "choices", "stops", "executions", "_pictures", "_states", "_window", "_window_start")

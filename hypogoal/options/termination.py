@@ -29,15 +29,13 @@ MANY = 256  # states from which each ensemble's own prediction, which computes d
 class Terminations(Resumable):
     """Which options' sub-goals hold in states; of each state and option a classifier is asked once.
 
-    An execution ends at the first state in which its own sub-goal holds (the paper). Other rules are subclasses.
+    An execution ends at the first state in which its own sub-goal holds (the paper). Other rules are subclasses, which
+    are told how many ``environments`` there are, and their ``length``.
 
     Args:
         classify: state ids (n,) -> log-odds float32 (n, O), or verdicts, bool (n, O).
-        options: the number of options, O.
         classify_one: state ids (n,) and an option -> (n,), where that costs less; None, where it does not.
         thresholds: float32 (O,), the log-odds above which it is a yes; 0 where None, which fits verdicts, too.
-        environments: how many there are, for rules that follow executions.
-        length: a rule's number.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
@@ -156,7 +154,6 @@ class Patience(Terminations):
         self._highest = np.full(self.options, -np.inf, dtype=np.float32)
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """As of :class:`Terminations`."""
         now = self.log_odds(ids, options)
         self._best = np.where(age == 0, now, np.maximum(self._best, now))
         np.add.at(self._steps, options, 1)
@@ -188,7 +185,6 @@ class Dwell(Terminations):
         self._held = np.zeros(self.environments, dtype=np.int64)
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """As of :class:`Terminations`."""
         self._held = np.where(self.of_running(ids, options), np.where(age == 0, 0, self._held) + 1, 0)
         long: NDArray[np.bool_] = self._held >= self.length
         return long

@@ -22,12 +22,8 @@ class Visited(Resumable):
     """A uniform sample of the distinct states visited: those whose hashes are the smallest (a bottom-k sketch).
 
     Whether a state is kept depends neither on when nor on how often it was visited, and no random numbers are drawn.
-
-    Args:
-        engine: draws states; where it has positions, they are kept too.
-        most: how many states to keep.
-        layout_seed: an origin of the states of an engine without positions.
-        seed: another seed keeps other states.
+    At ``most`` so many are kept, which ones depends on ``seed``; their positions too, where the engine has them, or
+    else ``layout_seed``.
     """
 
     def __init__(self, engine: Engine, most: int, layout_seed: int, seed: int):

@@ -15,20 +15,11 @@ KINDS = ("svg", "pdf", "png")
 
 
 def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = False) -> Path:
-    """Draw the report of an evaluated run.
+    """Draw an evaluated run, see ``evaluation.run.read_evaluation``, with so many ``videos``: :func:`draw_videos`.
 
-    Args:
-        run: a folder with an evaluation artefact in it; that in ``run/evaluation`` where there are several.
-        videos: how many episodes of the agents to play and draw, see :func:`draw_videos`.
-        force: replace an existing report.
-        resume: keep one that is complete.
-
-    Returns:
-        The page, ``run/report/index.html``. Beside it ``figures/*.svg``, ``figures/*.png`` and ``videos/*.gif``.
-
-    Raises:
-        UserError: the run was not evaluated, the evaluation is damaged, the report exists, or there are to be videos
-            and there is no agent.
+    Returns the page, ``run/report/index.html``. Beside it are ``figures/*.svg``, ``figures/*.png`` and
+    ``videos/*.gif``. A run that was not evaluated, a damaged evaluation, a report that exists, or videos where there is
+    no agent are a ``UserError``.
     """
     from hypogoal.evaluation.page import Material
     from hypogoal.evaluation.plots import to_png
@@ -55,11 +46,7 @@ def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = Fa
 
 
 def agents_of(run: Path) -> list[Artefact]:
-    """The run's agents that learned to choose among members' options.
-
-    Raises:
-        UserError: there is none.
-    """
+    """The run's agents that learned to choose among members' options; a ``UserError`` where there is none."""
     found = [
         artefact
         for artefact in find_artefacts(run, "meta")
@@ -86,19 +73,10 @@ def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int)
 
 
 def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:
-    """Draw the paper's figures, those that the run has artefacts for, as files of their own.
+    """Draw the paper's figures, those that the run has artefacts for, as files of their own, and ``captions.md``.
 
-    Args:
-        run: as for :func:`report`.
-        folder: gets a file per figure and ``captions.md``.
-        kind: ``svg``, ``pdf`` or ``png``.
-        force: replace files that are there.
-
-    Returns:
-        The files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs.
-
-    Raises:
-        UserError: no such kind, the run was not evaluated, or a file is there already.
+    Returns the files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs. Another
+    ``kind`` than those in ``KINDS``, a run that was not evaluated, or a file that is there is a ``UserError``.
     """
     from hypogoal.evaluation.page import Material
     from hypogoal.evaluation.plots import slug, to_file

@@ -30,11 +30,13 @@ from hypogoal.settings import CONFIGS, TABLES
 
 PRESETS = Path(str(resources.files("hypogoal"))) / "presets"
 EXPERIMENTS: Mapping[str, Experiment] = {path.stem: read_experiment(path) for path in sorted(PRESETS.glob("*.toml"))}
-FIGURES = {  # of the paper: the experiment and its preset
+FIGURES = {  # of the paper, and what has one preset: the experiment and this
+    "choosing": ("choosing", "choosing"),
     "figure3": ("montezuma-ladders", "figure3"),
     "figure4": ("montezuma-ladders", "figure4"),
     "figure6": ("doorkey", "figure6"),
 }
+CELLS = {("doorkey", "choosing"): "choosing"}  # presets with cells of their own: the experiment that has them
 AGAIN = "give the same command again to go on"
 
 
@@ -43,8 +45,8 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
     if stage == "collect":
         return load_domain(domain, given=True).config_class
     if stage == "run":
-        for experiment in EXPERIMENTS.values():
-            if domain == experiment.domain:
+        for name, experiment in EXPERIMENTS.items():
+            if domain == experiment.domain and name not in CELLS.values():
                 return experiment.config_class
         raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
     if stage not in CONFIGS:
@@ -71,9 +73,10 @@ def plan(
     """
     check_name(device)
     assignments = [*assignments]
+    experiment = CELLS.get((experiment, preset or ""), experiment)
     name, own_preset = FIGURES.get(experiment, (experiment, None))
     if name not in EXPERIMENTS and not name.endswith(".toml"):
-        known = ", ".join([*EXPERIMENTS, *FIGURES])
+        known = ", ".join(dict.fromkeys([*EXPERIMENTS, *FIGURES]))
         raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
     if own_preset not in (None, preset or own_preset):
         raise UserError(f"{experiment} has its own preset", preset, f"For another, give {name} with --preset.")

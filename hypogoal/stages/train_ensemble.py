@@ -141,13 +141,10 @@ def score_rows(
             "at_best": best_threshold(seen, labels)[1],
         }
         for member in range(len(ensemble)):
-            numbers = {name: _rounded(values[member]) for name, values in columns.items()}
+            told = {name: float(values[member]) for name, values in columns.items()}
+            numbers = {name: None if np.isnan(value) else round(value, 6) for name, value in told.items()}
             counts = {"states": len(labels), "positives": int(labels.sum())}
             yield {"scope": scope, "member": member, **counts, **numbers}
-
-
-def _rounded(value: float) -> float | None:
-    return None if np.isnan(value) else round(float(value), 6)
 
 
 class _Report(Report):

@@ -58,8 +58,11 @@ def train_meta(
         if loop.initiation and "initiation.safetensors" in trained.manifest["files"]:
             loop.initiation.load(load_tensors(trained.path / "initiation.safetensors"))
         recorder.episodes[:] = read_episodes(trained.path / "episodes.csv")
-        recorder.start_at(trained.config["steps"])
-    about = description(loop, domain, source.config, config, options_steps=trained.config["steps"] if trained else 0)
+        recorder.start_at(trained.config.get("ended_at", trained.config["steps"]))
+    spent = {"options_steps": trained.config["steps"] if trained else 0}
+    if trained and "ended_at" in trained.config:
+        spent["options_ended_at"] = recorder.steps
+    about = description(loop, domain, source.config, config, **spent)
     with create_artefact(
         out, kind="meta", config=about, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:

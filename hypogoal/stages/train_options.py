@@ -1,4 +1,4 @@
-"""Spec A3: learn every member's option policy while options are chosen at random."""
+"""Spec A3: learn every member's option policy while options are chosen at random, for a time or until that succeeds."""
 
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ def train_options(
     """Train the options of an ensemble artefact, or those of ``options`` further, and write the artefact ``out``.
 
     Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
-    begins an episode, instead of these two the shares of ``recorder.recent``.
+    begins an episode, instead of these two the shares of ``recorder.recent``. With ``until`` also ``ended``: by what.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
@@ -55,11 +55,19 @@ def train_options(
     ) as folder:
         log = MetricsLog(folder / "metrics.jsonl")
         with Progress("train-options", total=steps, quiet=quiet) as progress:
-            train(loop, steps, log, progress, checkpoints_of(folder))
+            solved = train(loop, steps, log, progress, checkpoints_of(folder), config.until)
         if domain.measures and loop.engine.position_names:
             recorder.write_executions(folder, domain.distance)
         write_trained(folder, loop, domain, source.config, config, seed)
-    counted = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
+        if config.until:
+            about |= {"ended_at": recorder.steps, "until_reached": solved}  # the manifest, which comes last, says so
+    counted: dict[str, Any] = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
     if config.restart_options:
-        return counted | recorder.recent(restarted=True)
-    return counted | {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
+        counted |= recorder.recent(restarted=True)
+    else:
+        counted |= {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
+    if config.until:
+        counted["ended"] = (
+            f"by until={config.until:g}" if solved else f"by the limit, until={config.until:g} not reached"
+        )
+    return counted

@@ -24,11 +24,8 @@ GYMNASIUM_SAYS_NOT = ("is different from the unwrapped version",)  # of its chec
 def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, seed: int = 0) -> Iterator[Verdict]:
     """Whether a domain keeps to what the stages rely on.
 
-    Args:
-        domain: see :mod:`hypogoal.domains.base`.
-        config: an instance of its ``config_class``; the defaults where None. States are collected twice with it.
-        layout_seed: the layout that is played.
-        seed: of the collection and of the random play.
+    States are collected twice, with ``config``, an instance of its ``config_class``, or the defaults where None; a
+    layout is played at random. ``seed`` is of both.
     """
     return run(_Contract(domain, config, layout_seed, seed).tests())
 
@@ -84,7 +81,9 @@ class _Contract:
         return f"{env.observation_space.shape} {env.observation_space.dtype}, {env.action_space}"
 
     def make_engine(self) -> Engine:
-        return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **_start_arguments(self.domain, self.seed))
+        starts = self.domain.starts
+        arguments = {"start": starts[0], "along": 0.0, "memory": 10_000, "seed": self.seed} if starts else {}
+        return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **arguments)
 
     def engine(self) -> str:
         engine: Engine = self.make_engine()
@@ -246,11 +245,6 @@ def _missing(goal: str, name: str, labels: NDArray[np.bool_]) -> tuple[str, str]
     """What to say, and to do, where labels are of one class."""
     text = f"{goal} has no {'negatives' if labels.any() else 'positives'} among the {name} states"
     return text, "Collect more steps or other layouts, or bring a policy that gets there."
-
-
-def _start_arguments(domain: Domain, seed: int) -> dict[str, Any]:
-    """What the engine of a domain with named starts must be told."""
-    return {"start": domain.starts[0], "along": 0.0, "memory": 10_000, "seed": seed} if domain.starts else {}
 
 
 def _same_step(first: Engine, second: Engine, actions: NDArray[np.int64], where: str, do: str) -> None:

@@ -18,12 +18,7 @@ TELL = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Flatt
 
 
 def check_network(name: str, observation_shape: tuple[int, ...] = (64, 64, 3)) -> Iterator[Verdict]:
-    """Whether a member network can be trained, stored, predicted with in every way, and explained.
-
-    Args:
-        name: as in ``--set network=NAME``.
-        observation_shape: (H, W, C) of the images it is to take.
-    """
+    """Whether a member network, a name as of ``--set network``, can be trained, stored, predicted with, explained."""
     return run(_Network(name, observation_shape).tests())
 
 

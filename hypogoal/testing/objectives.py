@@ -15,11 +15,7 @@ AGREED = ((1, 0), (1, 1), (0, 0))
 
 
 def check_objective(objective: Objective) -> Iterator[Verdict]:
-    """Whether a diversity objective keeps the laws that ensemble training relies on.
-
-    Args:
-        objective: as :func:`hypogoal.diversity.load_objective` gives it; of pairs or of the whole ensemble.
-    """
+    """Whether a diversity objective, see :func:`hypogoal.diversity.load_objective`, keeps what training relies on."""
     loss: Any = objective.pair_loss or objective.ensemble_loss
     laws: tuple[Callable[[Any], str], ...] = OF_PAIRS if objective.pair_loss else OF_ENSEMBLES
     return run((law.__name__.replace("_", " ").removeprefix("ensemble "), lambda law=law: law(loss)) for law in laws)  # type: ignore[misc]

@@ -139,7 +139,6 @@ class RoomsDomain(Domain):
         return Collected(self.observation_shape, SUB_GOALS, *told)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
-        """An engine of ``count`` environments of one layout; ``arguments``: its ``engine_settings``."""
         settings = {name: arguments.get(name, getattr(RoomsConfig(), name)) for name in self.engine_settings}
         return RoomsEngine(layout_seed, count, max_steps, **settings)
 

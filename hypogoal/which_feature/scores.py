@@ -41,11 +41,6 @@ def owned(ranked: Table, high: float = 0.95, low: float = 0.6) -> NDArray[np.boo
     return known & (unknown.sum(axis=1, keepdims=True) == ranked.shape[1] - 1)
 
 
-def coverage(ranked: Table, high: float = 0.95, low: float = 0.6) -> float:
-    """The share of factors that some member owns, see :func:`owned`."""
-    return float(owned(ranked, high, low).any(axis=0).mean())
-
-
 def redundancy(ranked: Table) -> float:
     """The share of pairs of members whose best factor is the same; NaN for one member. Chance: 1 / F."""
     best = ranked.argmax(axis=1)
@@ -67,15 +62,9 @@ def labels_needed(
     States are labelled one by one in random order, and the member with the highest hit rate so far (its verdict at 0.5
     is the label) is picked, one of several at random. Right is whoever ranks the true factor best, up to ``NEAR``.
 
-    Args:
-        probabilities: float32 (N, K).
-        factors: bool (N, F).
-        ranked: float64 (K, F), see :func:`rankings`.
-        rng: draws ``ORDERS`` orders.
-
-    Returns:
-        int64 (F,): the least number of labels from which on, up to ``MOST_LABELS`` (or N), the pick is right with a
-        probability of ``SURE``; 0 where no label is needed, one more than the most where they do not suffice.
+    Of probabilities (N, K) on factors (N, F) and :func:`rankings` (K, F) gives int64 (F,): the least number of labels
+    from which on, up to ``MOST_LABELS`` (or N), the pick is right with a probability of ``SURE``; 0 where no label is
+    needed, one more than the most where they do not suffice.
     """
     verdicts = probabilities > THRESHOLD
     most = min(MOST_LABELS, len(verdicts))

@@ -25,17 +25,14 @@ FLOOR, WALL, AGENT, OBJECT, BOX, GOAL = 0, 1, 2, 6, 10, 13  # where in the tiles
 
 @dataclass(frozen=True)
 class States:
-    """Scenes and what is true of them.
+    """Scenes and which factors hold in them.
 
-    Attributes:
-        observations: uint8 (N, 48, 48, 3); with ``moved`` (N, 48, 48, 6), the frame before and the frame now.
-        factors: bool (N, F), whether each factor that was asked for holds. ``colour``: the object is blue; ``shape``:
-            it is a ball; ``place``: it is in the right half; ``count``: there are three or four boxes; ``moved``: the
-            object was in another cell in the frame before. Those not asked for are drawn evenly.
+    ``colour``: the object is blue; ``shape``: it is a ball; ``place``: it is in the right half; ``count``: there are
+    three or four boxes; ``moved``: the object was in another cell in the frame before.
     """
 
-    observations: NDArray[np.uint8]
-    factors: NDArray[np.bool_]
+    observations: NDArray[np.uint8]  # (N, 48, 48, 3); with ``moved`` (N, 48, 48, 6), the frame before and the frame now
+    factors: NDArray[np.bool_]  # (N, F), those that were asked for; others are drawn evenly
 
 
 def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS) -> States:

@@ -52,6 +52,8 @@ def test_agents_are_named_after_how_they_choose():
     assert base_name("options", {}) == "random choice while options learn"
     assert missing(work_of(agents=named(*groups))) == ["no agent 'PPO paper'", "no agent 'DQN tuned'"]
     assert f"no agent '{ORACLE}'" in missing(work_of(agents=named(LEARNED, control)))
+    rooms = [{"layout_seed": seed, "shortest_path": 1} for seed in (100, 101)]  # where options are primitive actions
+    assert missing(work_of(agents=named(LEARNED), layouts=rooms)) == [f"no agent '{RANDOM}'", f"no agent '{ORACLE}'"]
 
 
 def test_a_setting_that_differs_splits_an_agent():

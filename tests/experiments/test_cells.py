@@ -11,6 +11,7 @@ from hypogoal.experiments.cells import Cell, Cost, Plan, depths, moved
 from hypogoal.experiments.costs import cost_lines
 from hypogoal.experiments.records import check_same, write_plan
 from hypogoal.experiments.runners.local import Outcome
+from hypogoal.settings import configuration
 from hypogoal.stages.sweep import EXPERIMENTS, plan, sweep
 
 OUT = Path("somewhere")
@@ -21,6 +22,7 @@ OUT = Path("somewhere")
     [
         ("doorkey", ["layout_seeds=100,101", "seeds=0,1"]),
         ("doorkey", ["pretrain=false"]),
+        ("choosing", []),
         ("montezuma-ladders", ["ladders=1L,2-6", "seeds=0,1"]),
     ],
 )
@@ -48,6 +50,28 @@ def test_the_ladders_experiment_has_every_method_group_and_control() -> None:
     options = [cell for cell in cells if cell.arguments[0] == "train-options"]
     assert sum("termination=oracle" in cell.arguments for cell in options) == 2 * 3
     assert len(options) == 2 * 3 * 2
+
+
+def test_choosing_has_cells_of_its_own_and_a_preset_of_its_worlds() -> None:
+    """Each method on ten layouts with seeds of their own, options learned in the plain world, and planned."""
+    planned = plan("doorkey", OUT, preset="choosing")
+    assert planned == plan("choosing", OUT) != plan("doorkey", OUT)
+    cells = {name: [cell for cell in planned.cells if cell.stage == name] for name in ("train-options", "train-meta")}
+    assert [len(own) for own in cells.values()] == [30, 60]
+    learned = [cell for cell in cells["train-meta"] if "--options" in cell.arguments]
+    assert len(learned) == 30 == sum("network=planned" in cell.arguments for cell in cells["train-meta"])
+    assert [cell.needs[1] for cell in learned] == [cell.out for cell in cells["train-options"]]
+    where = {tuple(dict(cell.axes)[axis] for axis in ("layout_seed", "seed")) for cell in cells["train-meta"]}
+    assert len(where) == len({layout for layout, _ in where}) == len({seed for _, seed in where}) == 10
+    assert all("choosing" in cell.arguments for own in cells.values() for cell in own), "the preset"
+    assert sum(cell.cost.seconds for cell in planned.cells) > 3600
+    practice, play = (configuration(stage, "doorkey", "choosing", ()) for stage in cells)
+    assert (practice.until, practice.steps, practice.world, practice.chooser) == (0.95, 400_000, (), "random")
+    assert (play.cap, play.steps, play.world) == (1.5, 50_000, ("wrong_key=ends",))
+    stages = {cell.stage for cell in plan("choosing", OUT, assignments=["learned=false"]).cells}
+    assert "train-options" not in stages and "train-meta" in stages
+    with pytest.raises(UserError, match="choosing has its own preset: demo"):
+        plan("choosing", OUT, preset="demo")
 
 
 def test_each_variant_gives_one_more_ensemble_per_method_and_seed() -> None:

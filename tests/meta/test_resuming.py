@@ -1,5 +1,6 @@
 """Spec G1: options played, learned and chosen go on after a break as if there had been none, to the last bit."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from loops import CASES, loop_of
 from hypogoal.core.checkpoints import Checkpoints, State
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.learners import episodes
 from hypogoal.meta import training
 from hypogoal.options.loop import OptionLoop
 
@@ -37,9 +39,11 @@ class Breaking(Checkpoints):
             raise Broken
 
 
-def run(case: str, folder: Path, checkpoints: Checkpoints) -> OptionLoop:
+def run(case: str, folder: Path, checkpoints: Checkpoints, until: float = 0.0) -> OptionLoop:
     loop = loop_of(case)
-    training.train(loop, STEPS, MetricsLog(folder / "metrics.jsonl"), Progress("", 0, quiet=True), checkpoints)
+    log, progress = MetricsLog(folder / "metrics.jsonl"), Progress("", 0, quiet=True)
+    solved = training.train(loop, STEPS, log, progress, checkpoints, until)
+    assert solved == (loop.recorder.steps < STEPS)
     return loop
 
 
@@ -71,6 +75,32 @@ def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.Mo
     weights = unbroken.learner.state()  # type: ignore[attr-defined]
     fresh = loop_of(case).learner.state()  # type: ignore[attr-defined]
     assert any(not torch.equal(value, fresh[name]) for name, value in weights.items()), "nothing was learned"
+
+
+@pytest.mark.parametrize(("until", "reached"), [(0.9, True), (1.0, False)])
+def test_training_that_succeeds_ends_whatever_breaks_it(
+    until: float, reached: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the first step by which so many of the last episodes succeeded, else at its limit; the log says which."""
+    monkeypatch.setattr(episodes, "LAST", 20)
+    monkeypatch.setattr(training, "LOG_INTERVAL", 50)
+    case, folders = "light, shared, gaussian", (tmp_path / "unbroken", tmp_path / "broken")
+    for folder in folders:
+        folder.mkdir()
+    run(case, folders[0], Checkpoints(None), until)
+    path = folders[1] / "checkpoint.safetensors"
+    with pytest.raises(Broken):
+        run(case, folders[1], Breaking(path, 23), until)
+    loop = run(case, folders[1], Checkpoints(path), until)
+    one, other = ((folder / "metrics.jsonl").read_bytes() for folder in folders)
+    assert one == other
+    last = json.loads(one.splitlines()[-1])
+    assert (last["step"], last["until_reached"]) == (loop.recorder.steps, reached)
+    shares = [
+        sum(row[2] > 0 for row in loop.recorder.episodes[: n + 1][-20:]) / 20 for n in range(19, last["episodes"])
+    ]
+    first = [row[0] for row, share in zip(loop.recorder.episodes[19:], shares, strict=True) if share >= until]
+    assert first == ([last["step"]] * len(first) if reached else []) and bool(first) == reached
 
 
 class Poisoned(Checkpoints):

@@ -5,6 +5,9 @@ from pathlib import Path
 import pytest
 
 from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.evaluation.curves import read_run
+from hypogoal.learners import episodes
 
 TESTS = Path(__file__).parents[1]
 FEW = ("--set", "environments=4", "--set", "warm_up=50", "--set", "steps=200", "-q")
@@ -69,3 +72,32 @@ def test_options_that_fit_are_continued(run: Path, tmp_path: Path, monkeypatch: 
     before = (run / "options/episodes.csv").read_text()
     after = (out / "episodes.csv").read_text()
     assert after.startswith(before) and int(after.splitlines()[-1].split(",")[0]) > 200
+
+
+def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What ended it stands on the command's last line and in the manifest; its limit is none of what was spent."""
+    allow(monkeypatch)
+    monkeypatch.setattr(episodes, "LAST", 3)
+    few = [*FEW[:-1], "--set", "until=0.3"]
+    said = {}
+    for name, changes in (("early", ("--set", "steps=4000")), ("late", ("--set", "steps=40"))):
+        command = ["train-options", str(run / "ensemble"), "--out", str(tmp_path / name), *few, *changes]
+        assert main(command) == 0
+        said[name] = capsys.readouterr().out.splitlines()[-2]
+        assert main([*command, "--resume"]) == 0, "it is complete"
+        capsys.readouterr()
+    assert said["early"].endswith("ended by until=0.3") and said["late"].endswith(
+        "ended by the limit, until=0.3 not reached"
+    )
+    early, late = (open_artefact(tmp_path / name).config for name in said)
+    assert 40 < early["ended_at"] < early["steps"] == 4000 and early["until_reached"] is True
+    assert (late["ended_at"], late["steps"], late["until_reached"]) == (40, 40, False)
+
+    out = tmp_path / "meta"
+    command = ["train-meta", str(run / "ensemble"), "--options", str(tmp_path / "early"), "--out", str(out), *FEW]
+    assert main(command) == 0
+    agent = read_run(open_artefact(out), "meta")
+    assert agent.config["options_ended_at"] == early["ended_at"] and agent.budget == early["ended_at"] + 200
+    assert early["ended_at"] < agent.episodes.step[-1] <= agent.budget

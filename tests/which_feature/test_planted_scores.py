@@ -23,7 +23,7 @@ def test_members_that_know_a_factor_each_cover_all() -> None:
     ranked = scores.rankings(SURE, FACTORS)
     assert (ranked == np.where(np.eye(4) == 1, 1.0, 0.5)).all()
     assert (scores.owned(ranked) == np.eye(4, dtype=bool)).all()
-    assert scores.coverage(ranked) == 1.0
+    assert scores.owned(ranked).any(axis=0).mean() == 1.0
     assert scores.redundancy(ranked) == 0.0
 
 
@@ -31,7 +31,7 @@ def test_members_that_know_a_factor_each_cover_all() -> None:
 def test_copies_of_one_member_cover_one_factor(factor: int) -> None:
     """However many there are."""
     ranked = scores.rankings(np.repeat(SURE[:, [factor]], 6, axis=1), FACTORS)
-    assert scores.coverage(ranked) == 0.25
+    assert scores.owned(ranked).any(axis=0).mean() == 0.25
     assert scores.redundancy(ranked) == 1.0
 
 
@@ -39,8 +39,8 @@ def test_members_that_guess_cover_nothing() -> None:
     """And neither do members that always say the same."""
     for seed in range(20):
         guesses = np.random.default_rng(seed).random((320, 4)).astype(np.float32)
-        assert scores.coverage(scores.rankings(guesses, FACTORS)) == 0.0
-    assert scores.coverage(scores.rankings(np.full((320, 4), 0.3, np.float32), FACTORS)) == 0.0
+        assert not scores.owned(scores.rankings(guesses, FACTORS)).any()
+    assert not scores.owned(scores.rankings(np.full((320, 4), 0.3, np.float32), FACTORS)).any()
 
 
 def test_a_member_that_uses_two_factors_owns_neither() -> None:
@@ -50,8 +50,8 @@ def test_a_member_that_uses_two_factors_owns_neither() -> None:
     hint = (0.6 * FACTORS[:, :1] + 0.2 * FACTORS[:, 1:2]).astype(np.float32)
     ranked = scores.rankings(hint, FACTORS)
     assert ranked[0].tolist() == [1.0, 0.75, 0.5, 0.5]
-    assert scores.coverage(ranked) == 0.0
-    assert scores.coverage(ranked, low=0.8) == 0.25
+    assert scores.owned(ranked).any(axis=0).mean() == 0.0
+    assert scores.owned(ranked, low=0.8).any(axis=0).mean() == 0.25
 
 
 def test_redundancy_counts_pairs() -> None:
