@@ -80,6 +80,14 @@ _ALL = (
         ("ensemble", "options"),
     ),
     Stage("descent", ("train-options", "{climbers}", *_set("steps=120", "steps_for=all", *DESCENT)), ("climbers",)),
+    Stage(
+        "audit",
+        (
+            *("audit", "{ensemble}", "--domain", "doorkey", "--sub-goal", "open-red-door"),
+            *_set("steps=800", "environments=8", *QUICK),
+        ),
+        ("ensemble",),
+    ),
     Stage("ppo", ("train-baseline", "doorkey", *_set("agent=ppo", "steps=2560", *QUICK[1:]))),
     Stage("dqn", ("train-baseline", "doorkey", *_set("agent=dqn", "steps=1600", *QUICK[1:]))),
 )

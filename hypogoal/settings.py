@@ -6,13 +6,14 @@ from typing import Any
 from hypogoal.core.config import resolve
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import BaselineConfig
-from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
+from hypogoal.meta.config import AuditConfig, TrainMetaConfig, TrainOptionsConfig
 
 CONFIGS: Mapping[str, type] = {
     "train-ensemble": TrainEnsembleConfig,
     "train-options": TrainOptionsConfig,
     "train-meta": TrainMetaConfig,
     "train-baseline": BaselineConfig,
+    "audit": AuditConfig,
 }
 STAGES = ("collect", *CONFIGS)  # whose settings are its domain's
 TABLES = (*STAGES, "run")  # of presets

@@ -19,8 +19,8 @@ from hypogoal.stages.train_ensemble import unlabelled_file
 
 TESTS = Path(__file__).parent
 FEW = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
-KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison")
-MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/")  # what settings do not say
+KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
+MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")  # what settings do not say
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             made("train-meta", run / "ensemble", "--out", run / name, *settings, *FEW)
         played = ("--set", "steps=128", "--set", "max_episode_steps=20", "-q")
         made("train-baseline", "own_domain:ODD", "--out", run / "ppo", *played)
+        where = ("--domain", "own_domain:DOMAIN", "--sub-goal", "left-end", "--set", "restart_options=false")
+        made("audit", run / "ensemble", "--out", run / "audit", *where, *FEW)
         made("evaluate", run, "-q")
         made("report", run)
         shutil.copytree(run, run.with_name("other"))
@@ -88,7 +90,7 @@ def test_every_file_that_is_gone_is_named(copy: Path) -> None:
             (copy / "aside").rename(artefact.path / name)
             (artefact.path / MANIFEST).write_bytes(before)
             count += 1
-    assert count == 26 and faults_of(copy) == []
+    assert count == 34 and faults_of(copy) == []
     (copy / "ensemble" / "left-end.safetensors").unlink()
     reseal(copy / "ensemble", files={})
     with pytest.raises(UserError, match=r"the artefact is damaged \(left-end\.safetensors: missing"):
@@ -192,13 +194,13 @@ def test_verify_looks_inside_the_folder_only(run: Path, copy: Path, capsys: pyte
     ]
     shutil.rmtree(copy / "ensemble")
     gone = [fault for fault in faults_of(copy) if f"its input {run}/ensemble (ensemble) is gone" in fault]
-    assert len(gone) == 6  # options and metas, and the evaluation
+    assert len(gone) == 7  # options, metas, the audit, and the evaluation
     assert open_artefact(copy / "meta").input("ensemble") == run / "ensemble"  # to a stage it is not
     assert main(["verify", str(copy / "meta"), "--json"]) == 0
     about = json.loads(capsys.readouterr().out)
     assert about["faults"] == [] and "lies outside, not looked at" in about["notes"][0]
     (copy / "ensemble").symlink_to(run / "ensemble")  # which leads outside
-    assert faults_of(copy) == [] and sum("/ensemble (ensemble) lies outside" in note for note in notes_of(copy)) == 6
+    assert faults_of(copy) == [] and sum("/ensemble (ensemble) lies outside" in note for note in notes_of(copy)) == 7
     for relative in ("/", "../../..", "loop"):
         entry = {**open_artefact(copy / "meta").manifest["inputs"][0], "relative": relative}
         os.symlink("loop", copy / "meta" / "loop") if relative == "loop" else None

@@ -172,6 +172,39 @@ def train_baseline(
 
 
 @app.command()
+def audit(
+    classifier: Annotated[str, typer.Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
+    out: Out,
+    domain: Annotated[str, typer.Option(help="Where it is played: doorkey, montezuma, or module:object.")],
+    sub_goal: Annotated[str, typer.Option(help="Of the domain: whose truth counts.")],
+    member: Annotated[int, typer.Option(min=0, help="Of the ensemble.")] = 0,
+    layout_seed: LayoutSeed = None,
+    preset: Preset = None,
+    set_: Set = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Train a policy against a success classifier: how often is it fooled, and where?"""
+    from hypogoal.core import own_code
+    from hypogoal.evaluation.audit import lines_of
+    from hypogoal.settings import configuration
+    from hypogoal.stages.audit import audit as stage
+
+    config = configuration("audit", domain, preset, set_, {"layout_seed": layout_seed}, given=True)
+    with own_code.given(classifier, domain):
+        report = stage(
+            classifier, config, out, domain=domain, sub_goal=sub_goal, member=member,
+            seed=seed, force=force, resume=resume, quiet=quiet, device=device,
+        )  # fmt: skip
+    for line in () if quiet else lines_of(report):
+        say(line)
+    give(out)
+
+
+@app.command()
 def evaluate(
     run: Annotated[Path, typer.Argument(help="A run: a folder with artefacts in it.")],
     out: Annotated[Path | None, typer.Option("--out", help="Default: RUN/evaluation.")] = None,

@@ -61,7 +61,7 @@ class Artefact:
 
     @property
     def kind(self) -> str:
-        """ensemble, options, meta, baseline, evaluation or report."""
+        """ensemble, options, meta, baseline, evaluation, report, comparison or audit."""
         return str(self.manifest["kind"])
 
     @property

@@ -120,11 +120,12 @@ def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
     What it may have and its settings do not say (figures, videos, ``executions.csv``, ``exploits.csv``) only its
     manifest knows.
     """
-    if kind in ("options", "meta"):
+    if kind in ("options", "meta", "audit"):
         played = {LOG, EPISODES, LAYOUT, OPTIONS, "choices.csv", "terminations.h5"}
         played |= {"initiation.safetensors"} if config.get("initiation") == "learned" else set()
         played |= {"visited.h5"} if config.get("save_visited") else set()
         chooses = kind == "meta" and config.get("chooser") in ("ppo", "thompson", "exp3")
+        played |= {"audit.json", "exploits.csv"} if kind == "audit" else set()
         return played | ({"meta.safetensors"} if chooses else set())
     scored = {SCORES} if config.get("score_every") else set()
     return {

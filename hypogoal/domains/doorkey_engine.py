@@ -92,7 +92,7 @@ class DoorKeyEngine(Engine):
 
     n_actions = N_ACTIONS
     observation_shape = OBSERVATION_SHAPE
-    resumes = True
+    restarts = resumes = True
     n_states = 0
 
     def __init__(
@@ -134,6 +134,9 @@ class DoorKeyEngine(Engine):
         self.ids = np.full(self.count, START, np.int64)
         self.elapsed = np.zeros(self.count, np.int64)
         return self.ids.copy()
+
+    def restart(self, where: NDArray[np.bool_]) -> None:
+        self.ids, self.elapsed = np.where(where, START, self.ids), np.where(where, 0, self.elapsed)
 
     def step(self, actions: NDArray[np.int64]) -> Step:
         next_ids = self.follow(self.ids, actions)

@@ -54,6 +54,16 @@ LEARNING: Mapping[str, Any] = {
     "epsilon_final": 0.01,
     "random_episodes": 0,
 }
+# And where they are learned by themselves, ladder by ladder.
+ALONE: Mapping[str, Any] = {
+    **LEARNING,
+    "max_episode_steps": MAX_STEPS,
+    "restart_options": True,
+    "mask_reached": False,
+    "chooser": "even",
+    "steps": 40_000,
+    "steps_for": "each",
+}
 
 
 @dataclass(frozen=True)
@@ -147,16 +157,9 @@ class MontezumaDomain(Domain):
                 "class_weight_negative": 0.8,
                 "class_weight_positive": 0.2,
             },
-            "train-options": {
-                **LEARNING,
-                "max_episode_steps": MAX_STEPS,
-                "restart_options": True,
-                "mask_reached": False,
-                "chooser": "even",
-                "steps": 40_000,
-                "steps_for": "each",
-            },
+            "train-options": ALONE,
             "train-meta": LEARNING,
+            "audit": ALONE,
         }
     )
 

@@ -26,17 +26,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Attributions:
-    """DeepLift of every member on n states.
+    """DeepLift of every member on n states."""
 
-    Attributes:
-        values: float64 (n, K, H, W, C), in log-odds; they speak for "reached" where positive.
-        log_odds: float64 (n, K), each member's of each state.
-        baseline_log_odds: float64 (K,), of the baseline.
-    """
-
-    values: NDArray[np.float64]
-    log_odds: NDArray[np.float64]
-    baseline_log_odds: NDArray[np.float64]
+    values: NDArray[np.float64]  # (n, K, H, W, C), in log-odds; they speak for "reached" where positive
+    log_odds: NDArray[np.float64]  # (n, K), each member's of each state
+    baseline_log_odds: NDArray[np.float64]  # (K,), of the baseline
 
     def completeness_error(self) -> NDArray[np.float64]:
         """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""

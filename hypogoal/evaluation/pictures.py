@@ -171,11 +171,11 @@ def _caption(origins: Mapping[str, NDArray[np.int64]], index: int, kinds: Sequen
 
 
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
-    """What is written below a frame: option and member; verdict and time left; why it ended."""
+    """What is written below a frame: option and member, of several; verdict and time left; why it ended."""
     sub_goal, member = sub_goals[frame.option // members], frame.option % members
     verdict = "yes" if frame.says_yes else "no"
     return [
-        f"{sub_goal}, member {member}",
+        f"{sub_goal}, member {member}" if members > 1 else sub_goal,
         f"step {frame.step}   reached? {verdict}   {frame.left} left",
         f"ends: {frame.ended}" if frame.ended else "",
     ]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import page
-from hypogoal.evaluation.numbers import Metrics, Row, grouped, method_rank, over, rows_of
+from hypogoal.evaluation.numbers import Metrics, Row, grouped, mean_of, method_rank, over, rows_of
 from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.hypotheses.scores import best_threshold, by_member, cross_fitted, halves, member_scores, ranking
 
@@ -75,7 +75,10 @@ def numbers(work: Work) -> dict[str, Any]:
         entry: dict[str, Any] = dict(zip(("name", "groups", "sub_goal"), key, strict=True))
         entry["ensembles"], cell = len(alike), [str(part) for part in key]
         for name in OF_MEMBERS:
-            means = [_mean([row[name] for row in goal["ranking"]["members"]]) for _, goal in alike]
+            means = [
+                mean_of([v for row in goal["ranking"]["members"] if not math.isnan(v := row[name])])
+                for _, goal in alike
+            ]
             entry[name] = over(means, "fraction", *cell, name)
         for name in CROSSED.values():
             entry[name] = over([goal["ranking"][name] for _, goal in alike], "fraction", *cell, name)
@@ -86,11 +89,6 @@ def numbers(work: Work) -> dict[str, Any]:
 def _cell(judged: tuple[Entry, Entry]) -> tuple[str, int | None, str]:
     ensemble, goal = judged
     return ensemble.get("method", ensemble["name"]), ensemble.get("groups"), goal["sub_goal"]
-
-
-def _mean(values: Sequence[float]) -> float:
-    numbers = np.array(values, dtype=np.float64)
-    return float(numbers[~np.isnan(numbers)].mean()) if not np.isnan(numbers).all() else math.nan
 
 
 def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:

@@ -148,10 +148,14 @@ def match_on_layout(path: Path, layout_seed: int) -> NDArray[np.float64]:
 
 def states_of_layout(engine: Engine) -> NDArray[np.int64]:
     """Of a fresh engine's layout the states that can be reached, else those that random play meets; each once."""
-    if (reachable := engine.reachable()) is not None:
-        return reachable
-    rng, met = rng_for(0, "states-of-layout"), [engine.ids]
-    for _ in range(2_000 // engine.count):
+    reachable = engine.reachable()
+    return states_met(engine, 2_000, rng_for(0, "states-of-layout")) if reachable is None else reachable
+
+
+def states_met(engine: Engine, steps: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """The states that random play of an engine meets in so many steps, each once."""
+    met = [engine.ids]
+    for _ in range(steps // engine.count):
         met.append(step_of(engine, rng.integers(engine.n_actions, size=engine.count)).next_ids)
     return np.unique(np.concatenate(met))
 

@@ -6,6 +6,7 @@ What each is worth on DoorKey: ``docs/results/thresholds-doorkey.md``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,12 @@ PAPER = "0.5"
 CERTAIN = 1e-12  # probabilities nearer to 0 or 1 are taken as this near
 Probabilities = NDArray[np.float32]  # (states,), one member's
 Rule = Callable[[Probabilities, Probabilities, Probabilities], np.floating]
+
+
+def log_odds_of(probabilities: NDArray[Any]) -> NDArray[np.float64]:
+    """Of probabilities (...,), always finite."""
+    exact = probabilities.astype(np.float64).clip(CERTAIN, 1 - CERTAIN)
+    return np.asarray(np.log(exact) - np.log1p(-exact))
 
 
 def _half(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
@@ -30,8 +37,7 @@ def _unlabelled_q95(positives: Probabilities, negatives: Probabilities, unlabell
 
 def unlabelled_split(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
     """Otsu (1979): the cut of the unlabelled states' logits into two classes that leaves least variance within them."""
-    probabilities = np.sort(unlabelled.astype(np.float64).clip(CERTAIN, 1 - CERTAIN))
-    logits = np.log(probabilities) - np.log1p(-probabilities)
+    logits = log_odds_of(np.sort(unlabelled))
     if len(logits) < 2:
         return np.float64(0.5)
     below = np.arange(1, len(logits))

@@ -132,3 +132,23 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
         source="ours: controls; Thompson 1933; Auer et al. 2002",
         choices=("ppo", "random", "thompson", "exp3"),
     )
+
+
+@dataclass(frozen=True)
+class AuditConfig(TrainOptionsConfig):
+    """How the policies are learned that are to fool a classifier, and what is tried against them."""
+
+    option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
+    restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
+    mask_reached: bool = setting(False, "do not begin executions where the classifier says yes already")
+    steps: int = setting(80_000, "environment steps, those of all policies together", unit="steps", low=1)
+    chooser: str = setting("even", "the policy with the fewest steps so far plays, or any", choices=("random", "even"))
+    threshold: float = setting(
+        0.0,
+        "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers",
+        low=0.0,
+        high=1.0,
+    )
+    mend: float = setting(
+        0.95, "a second policy is learned against yes above this higher probability; 0: none", low=0.0, high=1.0
+    )

@@ -46,15 +46,16 @@ def assemble(
     config: TrainOptionsConfig | TrainMetaConfig,
     seed: int,
     device: str = "cpu",
+    ends: Callable[[Engine], Terminations] | None = None,
 ) -> OptionLoop:
     """The environments of one layout, an ensemble's options in them, fresh policies of these and over these.
 
     ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, start states. Where the domain has no such start, or not the true sub-goals at which options are to end, it
-    is a ``UserError``.
+    several, start states; ``ends`` gives terminations that are no ensemble's. Where the domain has no such start, or
+    not the true sub-goals at which options are to end, it is a ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
-    columns = _columns(domain, sub_goals) if oracle else []
+    columns = columns_of(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
     arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
@@ -62,15 +63,17 @@ def assemble(
         if (shortest := engine.shortest_path()) is None:
             raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
         engine.max_steps = math.ceil(config.cap * shortest)
-    if oracle:
+    if ends:
+        terminations = ends(engine)
+    elif oracle:
         terminations = oracle_terminations(engine, columns)
     else:
         ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in sub_goals]
         alone = config.experience == "own" and not config.mask_reached
         terminations = learned_terminations(engine, ensembles, running_only=alone, rule=config.termination)
-        _check_rule(terminations, config)
         if (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
+    _check_rule(terminations, config)
     seen = None
     if config.policy_view == "agent-crop":
         if config.network != "light":
@@ -111,7 +114,7 @@ def nearness(
     sub_goals = about["sub_goals"]
     if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
         return None
-    columns = np.repeat(_columns(domain, sub_goals), about["members"])
+    columns = np.repeat(columns_of(domain, sub_goals), about["members"])
 
     def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
         with UsersCode("the engine's labels", engine, "labels"):
@@ -143,15 +146,12 @@ def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
         raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
 
 
-def _columns(domain: Domain, sub_goals: Sequence[str]) -> list[int]:
-    """Where among the domain's own these sub-goals are."""
+def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
+    """Where among the domain's own these sub-goals are; a ``UserError`` that says ``do`` where one is not."""
     for sub_goal in sub_goals:
         if sub_goal not in domain.sub_goals:
-            raise UserError(
-                f"{domain.name} does not know where {sub_goal!r} is true",
-                "termination=oracle",
-                f"It knows of {', '.join(domain.sub_goals)}; leave the setting out for members' verdicts.",
-            )
+            what, known = f"{domain.name} does not know where this is true", ", ".join(domain.sub_goals)
+            raise UserError(what, sub_goal, f"It knows of {known}. {do}")
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 

@@ -22,6 +22,7 @@ class Outcome:
 
     environments: NDArray[np.int64]  # in which they ran
     options: NDArray[np.int64]  # that they were of
+    began: NDArray[np.int64]  # the states in which these were chosen
     reached: NDArray[np.bool_]  # the options' own classifiers ended them
     inside: NDArray[np.bool_]  # these said yes already where they began
     counted: NDArray[np.bool_]  # they began where the domain says that they should (Spec D4)

@@ -136,6 +136,7 @@ class OptionLoop(Resumable):
         outcome = Outcome(
             environments=done,
             options=self.option[done],
+            began=self.began[done],
             reached=reached[done],
             inside=self.inside[done],
             counted=self.counted[done],

@@ -30,9 +30,10 @@ class Execution(NamedTuple):
     inside_at_start: bool  # its own classifier said yes where it began
     terminated: bool  # it ended in a terminal state of the episode
     states: list[int]  # the ids of those that it came to, the last one that it ended in
+    began: int = -1  # the id of the one before them; -1 of a checkpoint from before it was kept
 
 
-EXECUTION_COLUMNS = (*Execution._fields[:-1], "room", "x", "y", "distance")
+EXECUTION_COLUMNS = (*Execution._fields[:-2], "room", "x", "y", "distance")
 EXPLOIT_COLUMNS = ("step", "option", "reached", "near", "best_near", "best_far")
 
 
@@ -85,7 +86,8 @@ class Recorder(Resumable):
         np.add.at(self._window[:, 4], options, outcome.durations)
         columns = (options, outcome.durations, reached, outcome.inside, outcome.terminated)
         states = [self._states[place] for place in outcome.environments[outcome.counted].tolist()]
-        for row in zip(*(values[outcome.counted].tolist() for values in columns), states, strict=True):
+        began = outcome.began[outcome.counted].tolist()
+        for row in zip(*(values[outcome.counted].tolist() for values in columns), states, began, strict=True):
             self.executions[row[0]].append(Execution(self.steps, *row))
         for place in outcome.environments.tolist():
             self._states[place] = []
@@ -144,7 +146,7 @@ class Recorder(Resumable):
         write_table(
             folder / "executions.csv",
             EXECUTION_COLUMNS,
-            [(*map(int, row[:-1]), *map(int, at[n]), int(away[n])) for n, row in enumerate(rows)],
+            [(*map(int, row[:-2]), *map(int, at[n]), int(away[n])) for n, row in enumerate(rows)],
         )
 
     def write_exploits(

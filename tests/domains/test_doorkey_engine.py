@@ -292,3 +292,16 @@ def test_wrong_arguments_are_refused() -> None:
         DoorKeyEngine(0, 2).step(np.array([0, 7]))
     with pytest.raises(ValueError, match="uint8"):
         DoorKeyEngine(0, 2).images(np.array([0, 0]), np.empty((2, 64, 64, 3), np.float32))
+
+
+def test_an_episode_begins_when_asked() -> None:
+    """Spec D4: where it is asked for, at the start and with all of its steps left; elsewhere nothing changes."""
+    engine = DoorKeyEngine(100, 3, max_steps=4)
+    for action in (0, 0):  # turn left
+        engine.step(np.full(3, action))
+    before = engine.ids.copy()
+    engine.restart(np.array([False, True, False]))
+    assert engine.ids.tolist() == [before[0], START, before[2]] and before[0] != START
+    assert engine.elapsed.tolist() == [2, 0, 2]
+    engine.step(np.zeros(3, np.int64))
+    assert engine.step(np.zeros(3, np.int64)).truncated.tolist() == [True, False, True]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import csv
 import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from test_docs import blocks, commands
 
 from hypogoal.cli import main
@@ -83,6 +85,31 @@ def test_the_example_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> N
     """Spec B6: the page's first command."""
     assert main(["check", "unlock_pickup:DOMAIN", *LAYOUTS]) == 0
     assert "FAIL" not in capsys.readouterr().out
+
+
+def test_the_audits_page_audits_its_classifier(tmp_path: Path) -> None:
+    """Spec H5: the page's command, on the shortest ways instead of learned ones, fools the classifier as the page says.
+
+    The film in the page is the one that the command makes.
+    """
+    page = EXAMPLES.parent / "docs" / "audit.md"
+    words = commands(page)[0]
+    out = tmp_path / "audit"
+    quick = settings("network=planned", "steps=320")
+    assert main([*words[1 : words.index("--out")], "--out", str(out), *quick]) == 0
+    report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
+    assert (report["before"]["fires_far"], report["mended"]["fires_far"]) == (1.0, 0.0)
+    assert [kind["holds"] for kind in report["before"]["kinds"]] == [[]]
+    film = page.with_name("audit.gif")
+    assert film.stat().st_size < 300_000
+    with Image.open(film) as shown, Image.open(out / "before-1.gif") as made:
+        assert shown.n_frames == made.n_frames == 4
+    with (page.parent / "results" / "audit-layouts.csv").open(newline="", encoding="utf-8") as file:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    assert len(rows) == 20 and all(row["executions"] == row["mended_executions"] == 100 for row in rows)
+    fooled = [f"{row['layout']:.0f}" for row in rows if row["fooled"] == 100]
+    assert f"On layouts {', '.join(fooled[:-1])} and {fooled[-1]} every" in page.read_text(encoding="utf-8")
+    assert sum(row["there"] for row in rows) == 1_600 and {row["mended_there"] for row in rows} == {100}
 
 
 @pytest.mark.atari

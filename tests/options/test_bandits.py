@@ -57,7 +57,7 @@ def ended(bandit: Bandit, returned: list[float], terminated: list[bool], truncat
     """What the options that run in both environments came to."""
     no, one = np.zeros(2, np.bool_), np.ones(2)
     over = np.array(terminated), np.array(truncated)
-    bandit.record(Outcome(HERE, HERE, no, no, ~no, np.array(returned), HERE, one, HERE, *over))
+    bandit.record(Outcome(HERE, HERE, HERE, no, no, ~no, np.array(returned), HERE, one, HERE, *over))
 
 
 def only(*options: int) -> NDArray[np.bool_]:

@@ -1,0 +1,132 @@
+"""How often policies fool a success classifier, and where (Spec H5).
+
+A classifier can be right on nearly all states that are met, and wrong where a policy stops that was trained to have it
+say yes. So options are learned that end where it does, and of their executions the truth is asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core import own_code
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine
+from hypogoal.evaluation.exploits import option_numbers
+from hypogoal.evaluation.numbers import grouped
+from hypogoal.evaluation.pictures import episode_gif
+from hypogoal.evaluation.selection import states_met
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.scores import member_scores
+from hypogoal.hypotheses.thresholds import log_odds_of
+from hypogoal.meta.episodes import Frame
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.recording import Execution
+
+POLICIES = ("before", "mended")
+CHUNK = 256  # observations that own code is given at once
+CELL = 8  # of positions that count as one place
+FILMS = 4  # kinds that are shown
+RANDOM_STEPS = 4_000  # of random play
+Classifier = Callable[[Engine, NDArray[np.int64]], NDArray[np.floating]]  # state ids (n,) -> log-odds (n,)
+
+
+def own_classifier(name: str) -> Classifier:
+    """Code of the user's own, from observations uint8 (n, *obs) to probabilities (n,); else a ``UserError``."""
+    function = own_code.load_own(name, "classifier", "hypogoal.classifiers", {})
+    if not callable(function):
+        raise UserError("this is no function", name, "Give one from uint8 (N, H, W, C) to probabilities (N,).")
+
+    def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
+        told = []
+        for some in np.split(ids, range(CHUNK, len(ids), CHUNK)):
+            with own_code.UsersCode(f"the classifier {name}", function) as code:
+                given = np.asarray(function(engine.images(some)), dtype=np.float64)
+                if given.shape != some.shape or not ((given >= 0) & (given <= 1)).all():
+                    gave = f"gave {given.shape}, {given.min():g} to {given.max():g}" if given.size else "gave nothing"
+                    code.refuse(gave, f"Give probabilities, 0 to 1, float ({len(some)},).")
+            told.append(log_odds_of(given))
+        return np.concatenate(told)
+
+    return classify
+
+
+def member_of(ensemble: Ensemble, member: int) -> Classifier:
+    """A member of an ensemble; a ``UserError`` where there is no such one."""
+    if member >= len(ensemble):
+        raise UserError("the ensemble has no such member", member, f"Give --member, 0 to {len(ensemble) - 1}.")
+
+    def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
+        positions = engine.positions(ids) if ensemble.needs_positions else None
+        return ensemble.log_odds(engine.images(ids), positions)[:, member]
+
+    return classify
+
+
+def random_play(loop: OptionLoop, column: int, rng: np.random.Generator) -> dict[str, Any]:
+    """The classifier's scores, of sub-goal number ``column``, on the states that random actions lead to, each once."""
+    engine = loop.engine
+    engine.reset()
+    ids = states_met(engine, RANDOM_STEPS, rng)
+    ids = ids[engine.remembers(ids)]
+    truth, says_yes = engine.labels(ids)[:, column], loop.terminations.of(ids)[:, :1]
+    scores = {name: score.item() for name, score in member_scores(says_yes, truth).items()}
+    return {"states": len(ids), "positives": int(truth.sum()), **scores}
+
+
+def findings(
+    loop: OptionLoop, table: dict[str, NDArray[np.float64]], option: int, sub_goals: Sequence[str], folder: Path
+) -> dict[str, Any]:
+    """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
+
+    False yes are of one kind where the same sub-goals hold and, of engines that know positions, the cell is the same;
+    of each of the most frequent kinds a film of the shortest execution is put into ``folder``.
+    """
+    engine, own, rows = loop.engine, table["option"] == option, list(loop.recorder.executions[option])
+    says_yes, near = table["reached"][own] > 0, table["near"][own] > 0
+    fooled = [row for row, wrong in zip(rows, says_yes & ~near, strict=True) if wrong]
+
+    def kind_of(row: Execution) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        end = np.array(row.states[-1:])
+        cell = engine.positions(end)[0] // CELL if engine.position_names else np.zeros(0, dtype=np.int64)
+        return tuple(np.array(sub_goals)[engine.labels(end)[0]].tolist()), tuple(cell.tolist())
+
+    kinds: list[dict[str, Any]] = []
+    for (holds, _), alike in sorted(grouped(fooled, kind_of).items(), key=lambda item: -len(item[1])):
+        row = min(alike, key=lambda row: row.duration)
+        path = np.array([row.began, *row.states])
+        at = engine.positions(path[-1:])[0].tolist() if engine.position_names else []
+        film = f"{POLICIES[option]}-{len(kinds) + 1}.gif"
+        if shown := len(kinds) < FILMS and bool(engine.remembers(path).all()):
+            (folder / film).write_bytes(_film(loop, path, option))
+        about = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
+        kinds.append({"executions": len(alike), **about, "film": film if shown else None})
+    ends = {"fooled": len(fooled), "there": int((says_yes & near).sum())}
+    begun = {"yes_at_start": sum(row.inside_at_start for row in rows)}
+    return option_numbers(table, option) | ends | begun | {"kinds": kinds}
+
+
+def _film(loop: OptionLoop, path: NDArray[np.int64], option: int) -> bytes:
+    """An execution that ended in a false yes, from where it began."""
+    timeout = loop.config.option_timeout
+    states = zip(loop.engine.images(path), loop.terminations.of(path)[:, option].tolist(), strict=True)
+    frames = [Frame(picture, step, option, yes, timeout - step, "") for step, (picture, yes) in enumerate(states)]
+    return episode_gif([*frames[:-1], replace(frames[-1], ended="fooled")], POLICIES, 1, timeout)
+
+
+def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
+    """What ``audit.json`` says, for a terminal of 80 columns."""
+    chance = report["random_play"]
+    yield f"random play: right in {chance['accuracy']:.1%} of {chance['states']} states"
+    for name in POLICIES:
+        if row := report[name]:
+            ends = f"fooled in {row['fooled']} of {row['executions']} executions, there in {row['there']}"
+            yield f"{name}, yes above {row['threshold']:.4g}: {ends}"
+            for kind in row["kinds"][:FILMS]:
+                what = " and ".join(kind["holds"]) or "no sub-goal"
+                yield f"  {kind['film'] or '':12s} {kind['executions']:4d} x  while {what} holds"

@@ -1,0 +1,252 @@
+"""Spec H5: policies are trained against a success classifier: what they are fooled by, and what a mend changes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from own_domain import CorridorDomain, TallCorridor
+from PIL import Image
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.manifests import files_of
+from hypogoal.core.own_code import OF_FILE
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles
+from hypogoal.evaluation.audit import CELL, FILMS, lines_of
+from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.stages.collect import collect
+from hypogoal.stages.train_ensemble import train_ensemble
+
+BLUE_FIRST = "101"  # a layout on which the blue key is nearer than the red one
+Pictures = NDArray[np.uint8]
+
+
+def gone(pictures: Pictures, colour: int) -> NDArray[np.bool_]:
+    """Whether no key of a colour (0, 1, 2: blue, green, red) lies on the floor, bool (N,)."""
+    side = pictures.shape[1] // TILE
+    cells = pictures.reshape(-1, side, TILE, side, TILE, 3).swapaxes(2, 3)
+    return ~(cells == tiles()[KEY + colour]).all((3, 4, 5)).any((1, 2))
+
+
+def takes_blue_for_red(pictures: Pictures) -> NDArray[np.float64]:
+    """It is surer where the red key is gone."""
+    return np.where(gone(pictures, 2), 0.99, np.where(gone(pictures, 0), 0.9, 0.02))
+
+
+def white_at(pictures: Pictures, cell: int) -> NDArray[np.bool_]:
+    """Whether the agent of the corridor is in a cell."""
+    return pictures[:, 0, 8 * cell, 0] > 0
+
+
+def left_end(pictures: Pictures) -> NDArray[np.bool_]:
+    return white_at(pictures, 0)
+
+
+def too_soon(pictures: Pictures) -> list[float]:
+    return [0.6 if soon else 0.1 for soon in white_at(pictures, 1)]
+
+
+def beside_the_start(pictures: Pictures) -> NDArray[np.bool_]:
+    return white_at(pictures, 1) | white_at(pictures, 3)
+
+
+def of_no_shape(pictures: Pictures) -> NDArray[np.float64]:
+    return np.full((len(pictures), 2), 0.5)
+
+
+def no_probability(pictures: Pictures) -> NDArray[np.float64]:
+    return np.full(len(pictures), np.nan)
+
+
+class Placed(TallCorridor):
+    """The corridor, which begins episodes when asked and knows where the agent is: a cell of it is one place."""
+
+    restarts, position_names = True, ("x",)
+
+    def restart(self, where: NDArray[np.bool_]) -> None:
+        self.ids, self.elapsed = np.where(where, 2, self.ids), np.where(where, 0, self.elapsed)
+
+    def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.asarray(ids)[:, None] * CELL
+
+
+class PlacedDomain(CorridorDomain):
+    """The corridor with these."""
+
+    name = f"{__name__}:PLACED"
+
+    def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> TallCorridor:
+        return Placed(count, max_steps)
+
+
+PLACED = PlacedDomain()
+
+
+def settings(*pairs: str) -> list[str]:
+    return [word for pair in pairs for word in ("--set", pair)]
+
+
+QUICK = settings("environments=4", "warm_up=50", "epsilon_steps=300", "option_timeout=10", "option_batch=24")
+CORRIDOR = ["--domain", PLACED.name, "--sub-goal", "left-end", *QUICK]
+
+
+def audited(out: Path, classifier: str, *words: str) -> tuple[dict[str, Any], list[dict[str, str]]]:
+    """``audit.json`` and ``exploits.csv`` of an audit of an ensemble or of a function of this module."""
+    target = classifier if "/" in classifier else f"{__name__}:{classifier}"
+    assert main(["audit", target, "--out", str(out), "-q", *words]) == 0
+    assert main(["verify", str(out)]) == 0
+    report = json.loads((out / "audit.json").read_text(encoding="utf-8"))
+    with (out / "exploits.csv").open(newline="", encoding="utf-8") as file:
+        return report, list(csv.DictReader(file))
+
+
+def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Path) -> None:
+    """Spec H5: on the shortest ways, where all can be said: the planted kind, its film, and that the mend ends it."""
+    where = ["--domain", "doorkey", "--sub-goal", "collect-red-key", "--layout-seed", BLUE_FIRST]
+    out = tmp_path / "audit"
+    report, rows = audited(out, "takes_blue_for_red", *where, *settings("network=planned", "steps=1600"))
+    before, mended = report["before"], report["mended"]
+    assert (before["threshold"], before["fires_far"], before["there"]) == (0.5, 1.0, 0)
+    assert before["fooled"] == before["executions"] >= 40
+    film = "before-1.gif"
+    kind = {"executions": before["fooled"], "holds": ["collect-blue-key"], "position": {}, "film": film}
+    assert before["kinds"] == [kind]
+    assert (mended["threshold"], mended["fires_far"], mended["fires_near"], mended["kinds"]) == (0.95, 0.0, 1.0, [])
+    assert mended["there"] == mended["executions"] >= 40
+    chance = report["random_play"]
+    assert 0.5 < chance["accuracy"] < 1 and chance["precision"] < 1 and chance["recall"] == 1
+    assert {(row["option"], row["reached"], row["near"]) for row in rows} == {("0", "1", "0"), ("1", "1", "1")}
+
+    engine = DoorKeyEngine(int(BLUE_FIRST))
+    ids, away = engine.distances()
+    steps = int(away[engine.labels(ids)[:, 0]].min())
+    with Image.open(out / film) as drawn:
+        assert drawn.n_frames == steps + 1, "from where it began"
+    artefact = open_artefact(out, "audit")
+    more = artefact.manifest["files"].keys() - files_of("audit", artefact.config)
+    assert more == {film}
+    assert f"  {film} {before['fooled']:4d} x  while collect-blue-key holds" in list(lines_of(report))
+    assert max(map(len, lines_of(report))) <= 80
+
+
+def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> None:
+    """Spec H5: learned; where it was fooled is told by place; without a mend there is one policy."""
+    report, _ = audited(tmp_path / "soon", "too_soon", *CORRIDOR, *settings("steps=2000"))
+    before, mended = report["before"], report["mended"]
+    assert before["fires_far"] >= 0.9 and before["came_near"] <= 0.05
+    assert [(kind["holds"], kind["position"]) for kind in before["kinds"]] == [([], {"x": CELL})]
+    assert (mended["fooled"], mended["there"], mended["kinds"]) == (0, 0, []) and mended["executions"] > 20
+
+    truth, _ = audited(tmp_path / "truth", "left_end", *CORRIDOR, *settings("steps=1500", "mend=0"))
+    assert truth["mended"] is None
+    assert (truth["random_play"]["accuracy"], truth["before"]["fires_far"]) == (1.0, 0.0)
+    assert truth["before"]["there"] >= 50
+
+
+def test_places_are_kinds_of_their_own(tmp_path: Path) -> None:
+    """Spec H5: two places that look like success to it are two kinds, the more frequent first, each with its film."""
+    played = settings("steps=400", "mend=0", "warm_up=400", "option_timeout=1")  # nothing is learned, so both are met
+    report, _ = audited(tmp_path / "audit", "beside_the_start", *CORRIDOR, *played)
+    kinds = report["before"]["kinds"]
+    assert {kind["position"]["x"] for kind in kinds} == {1 * CELL, 3 * CELL} and FILMS > 1
+    assert sum(kind["executions"] for kind in kinds) == 100 and kinds[0]["executions"] >= kinds[1]["executions"]
+    assert [kind["film"] for kind in kinds] == ["before-1.gif", "before-2.gif"]
+
+
+def test_a_broken_audit_is_resumed_to_the_last_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec G1."""
+    words = ["audit", f"{__name__}:too_soon", *CORRIDOR, "-q", *settings("steps=800")]
+    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+
+    seen: list[Checkpoints] = []
+
+    def offer(checkpoints: Checkpoints, state: Callable[[], State]) -> None:
+        seen.append(checkpoints)
+        if len(seen) == 120:
+            checkpoints.save(state())
+        if len(seen) == 150:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "offer", offer)
+        assert main([*words, "--out", str(tmp_path / "broken")]) == 130
+    assert not (tmp_path / "broken").exists()
+    assert main([*words, "--out", str(tmp_path / "broken"), "--resume"]) == 0
+    names = {file.name for file in (tmp_path / "whole").iterdir()} - {"manifest.json"}
+    assert {"audit.json", "exploits.csv", "options.safetensors", "before-1.gif"} <= names
+    for name in names:
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "broken" / name).read_bytes(), name
+
+
+@pytest.fixture(scope="module")
+def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two members, barely trained."""
+    folder = tmp_path_factory.mktemp("member")
+    collect(DOMAIN, DoorKeyConfig(heldout_layouts=1, unlabelled_seeds=(1,), keyring=False), folder / "d.h5", quiet=True)
+    rule = "positives-median"
+    few = TrainEnsembleConfig(steps=10, members=2, workers=1, sub_goals=("open-red-door",), threshold=rule)
+    train_ensemble(folder / "d.h5", few, folder / "ensemble", quiet=True)
+    return folder / "ensemble"
+
+
+def test_a_member_is_audited_at_its_own_threshold(ensemble: Path, tmp_path: Path) -> None:
+    """Spec H5: in the world of its data; the states that fooled it can be kept, to label them."""
+    source = open_artefact(ensemble)
+    wanted = read_ensemble(ensemble, source.config, "open-red-door").thresholds[1].item()
+    few = settings("steps=640", "warm_up=100", "random_episodes=2", "save_visited=20", "mend=0.999999")
+    words = ["--domain", "doorkey", "--sub-goal", "open-red-door", "--member", "1", *few]
+    report, _ = audited(tmp_path / "audit", str(ensemble), *words)
+    assert report["before"]["threshold"] == pytest.approx(wanted) and wanted != 0.5
+    manifest = open_artefact(tmp_path / "audit", "audit").manifest
+    assert [entry["kind"] for entry in manifest["inputs"]] == ["ensemble"] and manifest["config"]["member"] == 1
+    assert manifest["config"]["domain_config"] == source.config["domain_config"]
+    assert manifest["config"]["domain_config"]["keyring"] is False and "visited.h5" in manifest["files"]
+
+
+DOOR = "--domain doorkey --sub-goal go-to-goal"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (f"{__name__}:left_end --domain doorkey --sub-goal fly", "does not know where this is true: fly"),
+        (f"{__name__}:nothing {DOOR}", "the classifier cannot be loaded"),
+        (f"{__name__}:BLUE_FIRST {DOOR}", "this is no function"),
+        (f"left_end {DOOR}", "no such artefact"),
+        (f"{__name__}:of_no_shape {DOOR}", "gave ("),
+        (f"{__name__}:no_probability {DOOR}", "Give probabilities, 0 to 1,"),
+        (f"{__name__}:left_end {DOOR} --set mend=0.4", "mends no threshold of 0.5"),
+        (f"{__name__}:left_end {DOOR} --set termination=oracle", "an audit is of one classifier alone"),
+        (f"{__name__}:left_end {DOOR} --set policy_view=agent-crop", "an audit is of one classifier alone"),
+        (f"{__name__}:left_end {DOOR} --set termination=dwell:2", "Give --set experience=own."),
+        (f"{__name__}:left_end --domain own_domain:DOMAIN --sub-goal left-end", "cannot begin an episode when asked"),
+        ("{ensemble} --domain doorkey --sub-goal open-red-door --member 2", "no such member: 2"),
+        ("{ensemble} --domain doorkey --sub-goal go-to-goal", "unknown sub-goal: go-to-goal"),
+    ],
+)
+def test_mistakes(words: str, told: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: one line that says what to do, exit code 2, nothing written."""
+    assert main(["audit", *words.format(ensemble=ensemble).split(), "--out", str(tmp_path / "audit"), "-q"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and told in lines[0], lines
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_files_word_is_not_the_users(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec H8: a classifier that a sweep's file names is loaded only where the user allowed it."""
+    monkeypatch.setenv(OF_FILE, "1")
+    words = ["--domain", "doorkey", "--sub-goal", "go-to-goal", "--out", str(tmp_path / "audit"), "-q"]
+    assert main(["audit", f"{__name__}:left_end", *words]) == 2
+    assert "a file names code of its own as its classifier" in capsys.readouterr().err
