@@ -207,7 +207,7 @@ def tables_that_hold(path: Path) -> Iterator[str]:
     missed = [ladder for ladder in LADDERS if np.mean([*inside.get(("oracle", ladder), {}).values()] or 0) > 0.5]
     groups = {
         "nine whose base does not run on": [ladder for ladder in LADDERS if ladder not in RUN_ON],
-        f"of these without {' and '.join(missed)}": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *missed)],
+        f"of these without {', '.join(missed)}": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *missed)],
         "three whose base runs on": list(RUN_ON),
     }
     yield "Mean member, mean over ladders; Student's 95 % interval over the seeds that have all of these ladders."
