@@ -49,6 +49,11 @@ def at_right(env: gymnasium.Env) -> bool:
     return env.unwrapped.cell == LENGTH - 1  # type: ignore[attr-defined]
 
 
+def all_labels(env: gymnasium.Env) -> dict[str, bool]:
+    """Both in one, the other way round."""
+    return {"right-end": at_right(env), "left-end": at_left(env)}
+
+
 SUB_GOALS = {"left-end": at_left, "right-end": at_right}
 DOMAIN = GymnasiumDomain(CorridorEnv, SUB_GOALS)
 

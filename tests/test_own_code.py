@@ -54,6 +54,10 @@ def labelling(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "lie": lambda env: value})
 
 
+def labelling_all(value: Any) -> GymnasiumDomain:
+    return GymnasiumDomain(CorridorEnv, ("left-end", "lie"), labels=lambda env: value)
+
+
 def choosing(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=lambda env, observation, rng: value)
 
@@ -93,6 +97,16 @@ LIES: list[tuple[GymnasiumDomain, str]] = [
     (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none, but a NoneType"),  # type: ignore[arg-type, return-value]
     (GymnasiumDomain(Spaceless, SUB_GOALS), "the environment has no spaces: AttributeError: "),
     *((labelling(value), "a sub-goal's function gave the label ") for value in [*ENDS, object()]),
+    *(
+        (labelling_all({"left-end": True, "lie": value}), "the function of all labels gave the label of lie ")
+        for value in [*ENDS, object()]
+    ),
+    (labelling_all({"left-end": True}), "the function of all labels gave no label of lie: test_own_code.py, line "),
+    (
+        labelling_all({"left-end": True, "lie": True, 3: 1}),
+        "gave a label of 3, which is no sub-goal: test_own_code.py",
+    ),
+    *((labelling_all(value), "the function of all labels gave no dictionary but a ") for value in (None, [True, True])),
     *(
         (choosing(value), "the domain's policy gave the action ")
         for value in [77, -1, 1.5, None, "1", True, np.array([0, 1]), NAN]

@@ -107,6 +107,10 @@ class Engine(ABC):
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """True sub-goal predicates, bool (n, G): the oracle that only evaluation and the upper bound may see."""
 
+    def labels_now(self) -> NDArray[np.bool_]:
+        """The labels of the environments' current states, bool (E, G), asked anew where they are kept by id."""
+        return self.labels(self.ids)
+
     def room_for(self, count: int, out: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         """Where to draw ``count`` observations: ``out``, a ``ValueError`` where it does not fit, or a new array."""
         shape = (count, *self.observation_shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from math import prod
@@ -56,7 +56,9 @@ class GymnasiumDomain(Domain):
         make: makes an environment: observations uint8 (H, W, C) or (H, W), actions ``Discrete``. What ``seed`` of
             ``reset`` fixes is the layout: the same seed and actions give the same episode. Its arguments are the
             domain's own settings, see ``config_class``.
-        sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state.
+        sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state, however
+            it came there; or names alone, with ``labels``.
+        labels: for names alone, one function from the environment to all of ``{name: bool}``.
         policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: distinct states that training keeps pictures of, see ``GymnasiumEngine``.
@@ -72,8 +74,9 @@ class GymnasiumDomain(Domain):
     def __init__(
         self,
         make: engines.MakeEnv,
-        sub_goals: Mapping[str, engines.Label],
+        sub_goals: Mapping[str, engines.Label] | Sequence[str],
         *,
+        labels: engines.LabelAll | None = None,
         policy: Policy | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = engines.MEMORY,
@@ -85,8 +88,8 @@ class GymnasiumDomain(Domain):
         generic = {field.name for field in fields(GymnasiumConfig)}
         self._own_settings = {field.name: field.default for field in fields(config_class) if field.name not in generic}
         self.engine_settings = tuple(self._own_settings)
-        self.sub_goals = tuple(sub_goals)
-        self._labels = tuple(sub_goals.values())
+        self._labels = engines.Labels(sub_goals, labels)
+        self.sub_goals = self._labels.names
         self.defaults = dict(defaults or {})
 
     @cached_property
@@ -152,7 +155,7 @@ class GymnasiumDomain(Domain):
             picture = digest(image)
             if picture not in seen:
                 seen.add(picture)
-                labels = engines.labels_of(env, self._labels)
+                labels = self._labels.of(env)
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states))
                 group.offer(_Met(image, labels, (layout, episode, step)), rng)
 

@@ -16,6 +16,7 @@ from hypogoal.domains.base import TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
+LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
@@ -106,14 +107,46 @@ def _kinds(given: object) -> str:
     return f"no tuple but a {type(given).__name__}"
 
 
-def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
-    """Which sub-goals hold in an environment's current state, bool (G,)."""
-    told = []
-    with UsersCode("a sub-goal's function") as code:
-        for label in labels:
-            code.of = label
-            told.append(code.truth(label(env), "the label"))
-    return np.array(told, dtype=np.bool_)
+class Labels:
+    """Which of G sub-goals hold in an environment's current state, as a user's own functions say.
+
+    That is a function for each name, or names and one function that says all. Names alone, or both, are a
+    ``UserError``.
+    """
+
+    def __init__(self, sub_goals: Mapping[str, Label] | Sequence[str], together: LabelAll | None = None):
+        self.names: tuple[str, ...] = (sub_goals,) if isinstance(sub_goals, str) else tuple(sub_goals)
+        self._each = tuple(sub_goals.values()) if isinstance(sub_goals, Mapping) else ()
+        self._together = together
+        if isinstance(sub_goals, Mapping) == (together is not None):
+            what = "sub-goals have functions and labels= too" if together else "nothing says where sub-goals hold"
+            do = "Give {name: function}, or names and labels=, a function from the environment to {name: bool}."
+            raise UserError(what, ", ".join(map(str, self.names)), do)
+
+    def of(self, env: gymnasium.Env) -> NDArray[np.bool_]:
+        """Asked of an environment, bool (G,); a ``UserError`` where a function fails, or says something else."""
+        if self._together:
+            return self._all(env, self._together)
+        told = []
+        with UsersCode("a sub-goal's function") as code:
+            for label in self._each:
+                code.of = label
+                told.append(code.truth(label(env), "the label"))
+        return np.array(told, dtype=np.bool_)
+
+    def _all(self, env: gymnasium.Env, together: LabelAll) -> NDArray[np.bool_]:
+        with UsersCode("the function of all labels", together) as code:
+            told: Any = together(env)
+            do = f"Give a dictionary of {', '.join(self.names)}, each True or False."
+            if not isinstance(told, Mapping):
+                code.refuse(f"gave no dictionary but a {type(told).__name__}", do)
+            for name in self.names:
+                if name not in told:
+                    code.refuse(f"gave no label of {name}", do)
+            for name in told:
+                if name not in self.names:
+                    code.refuse(f"gave a label of {name!r}, which is no sub-goal", do)
+            return np.array([code.truth(told[name], f"the label of {name}") for name in self.names], np.bool_)
 
 
 class GymnasiumEngine(TurnEngine):
@@ -123,14 +156,14 @@ class GymnasiumEngine(TurnEngine):
     the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
     Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
 
-    ``labels`` are G functions, see :func:`labels_of`. Episodes are truncated after ``max_steps`` steps, where the
+    Episodes are truncated after ``max_steps`` steps, where the
     environment does not do so earlier.
     """
 
     def __init__(
         self,
         make: MakeEnv,
-        labels: Sequence[Label],
+        labels: Labels,
         layout_seed: int,
         count: int,
         *,
@@ -140,7 +173,7 @@ class GymnasiumEngine(TurnEngine):
         self.count, self.max_steps, self.layout_seed = count, max_steps, layout_seed
         self.memory: int = memory
         self._envs = [make_checked(make) for _ in range(count)]
-        self._label_functions = tuple(labels)
+        self._ask = labels
         self.observation_shape = shape_of(self._envs[0])
         self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
         self._ring: list[NDArray[np.uint8]] = []
@@ -151,7 +184,7 @@ class GymnasiumEngine(TurnEngine):
 
     @property
     def n_states(self) -> int:
-        return len(self._labels) // max(1, len(self._label_functions))
+        return len(self._labels) // max(1, len(self._ask.names))
 
     @property
     def oldest(self) -> int:
@@ -172,7 +205,7 @@ class GymnasiumEngine(TurnEngine):
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of what an environment is in now."""
         image = as_image(env, observation, self.observation_shape)
-        labels = labels_of(env, self._label_functions).tobytes()
+        labels = self._ask.of(env).tobytes()
         look, new = digest(image, labels), self.n_states
         known = self._ids.get(look)
         if known is not None and known >= new - self.memory:
@@ -201,8 +234,11 @@ class GymnasiumEngine(TurnEngine):
         return out
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._label_functions))
+        every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._ask.names))
         return every[ids].copy()
+
+    def labels_now(self) -> NDArray[np.bool_]:
+        return np.stack([self._ask.of(env) for env in self._envs])
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly: the states, and what was played since each episode began."""
@@ -219,7 +255,7 @@ class GymnasiumEngine(TurnEngine):
 
         Where they lead to other states, the environment is not the same for the same seed, it is a ``UserError``.
         """
-        width, size = len(self._label_functions), 2 * self.memory
+        width, size = len(self._ask.names), 2 * self.memory
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
         self._ids.clear()

@@ -48,6 +48,31 @@ def test_collection_has_each_picture_once_with_its_labels() -> None:
     assert not known & {image.tobytes() for image in found.heldout.observations}
 
 
+def test_one_function_may_say_all_labels() -> None:
+    """Spec B6: what it says goes by name, in collection and in the engine; names alone need no environment."""
+    domain = GymnasiumDomain(CorridorEnv, tuple(SUB_GOALS), labels=corridor_env.all_labels)
+    assert domain.sub_goals == DOMAIN.sub_goals
+    for one, other in zip(collected(domain).labelled.labels, collected().labelled.labels, strict=True):
+        np.testing.assert_array_equal(one, other)
+    engine, other_engine = domain.make_engine(0, 2, 30), DOMAIN.make_engine(0, 2, 30)
+    for _ in range(3):
+        for each in (engine, other_engine):
+            each.step(np.array([0, 1]))
+    np.testing.assert_array_equal(engine.labels(engine.ids), [[True, False], [False, False]])
+    for each in (engine.labels(engine.ids), other_engine.labels_now()):
+        np.testing.assert_array_equal(each, engine.labels_now())
+    assert GymnasiumDomain(lambda: 1 // 0, "won", labels=lambda env: {"won": True}).sub_goals == ("won",)  # type: ignore[arg-type, return-value]
+
+
+@pytest.mark.parametrize(("sub_goals", "labels"), [(("a", "b"), None), (SUB_GOALS, corridor_env.all_labels)])
+def test_labels_come_from_functions_or_from_one(sub_goals: Any, labels: Any) -> None:
+    """Spec G2."""
+    with pytest.raises(
+        UserError, match=r"(nothing says where sub-goals hold: a, b|and labels= too: left).* Give \{name"
+    ):
+        GymnasiumDomain(CorridorEnv, sub_goals, labels=labels)
+
+
 def test_collection_is_the_same_for_the_same_seed() -> None:
     """Spec G1."""
     one, same, other = (collected(seed=seed) for seed in (3, 3, 4))
