@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.config import from_values, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import Collected, States, require_names
+from hypogoal.dataset import GET_MORE, Collected, States, hard_to_learn, require_names
 from hypogoal.domains.base import Domain, Engine, Step
 from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Test, Verdict, promise, run
@@ -204,6 +204,8 @@ class _Contract:
             if len(np.unique(heldout)) < 2:
                 warnings.warn(". ".join(_missing(goal, "held-out", heldout)), stacklevel=2)
             text.append(f"{goal} {int(labelled.sum())} of {len(labelled)}")
+        for line in hard_to_learn(self.collected.labelled.labels, self.domain.sub_goals):
+            warnings.warn(f"{line}. {GET_MORE}", stacklevel=2)
         return f"positives among labelled: {', '.join(text)}"
 
     def collected_again(self) -> str:
@@ -247,7 +249,7 @@ def _sets(collected: Collected) -> list[tuple[str, States]]:
 def _missing(goal: str, name: str, labels: NDArray[np.bool_]) -> tuple[str, str]:
     """What to say, and to do, where labels are of one class."""
     text = f"{goal} has no {'negatives' if labels.any() else 'positives'} among the {name} states"
-    return text, "Collect more steps or other layouts, or bring a policy that gets there."
+    return text, GET_MORE
 
 
 def _same_step(first: Engine, second: Engine, actions: NDArray[np.int64], where: str, do: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from hypogoal.dataset import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium_engine import GymnasiumEngine, channels_first
+from hypogoal.stages.collect import collect
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 
@@ -111,13 +113,30 @@ class Counting(gymnasium.Env[np.ndarray, int]):
 @pytest.mark.parametrize(("states", "steps"), [(500, 1000), (400, 3000)])
 def test_the_sample_is_of_all_that_was_played(states: int, steps: int) -> None:
     """Spec B7: each sixth of the play gives a sixth of the states, where there are fewer or more than are kept."""
-    goals = {"odd": lambda env: env.unwrapped.count % 2 == 1}
     config = GymnasiumConfig(heldout_seeds=(4,), steps=steps, states=states, max_episode_steps=steps)
-    found = collected(GymnasiumDomain(Counting, goals), config).labelled
+    found = collected(ODD, config).labelled
     assert len(found.labels) == states and found.labels.sum() == states // 2
     sixths = np.histogram(found.origins["step"], bins=6, range=(0, steps))[0]
     # Drawn without replacement: at most binomial's spread, of which this is more than four times.
     assert np.abs(sixths - states / 6).max() < 4 * np.sqrt(states * 5 / 36), sixths
+
+
+ODD = GymnasiumDomain(Counting, {"odd": lambda env: env.unwrapped.count % 2 == 1})
+
+
+def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: with the sub-goal and what gets there, as 'import' tells it; nothing where there are enough of both."""
+    config = GymnasiumConfig(heldout_seeds=(4,), steps=100, max_episode_steps=100)
+    collect(ODD, config, tmp_path / "odd.h5", quiet=True)
+    assert capsys.readouterr().err == ""
+    collect(DOMAIN, SMALL, tmp_path / "corridor.h5", quiet=True)
+    told = "has 1 positives among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
+    ends = "hypogoal: {} " + told + "bring a policy that gets there."
+    assert capsys.readouterr().err.splitlines() == [ends.format("left-end"), ends.format("right-end")]
+    one = replace(SMALL, heldout_seeds=(4,), steps=60, max_episode_steps=2)  # the right end is three steps away
+    seldom = GymnasiumDomain(CorridorEnv, {"first": lambda env: env.unwrapped.cell < 3})
+    collect(seldom, replace(one, labelled_seeds=(0,)), tmp_path / "seldom.h5", quiet=True)
+    assert "first has 2 negatives among 5 labelled states" in capsys.readouterr().err
 
 
 def test_a_policy_collects() -> None:

@@ -88,7 +88,14 @@ def test_domains_that_keep_the_contract_pass() -> None:
     verdicts = list(check_domain(CorridorDomain()))
     require(verdicts)
     assert len(verdicts) == 12
-    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["heldout"]
+    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["classes", "heldout"]
+    told = "left-end has 8 positives among 48 labelled states: classes are unbalanced. Collect more steps or other"
+    assert verdicts[8].warnings[0].startswith(told)
+    assert not [
+        verdict
+        for verdict in check_domain(CorridorDomain(), CorridorConfig(10))
+        if verdict.name == "classes" and verdict.warnings
+    ]
 
 
 ENGINES = [
@@ -294,7 +301,7 @@ def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, caps
     small = [word for pair in ("steps=150", "heldout_seeds=4,5") for word in ("--set", pair)]
     assert main(["check", "corridor_env:DOMAIN", *small]) == 0
     told = capsys.readouterr().out.splitlines()
-    assert all(line.startswith("ok   ") for line in told) and len(told) == 13
+    assert all(line.startswith("ok   ") for line in told if "unbalanced" not in line) and len(told) == 15
     assert main(["check", "corridor_env:RESTLESS", *small]) == 2
     told = capsys.readouterr().out.splitlines()
     assert told[-1].startswith("FAIL determinism") and "np_random" in told[-1]
