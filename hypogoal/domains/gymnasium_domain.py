@@ -58,6 +58,9 @@ class GymnasiumDomain(Domain):
         sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state, however
             it came there; or names alone, with ``labels``.
         labels: for names alone, one function from the environment to all of ``{name: bool}``.
+        success: at the end of each episode of training, whether it was a success: a function of the environment, the
+            last step's info, the episode's sum of rewards, and whether it terminated. None: where it terminated with a
+            sum above 0.
         policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: distinct states that training keeps pictures of, see ``GymnasiumEngine``.
@@ -76,6 +79,7 @@ class GymnasiumDomain(Domain):
         sub_goals: Mapping[str, engines.Label] | Sequence[str],
         *,
         labels: engines.LabelAll | None = None,
+        success: engines.Success | None = None,
         policy: Policy | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = engines.MEMORY,
@@ -83,6 +87,7 @@ class GymnasiumDomain(Domain):
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
         self.make, self.policy, self.memory, self.name = make, policy, memory, name
+        self.success = success
         self.config_class = config_class
         generic = {field.name for field in fields(GymnasiumConfig)}
         self._own_settings = {field.name: field.default for field in fields(config_class) if field.name not in generic}
@@ -109,7 +114,8 @@ class GymnasiumDomain(Domain):
         """An engine of ``count`` environments of one layout; ``arguments``: ``memory``, and settings of its own."""
         memory = arguments.pop("memory", self.memory)
         make = partial(self.make_env, **arguments)
-        return engines.GymnasiumEngine(make, self._labels, layout_seed, count, max_steps=max_steps, memory=memory)
+        told = {"max_steps": max_steps, "memory": memory, "success": self.success}
+        return engines.GymnasiumEngine(make, self._labels, layout_seed, count, **told)
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import digest
-from hypogoal.domains.base import TurnEngine
+from hypogoal.domains.base import Step, TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
+Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
 MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
@@ -157,7 +158,7 @@ class GymnasiumEngine(TurnEngine):
     Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
 
     Episodes are truncated after ``max_steps`` steps, where the
-    environment does not do so earlier.
+    environment does not do so earlier. ``success`` is asked at the end of each, see ``GymnasiumDomain``.
     """
 
     def __init__(
@@ -169,11 +170,13 @@ class GymnasiumEngine(TurnEngine):
         *,
         max_steps: int,
         memory: int = MEMORY,
+        success: Success | None = None,
     ):
         self.count, self.max_steps, self.layout_seed = count, max_steps, layout_seed
         self.memory: int = memory
         self._envs = [make_checked(make) for _ in range(count)]
-        self._ask = labels
+        self._ask, self._success = labels, success
+        self._earned, self._succeeded = [0.0] * count, [False] * count  # in the episode so far; it ended so just now
         self.observation_shape = shape_of(self._envs[0])
         self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
         self._ring: list[NDArray[np.uint8]] = []
@@ -192,15 +195,25 @@ class GymnasiumEngine(TurnEngine):
 
     def _begin(self, number: int) -> int:
         observation, _info = begun(self._envs[number], seed=self.layout_seed)
-        self._played[number] = []
+        self._played[number], self._earned[number] = [], 0.0
         return self._remember(self._envs[number], observation)
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         env = self._envs[number]
-        observation, reward, terminated, truncated, _info = stepped(env, action)
+        observation, reward, terminated, truncated, info = stepped(env, action)
         self._played[number].append(action)
+        self._earned[number] += reward
         truncated = (truncated or elapsed >= self.max_steps) and not terminated
+        if self._success:
+            with UsersCode("the domain's success", self._success) as code:
+                self._succeeded[number] = (terminated or truncated) and code.truth(
+                    self._success(env, info, self._earned[number], terminated), "success"
+                )
         return self._remember(env, observation), reward, terminated, truncated
+
+    def step(self, actions: NDArray[np.int64]) -> Step:
+        step = super().step(actions)
+        return step._replace(succeeded=np.array(self._succeeded, np.bool_)) if self._success else step
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of what an environment is in now."""
@@ -265,8 +278,10 @@ class GymnasiumEngine(TurnEngine):
         for number, actions in enumerate(snapshot["played"]):
             env = self._envs[number]
             observation, _info = begun(env, seed=self.layout_seed)
+            self._earned[number] = 0.0
             for action in actions:
-                observation = stepped(env, action)[0]
+                observation, reward, *_ = stepped(env, action)
+                self._earned[number] += reward
             here, was = as_image(env, observation, self.observation_shape), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 what = "the environment does not do the same again for the same seed, so this cannot be gone on with"

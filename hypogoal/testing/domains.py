@@ -119,6 +119,8 @@ class _Contract:
             _array(step.rewards, np.float32, (COUNT,), "rewards of a step")
             for name in ("terminated", "truncated"):
                 _array(getattr(step, name), np.bool_, (COUNT,), f"{name} of a step")
+            if step.succeeded is not None:
+                _array(step.succeeded, np.bool_, (COUNT,), "succeeded of a step")
             promise(bool(np.isfinite(step.rewards).all()), f"rewards are {step.rewards}", "Give finite numbers.")
             over = step.terminated | step.truncated
             cut = before + 1 >= MAX_STEPS
@@ -254,7 +256,7 @@ def _missing(goal: str, name: str, labels: NDArray[np.bool_]) -> tuple[str, str]
 
 def _same_step(first: Engine, second: Engine, actions: NDArray[np.int64], where: str, do: str) -> None:
     left, right = first.step(actions), second.step(actions)
-    for name in ("rewards", "terminated", "truncated"):
+    for name in ("rewards", "terminated", "truncated", "succeeded"):
         same = np.array_equal(getattr(left, name), getattr(right, name))
         promise(same, f"{name} differ ({where})", do)
     for ids, others in ((left.next_ids, right.next_ids), (first.ids, second.ids)):

@@ -188,6 +188,26 @@ def test_the_engine_cuts_episodes() -> None:
     assert engine.elapsed.tolist() == [1, 1]
 
 
+def test_a_domain_says_what_is_a_success() -> None:
+    """Spec B6: asked of the environment at the end of each episode, however it ends, and of no other step."""
+    engine, left, right = corridor_env.SWIFT.make_engine(0, 2, 8), 0, 1
+    ways = {
+        (right, right, right): True,
+        (left, right, right, right, right): True,
+        (left, left, right, right, right, right, right): False,  # too late
+        (left,) * 8: True,  # cut where that is none
+        (right, left) * 4: False,
+    }
+    for way, success in ways.items():
+        for number, action in enumerate(way, 1):
+            engine.restore(engine.snapshot())  # what was earned before is known again
+            step = engine.step(np.array([action, left]))
+            assert step.succeeded is not None and step.succeeded.dtype == np.bool_
+            assert step.succeeded[0] == (success and number == len(way)), way
+        assert engine.elapsed[0] == 0
+    assert DOMAIN.make_engine(0, 1, 8).step(np.array([0])).succeeded is None
+
+
 def test_an_engine_goes_on_from_a_snapshot() -> None:
     """Spec G1: the same ids, pictures and ends as the one that was not stopped."""
     one, rng = engine_of(), np.random.default_rng(2)
