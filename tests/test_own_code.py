@@ -321,6 +321,7 @@ def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
         (lambda step: step._replace(rewards=None), "the engine's step gave rewards None"),
         (lambda step: step._replace(terminated=step.rewards), "the engine's step gave terminated"),
         (lambda step: step._replace(truncated=step.truncated[:1]), "the engine's step gave truncated"),
+        (lambda step: step._replace(succeeded=step.rewards), "the engine's step gave succeeded"),
         (lambda step: None, "the engine's step gave next_ids None"),
         (lambda step: sys.exit(0), "own code of test_own_code raised SystemExit(0)"),
         (lambda step: os._exit(0), "own code of test_own_code raised SystemExit(0)"),

@@ -1,11 +1,14 @@
 """What is kept of episodes, and what a success is in tables and checkpoints of any age (Spec E7, F5, G1)."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from corridor import Corridor
 
 from hypogoal.core.files import write_table
-from hypogoal.domains.base import Step
+from hypogoal.domains.base import Step, step_of
 from hypogoal.evaluation.run import read_episodes
 from hypogoal.learners.episodes import EPISODE_COLUMNS, Episodes
 from hypogoal.stages import train_meta
@@ -30,6 +33,20 @@ def test_success_is_by_reward_or_as_the_domain_says() -> None:
     assert [row[4] for row in own] == [0, 1, 1, 1, 0, 0]
     assert own.success() == 0.5 and played(None).success() == 1 / 6
     assert own[:2] == [(6, 2, 2.0, 1, 0), (6, 2, 0.0, 1, 1)]
+
+
+def test_steps_of_before_are_steps() -> None:
+    """Spec B6: an engine of one's own may give any object with the four arrays that each had."""
+
+    class Old(Corridor):
+        def step(self, actions: np.ndarray) -> Any:
+            step = super().step(actions)
+            return SimpleNamespace(**{name: getattr(step, name) for name in Step._fields[:4]})
+
+    engine, episodes = Old(1), Episodes(1)
+    for _ in range(3):
+        episodes.see(step_of(engine, np.array([1])))
+    assert episodes == [(3, 3, 1.0, 1, 1)]
 
 
 def test_tables_and_checkpoints_keep_it_and_older_ones_are_read(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from corridor import Corridor
-from corridor_env import CorridorEnv, all_labels, at_left
+from corridor_env import CorridorEnv, all_labels, at_left, swift
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -106,6 +106,7 @@ ENGINES = [
     (domain_of(**stepped(rewards=lambda values: values.astype(np.float64))), "steps", "float64"),
     (domain_of(**stepped(rewards=lambda values: values * np.nan)), "steps", "finite"),
     (domain_of(**stepped(terminated=lambda values: values.astype(np.int64))), "steps", "terminated of a step"),
+    (domain_of(**stepped(succeeded=lambda _: np.zeros(3, np.int64))), "steps", "succeeded of a step"),
     (domain_of(step=never_ending), "steps", "went on after max_steps"),
     (domain_of(labels=lambda self, ids: Corridor.labels(self, ids).astype(np.int64)), "labels", "int64"),
     (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "labels", "(3, 1)"),
@@ -218,7 +219,7 @@ def test_a_label_of_the_way_there_is_named() -> None:
         assert fault.name == "labels"
         assert "asked twice in the same state, labels differ: odd. A label is a function of the state" in fault.text
     both = ("left-end", "right-end")
-    require(check_domain(GymnasiumDomain(CorridorEnv, both, labels=all_labels), small))
+    require(check_domain(GymnasiumDomain(CorridorEnv, both, labels=all_labels, success=swift), small))
 
 
 @pytest.mark.parametrize("name", [name for name in OURS if name != "none"])
