@@ -107,7 +107,9 @@ def make_seeds(root: Path) -> None:
                 name: torch.zeros(options, dtype=torch.int64) for name in ("option_steps", "steps_since_positive")
             }
             save_tensors(folder / "options.safetensors", state | counters)
-            write_table(folder / "episodes.csv", EPISODE_COLUMNS, [(10 * n, 10, 1.0, n % 2) for n in range(1, 6)])
+            write_table(
+                folder / "episodes.csv", EPISODE_COLUMNS, [(10 * n, 10, 1.0, n % 2, n % 2) for n in range(1, 6)]
+            )
             write_table(folder / "choices.csv", CHOICE_COLUMNS, [(50, n, 9, 3, 2.5, 1, 8) for n in range(options)])
             rows = [(n, n % options, 3, 1, 0, 0, 1, 10, 20, 5) for n in range(6)]
             write_table(folder / "executions.csv", EXECUTION_COLUMNS, rows)

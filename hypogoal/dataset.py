@@ -28,6 +28,9 @@ ATTRIBUTES = (
     "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete",
 )  # fmt: skip
 AGAIN = "Collect it again."
+GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
+FEW = 10  # labelled states of a class, below which one is warned
+RARE = 0.05  # share of a class, below which one is warned
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
 
@@ -78,6 +81,24 @@ def leave_out(states: States, *known: NDArray[np.uint8]) -> States:
     kept = np.array([digest(picture) not in seen for picture in states.observations], np.bool_)
     origins = {name: values[kept] for name, values in states.origins.items()}
     return States(states.observations[kept], states.labels[kept], origins)
+
+
+def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
+    """A line for each sub-goal of whose positives, or negatives, there are few among the labels (N, G)."""
+    told = []
+    for goal, column in zip(goals, labels.T, strict=True):
+        positives = int(column.sum())
+        fewest = min(positives, len(labels) - positives)
+        if fewest < max(FEW, RARE * len(labels)):
+            which = "positives" if fewest == positives else "negatives"
+            told.append(f"{goal} has {fewest} {which} among {len(labels)} labelled states: classes are unbalanced")
+    return told
+
+
+def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
+    """A line for each sub-goal of which the held-out labels (N, G) have one class only."""
+    of_one = [goal for goal, column in zip(goals, labels.T, strict=True) if len(np.unique(column)) < 2]
+    return [f"{goal} has one class only in the held-out states, so it cannot be judged by them" for goal in of_one]
 
 
 def require_names(sub_goals: Sequence[str]) -> None:

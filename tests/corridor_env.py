@@ -49,8 +49,29 @@ def at_right(env: gymnasium.Env) -> bool:
     return env.unwrapped.cell == LENGTH - 1  # type: ignore[attr-defined]
 
 
+def all_labels(env: gymnasium.Env) -> dict[str, bool]:
+    """Both in one, the other way round."""
+    return {"right-end": at_right(env), "left-end": at_left(env)}
+
+
 SUB_GOALS = {"left-end": at_left, "right-end": at_right}
 DOMAIN = GymnasiumDomain(CorridorEnv, SUB_GOALS)
+
+
+class Paid(CorridorEnv):
+    """Each step costs, and says when it was."""
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        image, reward, over, cut, _ = super().step(action)
+        return image, reward - 0.125, over, cut, {"cell": self.cell}
+
+
+def swift(env: gymnasium.Env, info: dict[str, Any], earned: float, terminated: bool) -> bool:
+    """At the right end within five steps, or at the left end when the time is up."""
+    return earned >= 1 - 5 * 0.125 if terminated else bool(at_left(env) and info["cell"] == 0)
+
+
+SWIFT = GymnasiumDomain(Paid, SUB_GOALS, success=swift)
 
 
 class Floats(CorridorEnv):

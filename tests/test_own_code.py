@@ -54,6 +54,14 @@ def labelling(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "lie": lambda env: value})
 
 
+def labelling_all(value: Any) -> GymnasiumDomain:
+    return GymnasiumDomain(CorridorEnv, ("left-end", "lie"), labels=lambda env: value)
+
+
+def judging(value: Any) -> GymnasiumDomain:
+    return GymnasiumDomain(CorridorEnv, SUB_GOALS, success=lambda env, info, earned, terminated: value)
+
+
 def choosing(value: Any) -> GymnasiumDomain:
     return GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=lambda env, observation, rng: value)
 
@@ -93,6 +101,16 @@ LIES: list[tuple[GymnasiumDomain, str]] = [
     (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none, but a NoneType"),  # type: ignore[arg-type, return-value]
     (GymnasiumDomain(Spaceless, SUB_GOALS), "the environment has no spaces: AttributeError: "),
     *((labelling(value), "a sub-goal's function gave the label ") for value in [*ENDS, object()]),
+    *(
+        (labelling_all({"left-end": True, "lie": value}), "the function of all labels gave the label of lie ")
+        for value in [*ENDS, object()]
+    ),
+    (labelling_all({"left-end": True}), "the function of all labels gave no label of lie: test_own_code.py, line "),
+    (
+        labelling_all({"left-end": True, "lie": True, 3: 1}),
+        "gave a label of 3, which is no sub-goal: test_own_code.py",
+    ),
+    *((labelling_all(value), "the function of all labels gave no dictionary but a ") for value in (None, [True, True])),
     *(
         (choosing(value), "the domain's policy gave the action ")
         for value in [77, -1, 1.5, None, "1", True, np.array([0, 1]), NAN]
@@ -194,6 +212,14 @@ def test_what_an_environment_gives_is_looked_at(
     assert "FAIL" in checked.out.splitlines()[-1] if checked.out else message in checked.err
 
 
+@pytest.mark.parametrize("value", [None, 0.5, "True", np.array([True]), NAN])
+def test_what_is_called_a_success_is_looked_at(value: Any, told: Callable[..., str]) -> None:
+    """Spec G2: where episodes end, so in training; whose code, its file and line."""
+    assert re.search(
+        r"the domain's success gave success .*: test_own_code\.py, line \d", told(judging(value), BASELINE)
+    )
+
+
 @pytest.mark.parametrize(("text", "leave"), LEAVING)
 def test_whatever_is_raised_is_one_line(text: str, leave: Callable[..., Any], told: Callable[..., str]) -> None:
     """Spec G2: nobody takes a program that ended for one that succeeded."""
@@ -239,7 +265,7 @@ def test_numbers_of_any_library_are_numbers(tmp_path: Path, monkeypatch: pytest.
     for own in HONEST:
         engine = own.make_engine(0, 2, 9)
         for step, row in zip(steps, actions, strict=True):
-            for one, other in zip(step, engine.step(row), strict=True):
+            for one, other in zip(step[:4], engine.step(row)[:4], strict=True):
                 assert one.dtype == other.dtype
                 np.testing.assert_array_equal(one, other)
     kinds = (int, np.int8, np.array, torch.tensor, lambda action: np.array([action]))
@@ -295,6 +321,7 @@ def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
         (lambda step: step._replace(rewards=None), "the engine's step gave rewards None"),
         (lambda step: step._replace(terminated=step.rewards), "the engine's step gave terminated"),
         (lambda step: step._replace(truncated=step.truncated[:1]), "the engine's step gave truncated"),
+        (lambda step: step._replace(succeeded=step.rewards), "the engine's step gave succeeded"),
         (lambda step: None, "the engine's step gave next_ids None"),
         (lambda step: sys.exit(0), "own code of test_own_code raised SystemExit(0)"),
         (lambda step: os._exit(0), "own code of test_own_code raised SystemExit(0)"),

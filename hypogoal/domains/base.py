@@ -25,6 +25,7 @@ BUILT_IN = {
     "which-feature": "hypogoal.which_feature.domain:DOMAIN",
 }
 ENTRY_POINTS = "hypogoal.domains"
+STEP_KINDS = (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b"))
 IMPORTED = "imported"  # what states are of where 'hypogoal import' was not told
 
 
@@ -36,12 +37,15 @@ class Step(NamedTuple):
         rewards: float32 (E,).
         terminated: bool (E,), the task is over.
         truncated: bool (E,), the episode was cut at its step limit.
+        succeeded: bool (E,), the episode is over and was a success, where a domain says itself what that is. None: one
+            that terminated with a sum of rewards above 0.
     """
 
     next_ids: NDArray[np.int64]
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
+    succeeded: NDArray[np.bool_] | None = None
 
 
 class Plan(NamedTuple):
@@ -106,6 +110,10 @@ class Engine(ABC):
     @abstractmethod
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """True sub-goal predicates, bool (n, G): the oracle that only evaluation and the upper bound may see."""
+
+    def labels_now(self) -> NDArray[np.bool_]:
+        """The labels of the environments' current states, bool (E, G), asked anew where they are kept by id."""
+        return self.labels(self.ids)
 
     def room_for(self, count: int, out: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         """Where to draw ``count`` observations: ``out``, a ``ValueError`` where it does not fit, or a new array."""
@@ -314,7 +322,7 @@ class Domain(ABC):
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
     """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
     step = engine.step(actions)
-    for name, kinds in (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b")):
+    for name, kinds in STEP_KINDS if getattr(step, "succeeded", None) is None else (*STEP_KINDS, ("succeeded", "b")):
         values = getattr(step, name, None)
         if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:  # type: ignore[union-attr]
             do = f"Give a Step of arrays of {engine.count}; hypogoal check says of which type."
@@ -323,7 +331,7 @@ def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
         place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
         what = f"gave the reward {step.rewards[place]} in environment {place}"
         UsersCode("the engine's step", engine, "step").refuse(what, "Give finite numbers.")
-    return step
+    return step if isinstance(step, Step) else Step(*(getattr(step, name, None) for name in Step._fields))
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:

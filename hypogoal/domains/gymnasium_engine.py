@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import digest
-from hypogoal.domains.base import TurnEngine
+from hypogoal.domains.base import Step, TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
+LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
+Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
 MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
@@ -106,14 +108,46 @@ def _kinds(given: object) -> str:
     return f"no tuple but a {type(given).__name__}"
 
 
-def labels_of(env: gymnasium.Env, labels: Sequence[Label]) -> NDArray[np.bool_]:
-    """Which sub-goals hold in an environment's current state, bool (G,)."""
-    told = []
-    with UsersCode("a sub-goal's function") as code:
-        for label in labels:
-            code.of = label
-            told.append(code.truth(label(env), "the label"))
-    return np.array(told, dtype=np.bool_)
+class Labels:
+    """Which of G sub-goals hold in an environment's current state, as a user's own functions say.
+
+    That is a function for each name, or names and one function that says all. Names alone, or both, are a
+    ``UserError``.
+    """
+
+    def __init__(self, sub_goals: Mapping[str, Label] | Sequence[str], together: LabelAll | None = None):
+        self.names: tuple[str, ...] = (sub_goals,) if isinstance(sub_goals, str) else tuple(sub_goals)
+        self._each = tuple(sub_goals.values()) if isinstance(sub_goals, Mapping) else ()
+        self._together = together
+        if isinstance(sub_goals, Mapping) == (together is not None):
+            what = "sub-goals have functions and labels= too" if together else "nothing says where sub-goals hold"
+            do = "Give {name: function}, or names and labels=, a function from the environment to {name: bool}."
+            raise UserError(what, ", ".join(map(str, self.names)), do)
+
+    def of(self, env: gymnasium.Env) -> NDArray[np.bool_]:
+        """Asked of an environment, bool (G,); a ``UserError`` where a function fails, or says something else."""
+        if self._together:
+            return self._all(env, self._together)
+        told = []
+        with UsersCode("a sub-goal's function") as code:
+            for label in self._each:
+                code.of = label
+                told.append(code.truth(label(env), "the label"))
+        return np.array(told, dtype=np.bool_)
+
+    def _all(self, env: gymnasium.Env, together: LabelAll) -> NDArray[np.bool_]:
+        with UsersCode("the function of all labels", together) as code:
+            told: Any = together(env)
+            do = f"Give a dictionary of {', '.join(self.names)}, each True or False."
+            if not isinstance(told, Mapping):
+                code.refuse(f"gave no dictionary but a {type(told).__name__}", do)
+            for name in self.names:
+                if name not in told:
+                    code.refuse(f"gave no label of {name}", do)
+            for name in told:
+                if name not in self.names:
+                    code.refuse(f"gave a label of {name!r}, which is no sub-goal", do)
+            return np.array([code.truth(told[name], f"the label of {name}") for name in self.names], np.bool_)
 
 
 class GymnasiumEngine(TurnEngine):
@@ -123,24 +157,26 @@ class GymnasiumEngine(TurnEngine):
     the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
     Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
 
-    ``labels`` are G functions, see :func:`labels_of`. Episodes are truncated after ``max_steps`` steps, where the
-    environment does not do so earlier.
+    Episodes are truncated after ``max_steps`` steps, where the
+    environment does not do so earlier. ``success`` is asked at the end of each, see ``GymnasiumDomain``.
     """
 
     def __init__(
         self,
         make: MakeEnv,
-        labels: Sequence[Label],
+        labels: Labels,
         layout_seed: int,
         count: int,
         *,
         max_steps: int,
         memory: int = MEMORY,
+        success: Success | None = None,
     ):
         self.count, self.max_steps, self.layout_seed = count, max_steps, layout_seed
         self.memory: int = memory
         self._envs = [make_checked(make) for _ in range(count)]
-        self._label_functions = tuple(labels)
+        self._ask, self._success = labels, success
+        self._earned, self._succeeded = [0.0] * count, [False] * count  # in the episode so far; it ended so just now
         self.observation_shape = shape_of(self._envs[0])
         self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
         self._ring: list[NDArray[np.uint8]] = []
@@ -151,7 +187,7 @@ class GymnasiumEngine(TurnEngine):
 
     @property
     def n_states(self) -> int:
-        return len(self._labels) // max(1, len(self._label_functions))
+        return len(self._labels) // max(1, len(self._ask.names))
 
     @property
     def oldest(self) -> int:
@@ -159,20 +195,30 @@ class GymnasiumEngine(TurnEngine):
 
     def _begin(self, number: int) -> int:
         observation, _info = begun(self._envs[number], seed=self.layout_seed)
-        self._played[number] = []
+        self._played[number], self._earned[number] = [], 0.0
         return self._remember(self._envs[number], observation)
 
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         env = self._envs[number]
-        observation, reward, terminated, truncated, _info = stepped(env, action)
+        observation, reward, terminated, truncated, info = stepped(env, action)
         self._played[number].append(action)
+        self._earned[number] += reward
         truncated = (truncated or elapsed >= self.max_steps) and not terminated
+        if self._success:
+            with UsersCode("the domain's success", self._success) as code:
+                self._succeeded[number] = (terminated or truncated) and code.truth(
+                    self._success(env, info, self._earned[number], terminated), "success"
+                )
         return self._remember(env, observation), reward, terminated, truncated
+
+    def step(self, actions: NDArray[np.int64]) -> Step:
+        step = super().step(actions)
+        return step._replace(succeeded=np.array(self._succeeded, np.bool_)) if self._success else step
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of what an environment is in now."""
         image = as_image(env, observation, self.observation_shape)
-        labels = labels_of(env, self._label_functions).tobytes()
+        labels = self._ask.of(env).tobytes()
         look, new = digest(image, labels), self.n_states
         known = self._ids.get(look)
         if known is not None and known >= new - self.memory:
@@ -201,8 +247,11 @@ class GymnasiumEngine(TurnEngine):
         return out
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._label_functions))
+        every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._ask.names))
         return every[ids].copy()
+
+    def labels_now(self) -> NDArray[np.bool_]:
+        return np.stack([self._ask.of(env) for env in self._envs])
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly: the states, and what was played since each episode began."""
@@ -219,7 +268,7 @@ class GymnasiumEngine(TurnEngine):
 
         Where they lead to other states, the environment is not the same for the same seed, it is a ``UserError``.
         """
-        width, size = len(self._label_functions), 2 * self.memory
+        width, size = len(self._ask.names), 2 * self.memory
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
         self._ids.clear()
@@ -229,8 +278,10 @@ class GymnasiumEngine(TurnEngine):
         for number, actions in enumerate(snapshot["played"]):
             env = self._envs[number]
             observation, _info = begun(env, seed=self.layout_seed)
+            self._earned[number] = 0.0
             for action in actions:
-                observation = stepped(env, action)[0]
+                observation, reward, *_ = stepped(env, action)
+                self._earned[number] += reward
             here, was = as_image(env, observation, self.observation_shape), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 what = "the environment does not do the same again for the same seed, so this cannot be gone on with"

@@ -75,8 +75,8 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
     while loop.recorder.steps < end:
         loop.advance(explore=False)
     loop.chooser = inner
-    rows = np.array(loop.recorder.episodes[first:], dtype=np.float64).reshape(-1, 4)
-    episodes = Episodes(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3] > 0)
+    step, length, reward, *truths = np.array(loop.recorder.episodes[first:], dtype=np.float64).reshape(-1, 5).T
+    episodes = Episodes(step.astype(np.int64), length.astype(np.int64), reward, *(told > 0 for told in truths))
     played = {"success": mean_of(episodes.succeeded), "near": near_shortest(episodes, loop.engine.shortest_path())}
     played["length"] = mean_of(episodes.length)
     return played, Choices(*(np.concatenate(column) for column in zip(*heard, strict=True)))

@@ -57,7 +57,10 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     ),
     "says_yes_unlabelled": ("fraction", "share of unlabelled states that a member calls positive"),
     "disagreement": ("fraction", "share of states on which two members' verdicts differ"),
-    "success": ("fraction", "share of the last 100 training episodes that succeeded: terminated with a reward above 0"),
+    "success": (
+        "fraction",
+        "share of the last 100 training episodes that succeeded: terminated, reward above 0, or as the domain says",
+    ),
     "reward": ("reward", "mean undiscounted reward of the last 100 training episodes"),
     "length": ("steps", "mean length of the last 100 training episodes, failures at the cap included"),
     "length_over_shortest": ("ratio", "length / the layout's shortest path"),

@@ -113,11 +113,13 @@ class Episodes(Columns):
     length: NDArray[np.int64]  # steps
     reward: NDArray[np.float64]  # undiscounted
     terminated: NDArray[np.bool_]  # it reached a terminal state; else it was cut at the cap
+    # Spec F5: as its domain says; else, and in tables of before this column, it terminated, and with a reward: an agent
+    # that dies reaches a terminal state too.
+    succeeded: NDArray[np.bool_] = None  # type: ignore[assignment]
 
-    @property
-    def succeeded(self) -> NDArray[np.bool_]:
-        """Spec F5: it terminated, and with a reward: an agent that dies reaches a terminal state too."""
-        return self.terminated & (self.reward > 0)
+    def __post_init__(self) -> None:
+        if self.succeeded is None:
+            object.__setattr__(self, "succeeded", self.terminated & (self.reward > 0))  # type: ignore[unreachable]
 
     def last(self, count: int = WINDOW) -> Episodes:
         """The last ``count`` episodes, or all where there are fewer."""
@@ -170,8 +172,9 @@ class Executions(Columns):
 
 
 def read_episodes(path: Path) -> Episodes:
-    """``episodes.csv``: step, length, reward, terminated."""
-    return _read(Episodes, path, {"reward": np.float64, "terminated": np.bool_})
+    """``episodes.csv``: step, length, reward, terminated, succeeded."""
+    kinds = {"reward": np.float64, "terminated": np.bool_, "succeeded": np.bool_}
+    return _read(Episodes, path, kinds, ("succeeded",))
 
 
 def read_choices(path: Path) -> Choices:
@@ -184,11 +187,10 @@ def read_executions(path: Path) -> Executions:
     return _read(Executions, path, dict.fromkeys(("reached", "inside_at_start", "terminated"), np.bool_))
 
 
-def _read(kind: type[Table], path: Path, kinds: Mapping[str, Any]) -> Table:
-    """A table with a column for each field, int64 where ``kinds`` says nothing else."""
-    names = tuple(inspect.signature(kind).parameters)
-    table = read_table(path, names)
-    return kind(**{name: table[name].astype(kinds.get(name, np.int64)) for name in names})
+def _read(kind: type[Table], path: Path, kinds: Mapping[str, Any], optional: Sequence[str] = ()) -> Table:
+    """A table with a column for each field, int64 where ``kinds`` says nothing else; ``optional`` ones may lack."""
+    table = read_table(path, [name for name in inspect.signature(kind).parameters if name not in optional], optional)
+    return kind(**{name: column.astype(kinds.get(name, np.int64)) for name, column in table.items()})
 
 
 def read_layout(path: Path) -> dict[str, Any]:
@@ -210,17 +212,21 @@ def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:
             raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> dict[str, NDArray[np.float64]]:
+def read_table(
+    path: Path, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
+) -> dict[str, NDArray[np.float64]]:
     """Columns of a table of numbers, a CSV file with a header; float (n,) each.
 
-    ``columns`` are those that must be there; all that are where None. A file that is missing, too large, no table, or
-    holds anything but finite numbers of at most 2^53 (or, in a ``BLANK`` column, nothing) is a ``UserError``.
+    ``columns`` are those that must be there; all that are where None; ``optional`` those that may be. A file that is
+    missing, too large, no table, or holds anything but finite numbers of at most 2^53 (or, in a ``BLANK`` column,
+    nothing) is a ``UserError``.
     """
     text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
     try:
         reader = csv.DictReader(io.StringIO(text, newline=""))
-        columns = list(reader.fieldnames or ()) if columns is None else columns
-        if not set(columns) <= set(reader.fieldnames or ()):
+        there = list(reader.fieldnames or ())
+        columns = there if columns is None else [*columns, *(name for name in optional if name in there)]
+        if not set(columns) <= set(there):
             raise KeyError(path)
         rows = [[math.nan if row[of] == "" and of in BLANK else float(row[of]) for of in columns] for row in reader]
     except (ValueError, KeyError, TypeError, csv.Error):

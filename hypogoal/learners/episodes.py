@@ -10,11 +10,11 @@ from hypogoal.core.checkpoints import Resumable, State
 from hypogoal.core.files import write_table
 from hypogoal.domains.base import Step
 
-EPISODE_COLUMNS = ("step", "length", "reward", "terminated")
+EPISODE_COLUMNS = ("step", "length", "reward", "terminated", "succeeded")
 LAST = 100  # episodes, of which success and length are told
 
 
-class Episodes(list[tuple[int, int, float, int]], Resumable):
+class Episodes(list[tuple[int, int, float, int, int]], Resumable):
     """A row of ``EPISODE_COLUMNS`` for every finished episode of E environments, in the order in which they ended.
 
     ``steps`` are environment steps so far, summed over the environments.
@@ -34,14 +34,15 @@ class Episodes(list[tuple[int, int, float, int]], Resumable):
         self._reward += step.rewards
         over = step.terminated | step.truncated
         for place in np.flatnonzero(over):
-            length, reward = int(self._length[place]), float(self._reward[place])
-            self.append((self.steps, length, reward, int(step.terminated[place])))
+            length, reward, done = int(self._length[place]), float(self._reward[place]), bool(step.terminated[place])
+            success = done and reward > 0 if step.succeeded is None else step.succeeded[place]
+            self.append((self.steps, length, reward, int(done), int(success)))
         self._length[over], self._reward[over] = 0, 0.0
 
     def success(self) -> float:
-        """Share of the last episodes that terminated with a reward above 0; NaN before the first."""
+        """Share of the last episodes that succeeded, see ``Step``; NaN before the first."""
         last = self[-LAST:]
-        return sum(bool(row[3]) and row[2] > 0 for row in last) / len(last) if last else float("nan")
+        return sum(row[4] for row in last) / len(last) if last else float("nan")
 
     def solved(self, share: float) -> bool:
         """Whether at least ``share`` of the last ``LAST`` episodes succeeded; never where there are fewer, or at 0."""
@@ -61,4 +62,7 @@ class Episodes(list[tuple[int, int, float, int]], Resumable):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        self[:] = [(int(row[0]), int(row[1]), row[2], int(row[3])) for row in snapshot["rows"].tolist()]
+        rows = snapshot["rows"]
+        if rows.shape[1] == 4:  # of before ``succeeded`` was kept
+            rows = np.column_stack([rows, (rows[:, 3] > 0) & (rows[:, 2] > 0)])
+        self[:] = [(int(row[0]), int(row[1]), row[2], int(row[3]), int(row[4])) for row in rows.tolist()]

@@ -1,7 +1,7 @@
 """Bandits over options: each option has one worth, whatever the state, learned from whole episodes (Spec H4).
 
-An episode is solved that is over with rewards, discounted within options, above 0 in sum. That is credited to every
-option chosen in it, also to those that did nothing for it.
+An episode is solved that is over with rewards, discounted within options, above 0 in sum, or as its domain says. That
+is credited to every option chosen in it, also to those that did nothing for it.
 What holds already is not offered, and of the others the one whose turn it is not fails: so an order is learned too.
 An option's worth is taken for fixed: failures from before its policy had learned its way count for ever.
 """
@@ -40,7 +40,8 @@ class Bandit(Chooser):
         self._earned[outcome.environments] += outcome.returns
         over = outcome.terminated | outcome.truncated
         ended = outcome.environments[over]
-        solved = outcome.terminated[over] & (self._earned[ended] > 0)
+        by_reward = outcome.terminated[over] & (self._earned[ended] > 0)
+        solved = by_reward if outcome.succeeded is None else outcome.succeeded[over]
         self._due += self._taken[ended[solved]].sum(0), self._taken[ended[~solved]].sum(0)
         self._taken[ended], self._earned[ended] = 0.0, 0.0
 

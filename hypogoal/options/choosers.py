@@ -32,6 +32,7 @@ class Outcome:
     next_ids: NDArray[np.int64]  # the states reached
     terminated: NDArray[np.bool_]  # the task is over, nothing follows
     truncated: NDArray[np.bool_]  # the episode was cut, at its limit or because the next option begins at a start
+    succeeded: NDArray[np.bool_] | None = None  # the episode did, where the domain says what that is, see ``Step``
 
 
 class Chooser(Resumable, ABC):

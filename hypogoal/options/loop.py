@@ -146,6 +146,7 @@ class OptionLoop(Resumable):
             next_ids=step.next_ids[done],
             terminated=step.terminated[done],
             truncated=step.truncated[done],
+            succeeded=None if step.succeeded is None else step.succeeded[done],
         )
         if self.initiation:
             out_of_time = (outcome.durations >= self.config.option_timeout) & ~outcome.terminated

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,10 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import free_memory, human
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States, digest, leave_out, require_names
+from hypogoal.dataset import Collected, States, digest, hard_to_judge, hard_to_learn, leave_out, require_names
 from hypogoal.domains.gymnasium_engine import channels_first
 
 COPIES = 4  # of the states, all held in memory at once while they are compared and written
-FEW = 10  # states of a class, below which one is warned
-RARE = 0.05  # share of a class, below which one is warned
 
 
 @dataclass(frozen=True)
@@ -66,10 +63,12 @@ def collected_of(
             f"no held-out states were given: {int(chosen.sum())} of the labelled ones are held out, which says nothing "
             "of other contexts"
         )
-    require_classes(labels, goals, warned)
-    for goal, told in zip(goals, test.labels.T, strict=True):
-        if len(np.unique(told)) < 2:
-            warned.append(f"{goal} has one class only in the held-out states, so it cannot be judged by them")
+    for goal, column in zip(goals, labels.T, strict=True):
+        if len(np.unique(column)) < 2:
+            lacking = "negatives" if column.any() else "positives"
+            what = f"{goal} has no {lacking} among {len(labels)} labelled states"
+            raise UserError(what, None, "Give states of both kinds.")
+    warned += hard_to_learn(labels, goals) + hard_to_judge(test.labels, goals)
     unknown = np.zeros((len(unlabelled), len(goals)), np.bool_)
     sets = [States(images, labels), States(unlabelled, unknown), test]
     numbered = [replace(states, origins={"row": np.arange(len(states.labels), dtype=np.int64)}) for states in sets]
@@ -168,14 +167,3 @@ def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.b
         what = f"of {len(labels)} labelled states none can be held out"
         raise UserError(what, f"heldout={share:g}", "Give held-out states, a larger --heldout, or more labelled ones.")
     return chosen
-
-
-def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], warned: list[str]) -> None:
-    """Refuse (``UserError``) a sub-goal that all or none of the labels (N, G) say is reached; warn where few do."""
-    for column, goal in enumerate(goals):
-        positives, among = int(labels[:, column].sum()), f"among {len(labels)} labelled states"
-        fewest, which = min((positives, "positives"), (len(labels) - positives, "negatives"), key=itemgetter(0))
-        if fewest == 0:
-            raise UserError(f"{goal} has no {which} {among}", None, "Give states of both kinds.")
-        if fewest < max(FEW, RARE * len(labels)):
-            warned.append(f"{goal} has {fewest} {which} {among}: classes are unbalanced")

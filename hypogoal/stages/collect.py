@@ -10,8 +10,9 @@ from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import Progress
-from hypogoal.dataset import open_dataset, require_names, write_dataset
-from hypogoal.domains.base import Domain
+from hypogoal.core.terminal import say
+from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
+from hypogoal.domains.base import BUILT_IN, Domain
 
 COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
 
@@ -48,4 +49,8 @@ def collect(
         made = work.files / out.name
         write_dataset(made, collected, **about, force=True)
         put_in_place(made, out)
+    if about["domain"] not in BUILT_IN:
+        told = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
+        for line in told + hard_to_judge(collected.heldout.labels, collected.sub_goals):
+            say(f"hypogoal: {line}", err=True)
     return open_dataset(out).counts()

@@ -74,8 +74,8 @@ def train_meta(
     return counted | {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
 
 
-def read_episodes(path: Path) -> list[tuple[int, int, float, int]]:
-    """The rows of an ``episodes.csv``: step, length, reward, terminated."""
+def read_episodes(path: Path) -> list[tuple[int, int, float, int, int]]:
+    """The rows of an ``episodes.csv``: step, length, reward, terminated, succeeded."""
     table = tables.read_episodes(path)
-    columns = (table.step, table.length, table.reward, table.terminated.astype(int))
+    columns = (table.step, table.length, table.reward, table.terminated.astype(int), table.succeeded.astype(int))
     return list(zip(*(column.tolist() for column in columns), strict=True))

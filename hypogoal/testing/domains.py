@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.config import from_values, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import Collected, States, require_names
+from hypogoal.dataset import GET_MORE, Collected, States, hard_to_learn, require_names
 from hypogoal.domains.base import Domain, Engine, Step
 from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Test, Verdict, promise, run
@@ -119,6 +119,8 @@ class _Contract:
             _array(step.rewards, np.float32, (COUNT,), "rewards of a step")
             for name in ("terminated", "truncated"):
                 _array(getattr(step, name), np.bool_, (COUNT,), f"{name} of a step")
+            if step.succeeded is not None:
+                _array(step.succeeded, np.bool_, (COUNT,), "succeeded of a step")
             promise(bool(np.isfinite(step.rewards).all()), f"rewards are {step.rewards}", "Give finite numbers.")
             over = step.terminated | step.truncated
             cut = before + 1 >= MAX_STEPS
@@ -132,8 +134,8 @@ class _Contract:
         return f"{STEPS} random steps, {ended} episodes ended"
 
     def labels(self) -> str:
-        """Of every state that random play meets; and whether what is seen says them."""
-        engine = self.make_engine()
+        """Of every state that random play meets, asked twice; and whether what is seen says them."""
+        engine, do = self.make_engine(), "A label is a function of the state now: count, keep and draw nothing in it."
         goals = len(self.domain.sub_goals)
         rows: dict[bytes, set[bytes]] = {}
         met = np.zeros(goals, np.int64)
@@ -141,6 +143,9 @@ class _Contract:
             ids = engine.step(actions).next_ids
             labels = engine.labels(ids)
             _array(labels, np.bool_, (COUNT, goals), "what labels() returns")
+            changed = (engine.labels_now() != engine.labels(engine.ids)).any(0)
+            named = ", ".join(goal for goal, other in zip(self.domain.sub_goals, changed, strict=True) if other)
+            promise(not named, f"asked twice in the same state, labels differ: {named}", do)
             met += labels.sum(0)
             for image, label in zip(engine.images(ids), labels, strict=True):
                 rows.setdefault(image.tobytes(), set()).add(label.tobytes())
@@ -201,6 +206,8 @@ class _Contract:
             if len(np.unique(heldout)) < 2:
                 warnings.warn(". ".join(_missing(goal, "held-out", heldout)), stacklevel=2)
             text.append(f"{goal} {int(labelled.sum())} of {len(labelled)}")
+        for line in hard_to_learn(self.collected.labelled.labels, self.domain.sub_goals):
+            warnings.warn(f"{line}. {GET_MORE}", stacklevel=2)
         return f"positives among labelled: {', '.join(text)}"
 
     def collected_again(self) -> str:
@@ -244,12 +251,12 @@ def _sets(collected: Collected) -> list[tuple[str, States]]:
 def _missing(goal: str, name: str, labels: NDArray[np.bool_]) -> tuple[str, str]:
     """What to say, and to do, where labels are of one class."""
     text = f"{goal} has no {'negatives' if labels.any() else 'positives'} among the {name} states"
-    return text, "Collect more steps or other layouts, or bring a policy that gets there."
+    return text, GET_MORE
 
 
 def _same_step(first: Engine, second: Engine, actions: NDArray[np.int64], where: str, do: str) -> None:
     left, right = first.step(actions), second.step(actions)
-    for name in ("rewards", "terminated", "truncated"):
+    for name in ("rewards", "terminated", "truncated", "succeeded"):
         same = np.array_equal(getattr(left, name), getattr(right, name))
         promise(same, f"{name} differ ({where})", do)
     for ids, others in ((left.next_ids, right.next_ids), (first.ids, second.ids)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from hypogoal.dataset import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium_engine import GymnasiumEngine, channels_first
+from hypogoal.stages.collect import collect
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
 
@@ -46,6 +48,31 @@ def test_collection_has_each_picture_once_with_its_labels() -> None:
     assert set(found.heldout.origins["layout_seed"].tolist()) <= {4, 5}
     known = {image.tobytes() for states in (found.labelled, found.unlabelled) for image in states.observations}
     assert not known & {image.tobytes() for image in found.heldout.observations}
+
+
+def test_one_function_may_say_all_labels() -> None:
+    """Spec B6: what it says goes by name, in collection and in the engine; names alone need no environment."""
+    domain = GymnasiumDomain(CorridorEnv, tuple(SUB_GOALS), labels=corridor_env.all_labels)
+    assert domain.sub_goals == DOMAIN.sub_goals
+    for one, other in zip(collected(domain).labelled.labels, collected().labelled.labels, strict=True):
+        np.testing.assert_array_equal(one, other)
+    engine, other_engine = domain.make_engine(0, 2, 30), DOMAIN.make_engine(0, 2, 30)
+    for _ in range(3):
+        for each in (engine, other_engine):
+            each.step(np.array([0, 1]))
+    np.testing.assert_array_equal(engine.labels(engine.ids), [[True, False], [False, False]])
+    for each in (engine.labels(engine.ids), other_engine.labels_now()):
+        np.testing.assert_array_equal(each, engine.labels_now())
+    assert GymnasiumDomain(lambda: 1 // 0, "won", labels=lambda env: {"won": True}).sub_goals == ("won",)  # type: ignore[arg-type, return-value]
+
+
+@pytest.mark.parametrize(("sub_goals", "labels"), [(("a", "b"), None), (SUB_GOALS, corridor_env.all_labels)])
+def test_labels_come_from_functions_or_from_one(sub_goals: Any, labels: Any) -> None:
+    """Spec G2."""
+    with pytest.raises(
+        UserError, match=r"(nothing says where sub-goals hold: a, b|and labels= too: left).* Give \{name"
+    ):
+        GymnasiumDomain(CorridorEnv, sub_goals, labels=labels)
 
 
 def test_collection_is_the_same_for_the_same_seed() -> None:
@@ -86,13 +113,30 @@ class Counting(gymnasium.Env[np.ndarray, int]):
 @pytest.mark.parametrize(("states", "steps"), [(500, 1000), (400, 3000)])
 def test_the_sample_is_of_all_that_was_played(states: int, steps: int) -> None:
     """Spec B7: each sixth of the play gives a sixth of the states, where there are fewer or more than are kept."""
-    goals = {"odd": lambda env: env.unwrapped.count % 2 == 1}
     config = GymnasiumConfig(heldout_seeds=(4,), steps=steps, states=states, max_episode_steps=steps)
-    found = collected(GymnasiumDomain(Counting, goals), config).labelled
+    found = collected(ODD, config).labelled
     assert len(found.labels) == states and found.labels.sum() == states // 2
     sixths = np.histogram(found.origins["step"], bins=6, range=(0, steps))[0]
     # Drawn without replacement: at most binomial's spread, of which this is more than four times.
     assert np.abs(sixths - states / 6).max() < 4 * np.sqrt(states * 5 / 36), sixths
+
+
+ODD = GymnasiumDomain(Counting, {"odd": lambda env: env.unwrapped.count % 2 == 1})
+
+
+def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: with the sub-goal and what gets there, as 'import' tells it; nothing where there are enough of both."""
+    config = GymnasiumConfig(heldout_seeds=(4,), steps=100, max_episode_steps=100)
+    collect(ODD, config, tmp_path / "odd.h5", quiet=True)
+    assert capsys.readouterr().err == ""
+    collect(DOMAIN, SMALL, tmp_path / "corridor.h5", quiet=True)
+    told = "has 1 positives among 6 labelled states: classes are unbalanced. Collect more steps or other layouts, or "
+    ends = "hypogoal: {} " + told + "bring a policy that gets there."
+    assert capsys.readouterr().err.splitlines() == [ends.format("left-end"), ends.format("right-end")]
+    one = replace(SMALL, heldout_seeds=(4,), steps=60, max_episode_steps=2)  # the right end is three steps away
+    seldom = GymnasiumDomain(CorridorEnv, {"first": lambda env: env.unwrapped.cell < 3})
+    collect(seldom, replace(one, labelled_seeds=(0,)), tmp_path / "seldom.h5", quiet=True)
+    assert "first has 2 negatives among 5 labelled states" in capsys.readouterr().err
 
 
 def test_a_policy_collects() -> None:
@@ -142,6 +186,26 @@ def test_the_engine_cuts_episodes() -> None:
     ends = [engine.step(np.zeros(2, np.int64)).truncated.tolist() for _ in range(4)]
     assert ends == [[False] * 2, [False] * 2, [True] * 2, [False] * 2]
     assert engine.elapsed.tolist() == [1, 1]
+
+
+def test_a_domain_says_what_is_a_success() -> None:
+    """Spec B6: asked of the environment at the end of each episode, however it ends, and of no other step."""
+    engine, left, right = corridor_env.SWIFT.make_engine(0, 2, 8), 0, 1
+    ways = {
+        (right, right, right): True,
+        (left, right, right, right, right): True,
+        (left, left, right, right, right, right, right): False,  # too late
+        (left,) * 8: True,  # cut where that is none
+        (right, left) * 4: False,
+    }
+    for way, success in ways.items():
+        for number, action in enumerate(way, 1):
+            engine.restore(engine.snapshot())  # what was earned before is known again
+            step = engine.step(np.array([action, left]))
+            assert step.succeeded is not None and step.succeeded.dtype == np.bool_
+            assert step.succeeded[0] == (success and number == len(way)), way
+        assert engine.elapsed[0] == 0
+    assert DOMAIN.make_engine(0, 1, 8).step(np.array([0])).succeeded is None
 
 
 def test_an_engine_goes_on_from_a_snapshot() -> None:

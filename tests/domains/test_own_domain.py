@@ -11,6 +11,9 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import load_domain
+from hypogoal.evaluation.run import read_episodes
+from hypogoal.learners.baselines.settings import BaselineConfig
+from hypogoal.stages.train_baseline import train_baseline
 
 TESTS = Path(__file__).parents[1]
 
@@ -85,6 +88,21 @@ def test_what_is_wrong_with_an_own_domain_is_one_line(
     assert message in err and err.count("\n") == 1
     assert domain != "RAISING" or "corridor_env.py, line " in err
     assert not list(tmp_path.glob("data.h5"))
+
+
+def test_success_is_what_the_domain_says_wherever_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6, F5: in training's numbers, the table of episodes, the evaluation; by reward it would be another."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:SWIFT")
+    few = BaselineConfig(steps=2_048, max_episode_steps=20)
+    numbers = train_baseline("corridor_env:SWIFT", few, tmp_path / "ppo", quiet=True)
+    episodes = read_episodes(tmp_path / "ppo" / "episodes.csv")
+    succeeded, cut = episodes.succeeded, ~episodes.terminated
+    assert (succeeded == (episodes.length <= 5))[~cut].all() and succeeded[cut].any()
+    assert (~succeeded & (episodes.reward > 0)).any()
+    assert numbers["success"] == pytest.approx(succeeded[-100:].mean())
+    assert main(["evaluate", str(tmp_path)]) == 0
+    agent = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())["agents"][0]
+    assert agent["success"]["mean"] == pytest.approx(succeeded[-100:].mean())
 
 
 def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,10 +58,10 @@ def test_what_is_said_of_play_is_of_the_episodes_played() -> None:
     assert earlier and shortest
     played, _ = play(loop, 4_000)
     rows = loop.recorder.episodes[earlier:]
-    solved = [length for _, length, reward, terminated in rows if terminated and reward > 0]
+    solved = [length for _, length, reward, terminated, _ in rows if terminated and reward > 0]
     near = [length for length in solved if 2 * length <= 3 * shortest]
     assert 0 < len(near) < len(solved) < len(rows)
-    lengths = [length for _, length, _, _ in rows]
+    lengths = [length for _, length, *_ in rows]
     assert played == {"success": len(solved) / len(rows), "near": len(near) / len(rows), "length": np.mean(lengths)}
 
 

@@ -97,7 +97,7 @@ def write_states(path, *, rooms):
 
 
 def write_agent(folder):
-    rows = [(end, 20, 1, 1) for end in range(20, 4_001, 20)]
+    rows = [(end, 20, 1, 1, 1) for end in range(20, 4_001, 20)]
     write_table(folder / "episodes.csv", EPISODE_COLUMNS, rows)
     facts = {"layout_seed": 100, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
     (folder / "layout.json").write_text(json.dumps(facts), encoding="utf-8")

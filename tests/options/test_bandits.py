@@ -31,7 +31,7 @@ def solved(loop: OptionLoop, episodes: int, last: int) -> float:
     """The share of the last of so many training episodes."""
     while len(loop.recorder.episodes) < episodes:
         loop.step()
-    return float(np.mean([terminated and reward > 0 for _, _, reward, terminated in loop.recorder.episodes][-last:]))
+    return float(np.mean([success for *_, success in loop.recorder.episodes][-last:]))
 
 
 def test_thompson_finds_the_right_members_within_200_episodes() -> None:
@@ -58,6 +58,16 @@ def ended(bandit: Bandit, returned: list[float], terminated: list[bool], truncat
     no, one = np.zeros(2, np.bool_), np.ones(2)
     over = np.array(terminated), np.array(truncated)
     bandit.record(Outcome(HERE, HERE, HERE, no, no, ~no, np.array(returned), HERE, one, HERE, *over))
+
+
+def test_a_domain_says_itself_what_is_solved() -> None:
+    """Spec B6: whatever the rewards, and whether or not the episode was cut."""
+    bandit = ThompsonChooser(3, 2, np.random.default_rng(0))
+    bandit.choose(HERE, HERE, only(0, 1))
+    no, one, yes = np.zeros(2, np.bool_), np.ones(2), np.array([True, False])
+    bandit.record(Outcome(HERE, HERE, HERE, no, no, ~no, np.array([0.0, 1.0]), HERE, one, HERE, ~yes, yes, yes))
+    bandit.learn()
+    assert bandit.credit.tolist() == [[1, 0, 0], [0, 1, 0]]
 
 
 def only(*options: int) -> NDArray[np.bool_]:

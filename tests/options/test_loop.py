@@ -91,7 +91,7 @@ def test_reward_inside_an_option_is_discounted_from_its_start_and_the_end_of_the
         loop.step()
     (outcome,) = chooser.outcomes
     assert outcome.returns[0] == pytest.approx(0.9**2) and outcome.terminated[0]
-    assert recorder.episodes == [(3, 3, 1.0, 1)]
+    assert recorder.episodes == [(3, 3, 1.0, 1, 1)]
     assert loop.engine.ids[0] == 2
 
 
@@ -110,7 +110,7 @@ def test_a_cut_episode_is_truncated_not_terminated() -> None:
     loop, recorder = loop_of(Corridor(1, max_steps=1), Scripted(0), chooser)
     loop.step()
     assert chooser.outcomes[0].truncated[0] and not chooser.outcomes[0].terminated[0]
-    assert recorder.episodes == [(1, 1, 0.0, 0)]
+    assert recorder.episodes == [(1, 1, 0.0, 0, 0)]
 
 
 def test_offered_options() -> None:

@@ -76,12 +76,12 @@ def test_solves_an_easy_task(agent, setting):
     chosen = hyperparameters(agent, setting)
     env = EngineEnv(Corridor(chosen.environments))
     trained = train(env, chosen, steps=EASY_STEPS[agent, setting], seed=1)
-    assert np.mean([terminated for *_, terminated in env.episodes[:20]]) < 0.8
+    assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.8
     trial = EngineEnv(Corridor(1))
     observation: Any = trial.reset()
     while not trial.episodes:
         observation = trial.step(trained.predict(observation, deterministic=True)[0])[0]
-    assert trial.episodes == [(4, 4, 1.0, 1)]  # the shortest way, by the greedy policy
+    assert trial.episodes == [(4, 4, 1.0, 1, 1)]  # the shortest way, by the greedy policy
 
 
 def test_a_time_limit_is_not_a_terminal_state():
@@ -96,7 +96,7 @@ def test_a_time_limit_is_not_a_terminal_state():
     assert [info["TimeLimit.truncated"] for info in infos] == [True, True]
     assert infos[1]["terminal_observation"].tolist() == corridor.codes(np.array([3]))[0].tolist()
     assert np.array_equal(np.asarray(observations), corridor.codes(np.array([0, 0])))  # the next episode's start
-    assert env.episodes == [(6, 3, 0.0, 0), (6, 3, 0.0, 0)]
+    assert env.episodes == [(6, 3, 0.0, 0, 0), (6, 3, 0.0, 0, 0)]
 
 
 def test_reaching_the_goal_is_a_terminal_state():
@@ -109,7 +109,7 @@ def test_reaching_the_goal_is_a_terminal_state():
     assert done[0]
     assert rewards[0] == 1.0
     assert infos[0]["TimeLimit.truncated"] is False
-    assert env.episodes == [(4, 4, 1.0, 1)]
+    assert env.episodes == [(4, 4, 1.0, 1, 1)]
 
 
 @pytest.mark.parametrize("network", list(NETWORKS))

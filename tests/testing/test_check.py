@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from corridor import Corridor
+from corridor_env import CorridorEnv, all_labels, at_left, swift
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
@@ -18,6 +20,7 @@ from hypogoal.dataset import Collected
 from hypogoal.diversity import OBJECTIVES as OURS
 from hypogoal.diversity import Objective, dbat, load_objective, none
 from hypogoal.domains.base import Step
+from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
 
 TESTS = Path(__file__).parents[1]
@@ -69,7 +72,7 @@ def forgetful(self: Any, snapshot: dict[str, Any]) -> None:
     Corridor.restore(self, snapshot | {"ids": np.full_like(snapshot["ids"], 4)})
 
 
-NOBODYS = np.random.default_rng(5)
+NOBODYS, COUNT = np.random.default_rng(5), itertools.count()
 
 
 def wandering(self: Any, actions: np.ndarray) -> Step:
@@ -85,7 +88,14 @@ def test_domains_that_keep_the_contract_pass() -> None:
     verdicts = list(check_domain(CorridorDomain()))
     require(verdicts)
     assert len(verdicts) == 12
-    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["heldout"]
+    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["classes", "heldout"]
+    told = "left-end has 8 positives among 48 labelled states: classes are unbalanced. Collect more steps or other"
+    assert verdicts[8].warnings[0].startswith(told)
+    assert not [
+        verdict
+        for verdict in check_domain(CorridorDomain(), CorridorConfig(10))
+        if verdict.name == "classes" and verdict.warnings
+    ]
 
 
 ENGINES = [
@@ -96,9 +106,15 @@ ENGINES = [
     (domain_of(**stepped(rewards=lambda values: values.astype(np.float64))), "steps", "float64"),
     (domain_of(**stepped(rewards=lambda values: values * np.nan)), "steps", "finite"),
     (domain_of(**stepped(terminated=lambda values: values.astype(np.int64))), "steps", "terminated of a step"),
+    (domain_of(**stepped(succeeded=lambda _: np.zeros(3, np.int64))), "steps", "succeeded of a step"),
     (domain_of(step=never_ending), "steps", "went on after max_steps"),
     (domain_of(labels=lambda self, ids: Corridor.labels(self, ids).astype(np.int64)), "labels", "int64"),
     (domain_of(labels=lambda self, ids: Corridor.labels(self, ids)[:, :1]), "labels", "(3, 1)"),
+    (
+        domain_of(labels=lambda self, ids: Corridor.labels(self, ids) | [False, next(COUNT) % 2 == 0]),
+        "labels",
+        "asked twice in the same state, labels differ: right-end",
+    ),
     (domain_of(step=wandering), "determinism", "differ"),
     (domain_of(restore=forgetful), "going on", "after restore"),
     (domain_of(images=lambda self, ids, out=None: 1 // 0), "images", "ZeroDivisionError"),
@@ -180,11 +196,30 @@ def test_labels_that_cannot_be_seen_are_told() -> None:
     """Spec B6: a picture with two labels is allowed, and no classifier can learn it."""
 
     def hidden(self: Any, ids: np.ndarray) -> np.ndarray:
-        self.asked = getattr(self, "asked", 0) + 1
-        return np.stack([ids == 0, np.full(len(ids), self.asked % 2 == 0)], axis=1)
+        return np.stack([ids == 0, np.full(len(ids), self.elapsed[0] % 2 == 0)], axis=1)
 
     verdicts = {verdict.name: verdict for verdict in check_domain(domain_of(labels=hidden))}
     assert "with different labels" in verdicts["labels"].warnings[0]
+
+
+def test_a_label_of_the_way_there_is_named() -> None:
+    """Spec B6: one that keeps what it was asked before, by a function each or by one for all; a state's own pass."""
+    met: list[int] = []
+
+    def all_but_odd(env: Any) -> dict[str, bool]:
+        met.append(env.unwrapped.cell)
+        return {"left-end": at_left(env), "odd": len(met) % 2 == 1}
+
+    small = GymnasiumConfig(steps=150, heldout_seeds=(4, 5))
+    for domain in (
+        GymnasiumDomain(CorridorEnv, ("left-end", "odd"), labels=all_but_odd),
+        GymnasiumDomain(CorridorEnv, {"left-end": at_left, "odd": lambda env: all_but_odd(env)["odd"]}),
+    ):
+        fault = first_fault(check_domain(domain, small))
+        assert fault.name == "labels"
+        assert "asked twice in the same state, labels differ: odd. A label is a function of the state" in fault.text
+    both = ("left-end", "right-end")
+    require(check_domain(GymnasiumDomain(CorridorEnv, both, labels=all_labels, success=swift), small))
 
 
 @pytest.mark.parametrize("name", [name for name in OURS if name != "none"])
@@ -267,7 +302,7 @@ def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, caps
     small = [word for pair in ("steps=150", "heldout_seeds=4,5") for word in ("--set", pair)]
     assert main(["check", "corridor_env:DOMAIN", *small]) == 0
     told = capsys.readouterr().out.splitlines()
-    assert all(line.startswith("ok   ") for line in told) and len(told) == 13
+    assert all(line.startswith("ok   ") for line in told if "unbalanced" not in line) and len(told) == 15
     assert main(["check", "corridor_env:RESTLESS", *small]) == 2
     told = capsys.readouterr().out.splitlines()
     assert told[-1].startswith("FAIL determinism") and "np_random" in told[-1]

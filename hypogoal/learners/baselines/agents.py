@@ -83,9 +83,9 @@ class _Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         episodes = self.env.episodes
-        for step, _, reward, terminated in episodes[self._seen :]:
-            if terminated and reward > 0 and self.first_goal is None:
-                self.first_goal = step
+        for row in episodes[self._seen :]:
+            if row[4] and self.first_goal is None:
+                self.first_goal = row[0]
         self._seen = len(episodes)
         if episodes.steps >= self._next:
             self._next += LOG_INTERVAL

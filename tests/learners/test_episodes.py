@@ -1,0 +1,69 @@
+"""What is kept of episodes, and what a success is in tables and checkpoints of any age (Spec E7, F5, G1)."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from corridor import Corridor
+
+from hypogoal.core.files import write_table
+from hypogoal.domains.base import Step, step_of
+from hypogoal.evaluation.run import read_episodes
+from hypogoal.learners.episodes import EPISODE_COLUMNS, Episodes
+from hypogoal.stages import train_meta
+
+YES, NO = np.ones(3, np.bool_), np.zeros(3, np.bool_)
+REWARDS = np.array([1, 0, -1], np.float32)
+
+
+def played(succeeded: np.ndarray | None) -> Episodes:
+    """Three environments end their episodes; then they are cut, all with a reward."""
+    episodes = Episodes(3)
+    episodes.see(Step(np.arange(3), REWARDS, NO, NO, None if succeeded is None else NO))
+    episodes.see(Step(np.arange(3), REWARDS, YES, NO, succeeded))
+    episodes.see(Step(np.arange(3), np.abs(REWARDS) + 1, NO, YES, None if succeeded is None else ~succeeded))
+    return episodes
+
+
+def test_success_is_by_reward_or_as_the_domain_says() -> None:
+    """Spec F5: a cut episode is none but where the domain says so."""
+    assert [row[4] for row in played(None)] == [1, 0, 0, 0, 0, 0]
+    own = played(np.array([False, True, True]))
+    assert [row[4] for row in own] == [0, 1, 1, 1, 0, 0]
+    assert own.success() == 0.5 and played(None).success() == 1 / 6
+    assert own[:2] == [(6, 2, 2.0, 1, 0), (6, 2, 0.0, 1, 1)]
+
+
+def test_steps_of_before_are_steps() -> None:
+    """Spec B6: an engine of one's own may give any object with the four arrays that each had."""
+
+    class Old(Corridor):
+        def step(self, actions: np.ndarray) -> Any:
+            step = super().step(actions)
+            return SimpleNamespace(**{name: getattr(step, name) for name in Step._fields[:4]})
+
+    engine, episodes = Old(1), Episodes(1)
+    for _ in range(3):
+        episodes.see(step_of(engine, np.array([1])))
+    assert episodes == [(3, 3, 1.0, 1, 1)]
+
+
+def test_tables_and_checkpoints_keep_it_and_older_ones_are_read(tmp_path: Path) -> None:
+    """Spec G1: those from before the column have the success that they were told to have."""
+    for told, episodes in ((True, played(np.array([False, True, True]))), (False, played(None))):
+        episodes.write(tmp_path)
+        found = read_episodes(tmp_path / "episodes.csv")
+        assert found.succeeded.tolist() == [bool(row[4]) for row in episodes]
+        assert found.last(2).succeeded.tolist() == found.succeeded[-2:].tolist()
+        assert train_meta.read_episodes(tmp_path / "episodes.csv") == list(episodes)
+        again = Episodes(3)
+        again.restore(episodes.snapshot())
+        assert again == episodes and again.steps == 9
+        if not told:
+            write_table(tmp_path / "episodes.csv", EPISODE_COLUMNS[:4], [row[:4] for row in episodes])
+            old = read_episodes(tmp_path / "episodes.csv")
+            assert old.succeeded.tolist() == found.succeeded.tolist() and old.succeeded.dtype == np.bool_
+            snapshot = episodes.snapshot()
+            again.restore({**snapshot, "rows": snapshot["rows"][:, :4]})
+            assert again == episodes
