@@ -235,12 +235,17 @@ def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["sh", "-c", words], capture_output=True, text=True, cwd=folder, env=environment, check=False)
 
 
+def told(done: subprocess.CompletedProcess[str]) -> list[str]:
+    """Lines of standard error, but the two that say that so small a domain is hard to learn."""
+    return [line for line in done.stderr.splitlines() if "positives among" not in line]
+
+
 @pytest.mark.skipif(os.name == "nt", reason="streams of a POSIX shell")
 @pytest.mark.parametrize("streams", [">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_closed_streams(tmp_path: Path, streams: str) -> None:
     """Spec G2: who closes them wants nothing of them; the output is whole, and nothing is printed into it."""
     done = shell(f"{COLLECT} {streams}", tmp_path)
-    assert done.returncode == 0 and done.stderr.count("\n") == (2 if "2>&-" not in streams else 0)
+    assert done.returncode == 0 and len(told(done)) == (2 if "2>&-" not in streams else 0)
     assert main(["verify", str(tmp_path / "data.h5")]) == 0
     done = shell(f"show nothing.h5 {streams}", tmp_path)
     assert done.returncode == 2 and done.stdout == ""
@@ -249,14 +254,14 @@ def test_closed_streams(tmp_path: Path, streams: str) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is full")
 def test_output_on_a_full_disk(tmp_path: Path) -> None:
     """Spec G2: what was made is complete, and that is said; a full standard error ends nothing."""
-    said = "hypogoal: the output is complete, but could not be printed (No space left on device)\n"
+    said = "hypogoal: the output is complete, but could not be printed (No space left on device)"
     done = shell(f"{COLLECT} -q > /dev/full", tmp_path)
-    assert (done.returncode, done.stderr) == (1, said)
+    assert (done.returncode, told(done)) == (1, [said])
     assert main(["verify", str(tmp_path / "data.h5")]) == 0
     for command in (f"{COLLECT} --resume", "show data.h5", "verify data.h5", "show data.h5 --json", "config collect"):
         done = shell(f"{command} > /dev/full", tmp_path)
-        assert done.returncode == 1 and done.stderr.endswith(said), done.stderr
-        assert done.stderr.count("\n") == 1 + ("--resume" in command)
+        assert done.returncode == 1 and told(done)[-1] == said, done.stderr
+        assert len(told(done)) == 1 + ("--resume" in command)
     done = shell(f"{COLLECT} --force 2> /dev/full", tmp_path)
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "data.h5")
     assert shell("show nothing.h5 2> /dev/full", tmp_path).returncode == 2
