@@ -321,17 +321,19 @@ class Domain(ABC):
 
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
     """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
-    step = engine.step(actions)
-    for name, kinds in STEP_KINDS if getattr(step, "succeeded", None) is None else (*STEP_KINDS, ("succeeded", "b")):
-        values = getattr(step, name, None)
-        if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:  # type: ignore[union-attr]
-            do = f"Give a Step of arrays of {engine.count}; hypogoal check says of which type."
+    step: Any = engine.step(actions)
+    do = f"Give a Step of arrays of {engine.count}; hypogoal check says of which type."
+    if not isinstance(step, Step):
+        UsersCode("the engine's step", engine, "step").refuse(f"gave no Step but a {type(step).__name__}", do)
+    for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):
+        values = getattr(step, name)
+        if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:
             UsersCode("the engine's step", engine, "step").refuse(f"gave {name} {values!r}", do)
     if not np.isfinite(step.rewards).all():
         place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
         what = f"gave the reward {step.rewards[place]} in environment {place}"
         UsersCode("the engine's step", engine, "step").refuse(what, "Give finite numbers.")
-    return step if isinstance(step, Step) else Step(*(getattr(step, name, None) for name in Step._fields))
+    return step
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:
