@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core import own_code
+from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
@@ -58,8 +59,30 @@ class Plan(NamedTuple):
     solved: NDArray[np.bool_]  # (N,), it ends there with the task solved
 
 
+class Layouts(Resumable):
+    """Which layout each episode begins in: one of ``seeds``, drawn anew by ``rng``; where that is None, environment
+    number e is always in the e-th, round and round.
+
+    Attributes:
+        now: the layout seeds of the environments' episodes.
+    """
+
+    CHANGING = ("rng", "now")
+
+    def __init__(self, seeds: Sequence[int], rng: np.random.Generator | None = None):
+        self.seeds, self.rng, self.many = tuple(seeds), rng, len(seeds) > 1
+        self.now: list[int] = []
+
+    def begin(self, number: int) -> int:
+        """The layout seed of a new episode of environment ``number``."""
+        place = number if self.rng is None else int(self.rng.integers(len(self.seeds)))
+        self.now += [-1] * (number + 1 - len(self.now))
+        self.now[number] = self.seeds[place % len(self.seeds)]
+        return self.now[number]
+
+
 class Engine(ABC):
-    """Many environments of one layout, stepped together; every distinct state has an integer id.
+    """Many environments, of one layout or several, stepped together; every distinct state has an integer id.
 
     What each engine must have comes first; below it what an engine may have besides, with what holds where it has not.
 
@@ -75,6 +98,7 @@ class Engine(ABC):
             empty where all episodes begin alike.
         action_sets: by name, actions that a policy may be restricted to.
         position_names: of the columns of :meth:`positions`; empty where it does not know where the agent is.
+        layouts: those that episodes begin in; None where all are of one.
         restarts, resumes: it has :meth:`restart`; it has :meth:`snapshot` and :meth:`restore`.
     """
 
@@ -88,6 +112,7 @@ class Engine(ABC):
     starts: Sequence[Any] = ()
     action_sets: Mapping[str, tuple[int, ...]] = MappingProxyType({})
     position_names: tuple[str, ...] = ()
+    layouts: Layouts | None = None
     restarts = resumes = False
 
     @property
@@ -237,6 +262,7 @@ class Domain(ABC):
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
         many_starts: it takes some of them, too, comma-separated.
+        many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
@@ -251,6 +277,7 @@ class Domain(ABC):
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
     many_starts: bool = False
+    many_layouts = False
     measures = pictures = sees_agent = False
     near = 0
 

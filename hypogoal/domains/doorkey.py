@@ -126,6 +126,7 @@ class DoorKeyDomain(Domain):
     config_class = DoorKeyConfig
     engine_settings = ("keyring", "door_label", "wrong_key")
     env_id = "hypogoal/DoorKey-8x8-v0"
+    many_layouts = True
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:
         """Observations of a collection, at the most: a layout has some 1,640 states (seed 0), others up to 2,500."""
@@ -173,7 +174,7 @@ class DoorKeyDomain(Domain):
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = env.MAX_STEPS, **arguments: Any
     ) -> DoorKeyEngine:
-        return DoorKeyEngine(layout_seed, count, max_steps=max_steps, **arguments)
+        return DoorKeyEngine(arguments.pop("layouts", layout_seed), count, max_steps=max_steps, **arguments)
 
 
 DOMAIN = DoorKeyDomain()

@@ -3,7 +3,7 @@
 Drawing is 99 % of MiniGrid's cost. Here a step is a few table look-ups for all environments together, and an image is
 64 tiles that were drawn once.
 
-A state is a *configuration* (the door and where the three keys are) and a *pose* (the agent's cell and
+A state is a *configuration* (the layout, its door and where its three keys are) and a *pose* (the agent's cell and
 direction). Turning and walking change the pose only and are table look-ups in NumPy. Picking up, dropping and
 toggling change the configuration: rare, so worked out in plain Python the first time and remembered. Every
 state met gets an id.
@@ -19,7 +19,7 @@ from minigrid.core.grid import Grid
 from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.typing import NDArray
 
-from hypogoal.domains.base import Engine, Plan, Step
+from hypogoal.domains.base import Engine, Layouts, Plan, Step
 from hypogoal.domains.doorkey_env import (
     DOOR_COLOUR,
     KEY_COLOURS,
@@ -38,7 +38,7 @@ CELLS = SIZE * SIZE
 POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
 HELD = CELLS  # a key's place: its cell, or HELD + rank on the ring (rank 0 was picked up first)
 OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers
-START = 0  # the id of the start state
+START = 0  # the id of the start state; of several layouts, of the first one's that was played
 UNKNOWN = -1
 
 # One byte says what is drawn in a cell.
@@ -68,7 +68,7 @@ MAY_CHANGE[PICKUP, KEY : KEY + 3] = MAY_CHANGE[DROP, EMPTY] = MAY_CHANGE[TOGGLE,
 _ROW_OF_TILE = np.dtype(f"V{TILE * 3}")  # a tile's pixel row moved as one item: twice as fast as 24 bytes
 _AHEAD, _AGENT_ON = AHEAD.tolist(), AGENT_ON.tolist()  # one look-up in a list is faster than in an array
 
-Configuration = tuple[int, ...]  # the door; the places of the blue, the green and the red key
+Configuration = tuple[int, ...]  # the layout's seed; the door; the places of the blue, the green and the red key
 
 
 @cache
@@ -85,9 +85,10 @@ def tiles() -> NDArray[np.uint8]:
 
 
 class DoorKeyEngine(Engine):
-    """Many environments of one layout, stepped together; ids are stable, and START is the id of the start state.
+    """Many environments of one layout or several, stepped together; ids are stable, START that of the start state.
 
-    Arguments are those of ``DoorKeyEnv``, but for ``layout``, one or the seed of one, and ``count``, of environments.
+    Arguments are those of ``DoorKeyEnv``, but for ``layout``, one, the seed of one or several, and ``count``, of
+    environments.
     """
 
     n_actions = N_ACTIONS
@@ -97,7 +98,7 @@ class DoorKeyEngine(Engine):
 
     def __init__(
         self,
-        layout: int | Layout,
+        layout: int | Layout | Layouts,
         count: int = 1,
         *,
         keyring: bool = True,
@@ -106,11 +107,15 @@ class DoorKeyEngine(Engine):
         wrong_key: str = "harmless",
     ):
         self.harsh = wrong_key == "ends"
-        self.layout = layout if isinstance(layout, Layout) else layout_of(layout)
+        self.known: dict[int, Layout] = {0: layout} if isinstance(layout, Layout) else {}  # those played, by seed
+        self.layouts: Layouts = layout if isinstance(layout, Layouts) else Layouts(list(self.known) or [layout])
         self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
         self.changes: dict[int, int] = {}  # of configurations, worked out so far, by configuration, cell and action
         self._numbers: dict[Configuration, int] = {}
-        # Of each configuration: its door and keys; what it shows without the agent, twice; the ids by pose.
+        # Of each configuration: its layout's seed and door cell; its door and keys; what it shows without the agent,
+        # twice; the ids by pose.
+        self._seeds: list[int] = []
+        self._doors = np.zeros(16, np.int64)
         self._places = np.zeros((16, 4), np.uint8)
         self._bare_codes = np.zeros((16, CELLS), np.uint8)
         self._rows: list[bytes] = []
@@ -122,8 +127,6 @@ class DoorKeyEngine(Engine):
         self._code_bytes = self._codes.data.cast("B")  # writes a row several times faster than NumPy
         self._on_goal = np.zeros(256, np.bool_)
         self._final = np.zeros(256, np.bool_)
-        start = self.layout.start * 4 + self.layout.direction
-        self._new_id(self._number_of((LOCKED, *self.layout.keys)) * POSES + start)
         self.reset()
 
     @property
@@ -131,21 +134,32 @@ class DoorKeyEngine(Engine):
         return tiles()
 
     def reset(self) -> NDArray[np.int64]:
-        self.ids = np.full(self.count, START, np.int64)
-        self.elapsed = np.zeros(self.count, np.int64)
+        self.ids = self.elapsed = np.zeros(self.count, np.int64)
+        self.restart(np.ones(self.count, np.bool_))
         return self.ids.copy()
 
     def restart(self, where: NDArray[np.bool_]) -> None:
-        self.ids, self.elapsed = np.where(where, START, self.ids), np.where(where, 0, self.elapsed)
+        self.ids, self.elapsed = self.ids.copy(), np.where(where, 0, self.elapsed)
+        for number in where.nonzero()[0].tolist():
+            self.ids[number] = self._start(self.layouts.begin(number))
+
+    def _start(self, seed: int) -> int:
+        """The start state of a layout."""
+        layout = self._layout(seed)
+        start = layout.start * 4 + layout.direction
+        return self._new_id(self._number_of((seed, LOCKED, *layout.keys)) * POSES + start)
+
+    def _layout(self, seed: int) -> Layout:
+        if seed not in self.known:
+            self.known[seed] = layout_of(seed)
+        return self.known[seed]
 
     def step(self, actions: NDArray[np.int64]) -> Step:
         next_ids = self.follow(self.ids, actions)
         terminated = self._final.take(next_ids)
-        elapsed = self.elapsed + 1
-        truncated = elapsed >= self.max_steps
-        ended = terminated | truncated
-        self.ids = np.where(ended, START, next_ids)
-        self.elapsed = np.where(ended, 0, elapsed)
+        self.ids, self.elapsed = next_ids, self.elapsed + 1
+        truncated = self.elapsed >= self.max_steps
+        self.restart(terminated | truncated)
         return Step(next_ids, self.at_goal(next_ids).astype(np.float32), terminated, truncated)
 
     def follow(self, ids: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -167,15 +181,15 @@ class DoorKeyEngine(Engine):
         key = (configuration * CELLS + front) * N_ACTIONS + action
         if (known := self.changes.get(key)) is not None:
             return known
-        door, *keys = self._places[configuration].tolist()
+        (door, *keys), seed = self._places[configuration].tolist(), self._seeds[configuration]
         held = sum(place >= HELD for place in keys)
         if action == PICKUP and front in keys and (self.keyring or not held):
             keys[keys.index(front)] = HELD + held
         elif action == DROP and held and self._rows[configuration][front] == EMPTY:
             keys[keys.index(max(keys))] = front
-        elif action == TOGGLE and front == self.layout.door and (door != LOCKED or keys[-1] >= HELD):
+        elif action == TOGGLE and front == self.known[seed].door and (door != LOCKED or keys[-1] >= HELD):
             door = CLOSED if door == OPEN else OPEN  # once unlocked it never locks again
-        self.changes[key] = self._number_of((door, *keys))
+        self.changes[key] = self._number_of((seed, door, *keys))
         return self.changes[key]
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
@@ -198,7 +212,7 @@ class DoorKeyEngine(Engine):
         """Spec B2: true sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
         configuration, pose = np.divmod(self._site.take(ids), POSES)
         door, keys = self._places[configuration, 0], self._places[configuration, 1:]
-        facing = AHEAD[pose] == self.layout.door
+        facing = AHEAD[pose] == self._doors[configuration]
         return sub_goals_reached(keys >= HELD, door == OPEN, facing, self.at_goal(ids), self.door_label)
 
     def origins(self, ids: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
@@ -218,15 +232,15 @@ class DoorKeyEngine(Engine):
         }
 
     def distances(self, drop: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Breadth-first search: ids of all states reachable from the start, nearest first, and steps to each.
+        """Breadth-first search: ids of all states reachable from the starts, nearest first, and steps to each.
 
-        States in which the episode ends are included and not gone beyond. Without ``drop`` they are a few thousand;
-        with it some ten million.
+        States in which the episode ends are included and not gone beyond. Without ``drop`` they are a few thousand of a
+        layout; with it some ten million.
         """
         actions = np.array([action for action in range(N_ACTIONS) if drop or action != DROP])
-        rings, depth = [np.array([START])], 0  # the states so many steps away
-        seen = np.ones(1, np.bool_)
-        steps = [np.zeros(1, np.int64)]
+        rings, depth = [np.array([self._start(seed) for seed in self.layouts.seeds])], 0  # those so many steps away
+        seen, steps = np.zeros(self.n_states, np.bool_), [np.zeros(len(rings[0]), np.int64)]
+        seen[rings[0]] = True
         while len(rings[-1]):
             origin = rings[-1][~self._final[rings[-1]]]
             following = np.unique(self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))))
@@ -259,42 +273,49 @@ class DoorKeyEngine(Engine):
         return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:
-        """Primitive steps from the start to the goal, at least; None where a key must be dropped (no key ring)."""
+        """Primitive steps from the start to the goal, at least; None where a key must be dropped (no key ring), or of many."""
+        if self.layouts.many:
+            return None
         ids, steps = self.distances()
         at_goal = self.at_goal(ids)
         return int(steps[at_goal].min()) if at_goal.any() else None
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float:
         """Spec F5: share of ``episodes`` of uniformly random actions that reach the goal in ``max_steps``."""
-        ids, solved = np.full(episodes, START, np.int64), 0
+        seeds = rng.choice(self.layouts.seeds, episodes).tolist() if self.layouts.many else self.layouts.seeds * episodes
+        ids, solved = np.array([self._start(seed) for seed in seeds], np.int64), 0
         for _ in range(self.max_steps):
             ids = self.follow(ids, rng.integers(N_ACTIONS, size=len(ids)))
             solved += int(self.at_goal(ids).sum())
             ids = ids[~self._final[ids]]
         return solved / episodes
 
-    def snapshot(self) -> dict[str, NDArray[Any]]:
+    def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly: where each environment is, and the ids given so far."""
         return {
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
             "configurations": self._places[: len(self._rows)].copy(),
             "sites": self._site[: self.n_states].copy(),
+            **({"seeds": np.array(self._seeds), "layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
-    def restore(self, snapshot: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of this layout and count, its states met in this order; else ``ValueError``."""
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Continue from a ``snapshot`` of these layouts and count, its states met in this order; else ``ValueError``."""
         if snapshot["ids"].shape != (self.count,):
             raise ValueError(f"the snapshot is of {len(snapshot['ids'])} environments, not {self.count}")
         configurations, sites = snapshot["configurations"], snapshot["sites"]
         begun = np.array_equal(configurations[: len(self._rows)], self._places[: len(self._rows)])
         if not (begun and np.array_equal(sites[: self.n_states], self._site[: self.n_states])):
             raise ValueError("a snapshot is restored onto states of its own layout, met in the same order")
-        for configuration in configurations.tolist():
-            self._number_of(tuple(configuration))
+        seeds = snapshot["seeds"].tolist() if self.layouts.many else self.layouts.seeds * len(configurations)
+        for seed, configuration in zip(seeds, configurations.tolist(), strict=True):
+            self._number_of((seed, *configuration))
         for site in sites.tolist():
             self._new_id(site)
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
+        if self.layouts.many:
+            self.layouts.restore(snapshot["layouts"])
 
     def _new_id(self, site: int) -> int:
         known = self._id_at.item(site)
@@ -312,7 +333,7 @@ class DoorKeyEngine(Engine):
         row[cell] = _AGENT_ON[row[cell]] + (pose & 3)
         self._code_bytes[new * CELLS : (new + 1) * CELLS] = row
         self._site[new], self._ahead[new] = site, configuration * CELLS + _AHEAD[pose]
-        self._on_goal[new] = cell == self.layout.goal
+        self._on_goal[new] = cell == self.known[self._seeds[configuration]].goal
         wrong = self.harsh and bool((self._places[configuration, 1:3] >= HELD).any())
         self._final[new] = self._on_goal[new] or wrong
         self._id_at[configuration, pose] = new
@@ -325,18 +346,21 @@ class DoorKeyEngine(Engine):
         new = self._numbers[configuration] = len(self._rows)
         if new == len(self._places):
             self._places, self._bare_codes = _doubled(self._places), _doubled(self._bare_codes)
+            self._doors = _doubled(self._doors)
             self._id_at = _doubled(self._id_at, UNKNOWN)
-        row = bytearray(CELLS)
-        for cell in self.layout.walls:
+        seed, door, *keys = configuration
+        row, layout = bytearray(CELLS), self._layout(seed)
+        for cell in layout.walls:
             row[cell] = WALL
-        row[self.layout.goal] = GOAL
-        row[self.layout.door] = DOOR + configuration[0]
-        for colour, place in enumerate(configuration[1:]):
+        row[layout.goal] = GOAL
+        row[layout.door] = DOOR + door
+        for colour, place in enumerate(keys):
             if place < HELD:
                 row[place] = KEY + colour
         self._rows.append(bytes(row))
         self._bare_codes[new] = np.frombuffer(row, np.uint8)
-        self._places[new] = configuration
+        self._seeds.append(seed)
+        self._doors[new], self._places[new] = layout.door, configuration[1:]
         return new
 
 

@@ -73,6 +73,8 @@ class GymnasiumDomain(Domain):
         DOMAIN = GymnasiumDomain(make, {"key": lambda env: env.unwrapped.carrying is not None})
     """
 
+    many_layouts = True
+
     def __init__(
         self,
         make: engines.MakeEnv,
@@ -111,11 +113,11 @@ class GymnasiumDomain(Domain):
         return engines.made(self.make, **{**self._own_settings, **arguments})
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> engines.GymnasiumEngine:
-        """An engine of ``count`` environments of one layout; ``arguments``: ``memory``, and settings of its own."""
-        memory = arguments.pop("memory", self.memory)
+        """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory``, and settings of its own."""
+        memory, layouts = arguments.pop("memory", self.memory), arguments.pop("layouts", layout_seed)
         make = partial(self.make_env, **arguments)
         told = {"max_steps": max_steps, "memory": memory, "success": self.success}
-        return engines.GymnasiumEngine(make, self._labels, layout_seed, count, **told)
+        return engines.GymnasiumEngine(make, self._labels, layouts, count, **told)
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)

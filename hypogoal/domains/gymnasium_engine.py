@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import digest
-from hypogoal.domains.base import Step, TurnEngine
+from hypogoal.domains.base import Layouts, Step, TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
@@ -151,10 +151,11 @@ class Labels:
 
 
 class GymnasiumEngine(TurnEngine):
-    """Environments of one layout, stepped one after the other.
+    """Environments of one layout or several, stepped one after the other.
 
-    Every episode begins with ``reset(seed=layout_seed)``. States are told apart by what is seen and by their labels:
-    the same picture with the same labels has the same id again while it is among the newest ``memory`` distinct ones.
+    Every episode begins with ``reset(seed=layout_seed)``. States are told apart by what is seen and by their labels, in
+    whichever layout: the same picture with the same labels has the same id again while it is among the newest
+    ``memory`` distinct ones.
     Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
 
     Episodes are truncated after ``max_steps`` steps, where the
@@ -165,14 +166,15 @@ class GymnasiumEngine(TurnEngine):
         self,
         make: MakeEnv,
         labels: Labels,
-        layout_seed: int,
+        layouts: int | Layouts,
         count: int,
         *,
         max_steps: int,
         memory: int = MEMORY,
         success: Success | None = None,
     ):
-        self.count, self.max_steps, self.layout_seed = count, max_steps, layout_seed
+        self.count, self.max_steps = count, max_steps
+        self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self.memory: int = memory
         self._envs = [make_checked(make) for _ in range(count)]
         self._ask, self._success = labels, success
@@ -194,7 +196,7 @@ class GymnasiumEngine(TurnEngine):
         return self.n_states - len(self._ring)
 
     def _begin(self, number: int) -> int:
-        observation, _info = begun(self._envs[number], seed=self.layout_seed)
+        observation, _info = begun(self._envs[number], seed=self.layouts.begin(number))
         self._played[number], self._earned[number] = [], 0.0
         return self._remember(self._envs[number], observation)
 
@@ -261,6 +263,7 @@ class GymnasiumEngine(TurnEngine):
             "images": np.stack(self._ring),
             "labels": np.frombuffer(self._labels, np.uint8).copy(),
             "played": [list(actions) for actions in self._played],
+            **({"layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -275,9 +278,11 @@ class GymnasiumEngine(TurnEngine):
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
             self._file(digest(self._ring[identity % size], labels), identity)
+        if self.layouts.many:
+            self.layouts.restore(snapshot["layouts"])
         for number, actions in enumerate(snapshot["played"]):
-            env = self._envs[number]
-            observation, _info = begun(env, seed=self.layout_seed)
+            env, seed = self._envs[number], self.layouts.now[number]
+            observation, _info = begun(env, seed=seed)
             self._earned[number] = 0.0
             for action in actions:
                 observation, reward, *_ = stepped(env, action)
@@ -285,6 +290,6 @@ class GymnasiumEngine(TurnEngine):
             here, was = as_image(env, observation, self.observation_shape), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 what = "the environment does not do the same again for the same seed, so this cannot be gone on with"
-                raise UserError(what, f"layout_seed={self.layout_seed}", "Begin anew with --force.")
+                raise UserError(what, f"layout_seed={seed}", "Begin anew with --force.")
         self._played = [list(actions) for actions in snapshot["played"]]
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
