@@ -208,6 +208,10 @@ def audit(
 def evaluate(
     run: Annotated[Path, typer.Argument(help="A run: a folder with artefacts in it.")],
     out: Annotated[Path | None, typer.Option("--out", help="Default: RUN/evaluation.")] = None,
+    layouts: Annotated[
+        str | None,
+        typer.Option(help="Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."),
+    ] = None,
     force: Force = False,
     resume: Resume = False,
     quiet: Quiet = False,
@@ -217,7 +221,7 @@ def evaluate(
     from hypogoal.stages.evaluate import summary_table
 
     out = out or run / "evaluation"
-    metrics = stage(run, out, force=force, resume=resume, quiet=quiet)
+    metrics = stage(run, out, layouts=layouts or "", force=force, resume=resume, quiet=quiet)
     if not quiet:
         draw(summary_table(metrics), 100)
     give(out)

@@ -108,7 +108,8 @@ class DoorKeyEngine(Engine):
     ):
         self.harsh = wrong_key == "ends"
         self.known: dict[int, Layout] = {0: layout} if isinstance(layout, Layout) else {}  # those played, by seed
-        self.layouts: Layouts = layout if isinstance(layout, Layouts) else Layouts(list(self.known) or [layout])
+        seed = 0 if isinstance(layout, Layout) else layout
+        self.layouts: Layouts = seed if isinstance(seed, Layouts) else Layouts((seed,))
         self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
         self.changes: dict[int, int] = {}  # of configurations, worked out so far, by configuration, cell and action
         self._numbers: dict[Configuration, int] = {}
@@ -273,7 +274,7 @@ class DoorKeyEngine(Engine):
         return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:
-        """Primitive steps from the start to the goal, at least; None where a key must be dropped (no key ring), or of many."""
+        """Primitive steps from the start to the goal, at least; None of many, or where a key must be dropped."""
         if self.layouts.many:
             return None
         ids, steps = self.distances()
@@ -282,7 +283,9 @@ class DoorKeyEngine(Engine):
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float:
         """Spec F5: share of ``episodes`` of uniformly random actions that reach the goal in ``max_steps``."""
-        seeds = rng.choice(self.layouts.seeds, episodes).tolist() if self.layouts.many else self.layouts.seeds * episodes
+        seeds = list(self.layouts.seeds) * episodes
+        if self.layouts.many:
+            seeds = rng.choice(self.layouts.seeds, episodes).tolist()
         ids, solved = np.array([self._start(seed) for seed in seeds], np.int64), 0
         for _ in range(self.max_steps):
             ids = self.follow(ids, rng.integers(N_ACTIONS, size=len(ids)))
@@ -301,7 +304,7 @@ class DoorKeyEngine(Engine):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of these layouts and count, its states met in this order; else ``ValueError``."""
+        """Continue from a ``snapshot`` of these layouts and count, states met in this order; else ``ValueError``."""
         if snapshot["ids"].shape != (self.count,):
             raise ValueError(f"the snapshot is of {len(snapshot['ids'])} environments, not {self.count}")
         configurations, sites = snapshot["configurations"], snapshot["sites"]

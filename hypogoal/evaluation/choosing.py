@@ -186,6 +186,7 @@ def numbers(work: Work) -> dict[str, Any]:
             artefact = artefacts[about["path"]]
             config = artefact.config
             known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
+            known = known and not config.get("layouts")  # whose states are too many to say what follows in each
             if base_name(artefact.kind, config) not in (LEARNED, *BANDITS.values()) or not known:
                 continue
             domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)

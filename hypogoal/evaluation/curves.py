@@ -215,6 +215,7 @@ def agent_metrics(name: str, runs: Sequence[Run]) -> dict[str, Any]:
             "seed": run.seed,
             "layout_seed": run.layout["layout_seed"],
             "shortest_path": run.layout.get("shortest_path"),
+            **{key: run.layout[key] for key in ("layouts",) if key in run.layout},
             "steps": run.budget,
             **run_numbers(run.episodes, run.layout.get("shortest_path")),
         }
@@ -255,7 +256,7 @@ def numbers(work: Work) -> dict[str, Any]:
         for index, same in enumerate(groups.values()):
             for key, values in agent_curves(same, grid).items():
                 work.arrays[f"curves/{index}/{key}"] = values
-    layouts = {run.layout["layout_seed"]: dict(run.layout) for run in runs}
+    layouts = {(run.layout["layout_seed"], run.layout.get("layouts", "")): dict(run.layout) for run in runs}
     agents = [agent_metrics(name, same) for name, same in groups.items()]
     return {"agents": agents, "layouts": [layouts[seed] for seed in sorted(layouts)]}
 
@@ -273,17 +274,24 @@ def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
                 for step, value in zip(arrays["curves/grid"][()].tolist(), values, strict=True):
                     yield from rows_of({quantity: value}, step=step, **about)
     for layout in metrics["layouts"]:
-        yield from rows_of({"random_success": layout["random_success"]}, layout=layout["layout_seed"])
+        where = "" if "layouts" in layout else layout["layout_seed"]
+        yield from rows_of({"random_success": layout["random_success"]}, layout=where)
 
 
 def against(agents: Sequence[Entry]) -> Rows:
     """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts."""
-    runs = [(agent["name"], (run["layout_seed"], run["seed"]), run) for agent in agents for run in agent["runs"]]
+    runs = [(agent["name"], (layout_of(run), run["seed"]), run) for agent in agents for run in agent["runs"]]
     rows: Rows = []
     for quantity, higher in HIGHER.items():
         measured = [(name, alike, run.get(quantity, math.nan)) for name, alike, run in runs]
         rows += pairs(measured, quantity, higher=higher, layouts=True)
     return rows
+
+
+def layout_of(facts: Entry) -> int | str:
+    """Where a run lives: a layout's seed, or the many that it draws from."""
+    where: int | str = facts.get("layouts") or facts["layout_seed"]
+    return where
 
 
 def missing(work: Work) -> list[str]:
@@ -338,7 +346,7 @@ INTERVALS = (
 )
 EVERY_RUN = (
     page.label("agent", "name", once=True),
-    page.number("layout", "layout_seed"),
+    page.number("layout", layout_of),
     page.number("seed", "seed"),
     page.number("budget", "steps", page.thousands),
     page.number("episodes", "episodes"),
@@ -350,7 +358,7 @@ EVERY_RUN = (
     page.number("95 % at", "steps_to_95", lambda steps: "never" if steps is None else page.thousands(steps)),
 )
 LAYOUTS = (
-    page.label("layout seed", lambda layout: str(layout["layout_seed"])),
+    page.label("layout seed", lambda layout: str(layout_of(layout))),
     page.number("shortest path, steps", "shortest_path", page.fixed, 0),
     page.number("random play succeeds", "random_success", page.percent),
     page.number("episodes of random play", "random_episodes"),
@@ -447,7 +455,7 @@ def _episodes(agent: Mapping[str, Any], window: int) -> str:
 def runs_of(agent: Entry) -> str:
     """How many runs an agent has, and of which layouts and seeds."""
     runs = agent["runs"]
-    layouts, seeds = (sorted({run[key] for run in runs}) for key in ("layout_seed", "seed"))
+    layouts, seeds = sorted({layout_of(run) for run in runs}, key=str), sorted({run["seed"] for run in runs})
     return (
         f"{len(runs)} run{'s' if len(runs) > 1 else ''}: layout seed{'s' if len(layouts) > 1 else ''} "
         f"{page.listed(layouts)}, run seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}"

@@ -116,6 +116,7 @@ class Work:
     contents: Contents  # the run's artefacts
     arrays: Any  # ``arrays.h5``, to be written into
     progress: Progress  # is told of each artefact
+    layouts: tuple[int, ...] = ()  # on which trained agents are to play
     shown: int | None = None  # the ensemble whose states are shown; None where there is none
     browsed: int | None = None  # the ensemble whose states are browsed; None where there is none
     # What questions keep of the states that they were shown, by their own names.

@@ -115,7 +115,11 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "shown": ("states", "held-out states of a sub-goal that the page lets one browse"),
     "explained": ("states", "those of them whose attributions are kept"),
     "last_frame": ("fraction", "share of all attribution, absolute, that is in the last channel"),
-    "match": ("fraction", "a member's balanced accuracy against the true sub-goal on the layout's reachable states"),
+    "match": (
+        "fraction",
+        "a member's balanced accuracy against the true sub-goal on the layout's reachable states; of many layouts the "
+        "first ten's",
+    ),
     "expected": ("decisions", "sum of 1 / (options offered) over the decisions that offered it"),
     "offered": ("decisions", "decisions at which the option was not masked"),
     "chosen": ("decisions", "decisions that chose the option"),

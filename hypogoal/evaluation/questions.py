@@ -16,6 +16,7 @@ from hypogoal.evaluation import (
     rooms,
     saliency,
     selection,
+    zero_shot,
 )
 from hypogoal.evaluation.numbers import QUANTITIES, Metrics
 from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
@@ -33,6 +34,7 @@ QUESTIONS: list[Question] = [
     saliency.QUESTION,
     selection.QUESTION,
     choosing.QUESTION,
+    zero_shot.QUESTION,
 ]
 OLDER = "; evaluated by an older hypogoal: its intervals are bootstraps, too narrow with few runs. Evaluate again"
 

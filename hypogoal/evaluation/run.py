@@ -194,13 +194,14 @@ def _read(kind: type[Table], path: Path, kinds: Mapping[str, Any], optional: Seq
 
 
 def read_layout(path: Path) -> dict[str, Any]:
-    """``layout.json``: layout_seed, shortest_path, random_success, random_episodes."""
+    """``layout.json``: layout_seed, shortest_path, random_success, random_episodes; of many layouts also layouts."""
     facts = read_json(path, "the layout's file is", AGAIN)
     wanted = {"layout_seed": int, "shortest_path": int | None, "random_success": float | int | None}
     fits = isinstance(facts, dict) and all(isinstance(facts.get(key, ...), kind) for key, kind in wanted.items())
     if not fits or not 0 <= facts["layout_seed"] < MOST or type(facts.get("random_episodes")) is not int:
         raise UserError("the layout's file is damaged", path, AGAIN)
-    return {key: facts[key] for key in (*wanted, "random_episodes")}
+    told = {"layouts": facts["layouts"]} if isinstance(facts.get("layouts"), str) else {}
+    return {key: facts[key] for key in (*wanted, "random_episodes")} | told
 
 
 def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:

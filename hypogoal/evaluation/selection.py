@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Engine, load_domain, step_of
+from hypogoal.domains.base import Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import BANDITS, LEARNED, PRETRAINING, RANDOM, base_name, variants, which
 from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
@@ -23,11 +23,13 @@ from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
 from hypogoal.evaluation.run import Choices, read_choices, read_terminations, within
 from hypogoal.hypotheses.scores import member_scores, most_and_least
+from hypogoal.meta.config import layout_seeds
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
 LATE = 0.25  # the last part of training that is looked at by itself
+LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
 PARTS = 20  # of training, in which choices are counted apart
 SELECTED = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING)  # agents whose options are members: to select among
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
@@ -108,7 +110,8 @@ def numbers(work: Work) -> dict[str, Any]:
             if base_name(artefact.kind, config) not in SELECTED:
                 continue
             ensemble = artefact.input("ensemble")
-            match, choices = match_of(ensemble, about["layout_seed"]), read_choices(folder / "choices.csv")
+            seeds = layout_seeds(config.get("layouts", ""), about["layout_seed"])[:LOOKED_AT]
+            match, choices = match_of(ensemble, tuple(seeds)), read_choices(folder / "choices.csv")
             for option, states in read_terminations(folder / "terminations.h5").items():
                 place = f"terminations/{about['path']}/{option}"
                 work.arrays[place] = overlay(states)
@@ -123,8 +126,8 @@ def numbers(work: Work) -> dict[str, Any]:
     return {"selection": metrics}
 
 
-def match_on_layout(path: Path, layout_seed: int) -> NDArray[np.float64]:
-    """Spec F6: the balanced accuracy of every member of an ensemble on the states of a layout, float (G*K,).
+def match_on_layout(path: Path, layouts: tuple[int, ...]) -> NDArray[np.float64]:
+    """Spec F6: the balanced accuracy of every member of an ensemble on the states of layouts, float (G*K,).
 
     NaN where the domain does not have the sub-goal, which the user's own labels told: its truth there is not known.
     """
@@ -132,7 +135,9 @@ def match_on_layout(path: Path, layout_seed: int) -> NDArray[np.float64]:
 
     source = open_artefact(path, "ensemble")
     domain = load_domain(source.config["domain"])
-    engine = domain.make_engine(layout_seed, 1, 500, **domain.world(source.config["domain_config"]))
+    arguments = domain.world(source.config["domain_config"])
+    arguments |= {"layouts": Layouts(layouts)} if len(layouts) > 1 else {}
+    engine = domain.make_engine(layouts[0], len(layouts), 500, **arguments)
     ids = states_of_layout(engine)
     images, labels = engine.images(ids), dict(zip(domain.sub_goals, engine.labels(ids).T, strict=True))
     match = []

@@ -5,7 +5,8 @@ The light recipe's are the defaults, those of Table 5 are in the ``paper`` prese
 
 from dataclasses import dataclass
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import MAX_RANGE, parse_integers, setting
+from hypogoal.core.errors import UserError
 from hypogoal.options.config import OptionConfig
 
 
@@ -62,6 +63,11 @@ class PlayConfig(OptionConfig):
         high=1.0,
     )
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
+    layouts: str = setting(
+        "",
+        "layouts of which each episode draws one: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: it",
+        source="ours: the paper lives on one",
+    )
     max_episode_steps: int = setting(
         500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
     )
@@ -89,6 +95,18 @@ class PlayConfig(OptionConfig):
         low=0,
     )
     random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
+
+
+def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
+    """What ``layouts`` means, each seed once, a bare number so many from ``first`` on; else a ``UserError``."""
+    if not layouts.strip() and first is not None:
+        return [first]
+    if layouts.strip().isdecimal():
+        count, do = int(layouts), f"Give from 1 to {MAX_RANGE}, or seeds as 2000-2099."
+        if first is None or not 0 < count <= MAX_RANGE:
+            raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
+        return list(range(first, first + count))
+    return list(dict.fromkeys(parse_integers(layouts)))
 
 
 @dataclass(frozen=True)

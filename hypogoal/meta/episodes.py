@@ -1,16 +1,17 @@
 """Episodes of a trained agent: frame by frame for films, and as data for other software (Spec D1, E1)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import assemble
+from hypogoal.meta.training import ONE_LAYOUT, assemble
 from hypogoal.options.loop import OptionLoop, Transitions
 
 REPLAY = 1_000  # nothing is learned: a small one
@@ -39,8 +40,10 @@ class Episode:
     terminated: bool  # the task was over; otherwise the episode was cut
 
 
-def agent_of(artefact: Artefact, seed: int, environments: int = 1) -> OptionLoop:
+def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequence[int] = ()) -> OptionLoop:
     """Environments in which the agent of a meta artefact plays; ``seed`` is of the draws.
+
+    ``layouts``: one of these in each environment, instead of those that it was trained in; without its ``cap``.
 
     A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
     """
@@ -56,8 +59,13 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1) -> OptionLoop
         "chooser": artefact.config["chooser"] if "meta.safetensors" in files else "random",
         "initiation": "learned" if "initiation.safetensors" in files else "anywhere",
     }
-    domain = load_domain(artefact.config["domain"])
-    loop = assemble(domain, source.path, source.config, TrainMetaConfig(**settings), seed)
+    domain, others = load_domain(artefact.config["domain"]), None
+    if layouts:
+        if not domain.many_layouts:
+            raise UserError(ONE_LAYOUT, domain.name, "Evaluate without --layouts.")
+        settings |= {"layouts": "", "cap": 0.0}
+        others = Layouts(layouts)
+    loop = assemble(domain, source.path, source.config, TrainMetaConfig(**settings), seed, layouts=others)
     learned = load_tensors(artefact.path / "options.safetensors")
     loop.learner.load(learned)
     loop.terminations.load(learned)

@@ -17,9 +17,9 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
-from hypogoal.domains.base import Domain, Engine
+from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
+from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
@@ -36,6 +36,7 @@ from hypogoal.options.visited import Visited
 from hypogoal.options.windows import AgentWindows, localiser_of
 
 LOG_INTERVAL = 2_000  # environment steps
+ONE_LAYOUT = "an engine of this domain plays one layout"
 LEARNERS: dict[str, type[Learner]] = {"light": LightLearner, "paper": RecurrentLearner, "planned": PlannedLearner}
 
 
@@ -47,21 +48,26 @@ def assemble(
     seed: int,
     device: str = "cpu",
     ends: Callable[[Engine], Terminations] | None = None,
+    layouts: Layouts | None = None,
 ) -> OptionLoop:
-    """The environments of one layout, an ensemble's options in them, fresh policies of these and over these.
+    """Environments, an ensemble's options in them, fresh policies of these and over these.
 
     ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, start states; ``ends`` gives terminations that are no ensemble's. Where the domain has no such start, or
-    not the true sub-goals at which options are to end, it is a ``UserError``.
+    several, layouts and start states; ``ends`` gives terminations that are no ensemble's, ``layouts`` others than those
+    of ``config``. Where the domain has no such start, or not the true sub-goals at which options are to end, it is a
+    ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = columns_of(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
     arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
+    if layouts:
+        arguments["layouts"] = layouts
+    many = "layouts" in arguments
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
     if config.cap:
         if (shortest := engine.shortest_path()) is None:
-            raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
+            raise UserError("there is no one shortest path, or nobody knows it", f"cap={config.cap:g}", "Give cap=0.")
         engine.max_steps = math.ceil(config.cap * shortest)
     if ends:
         terminations = ends(engine)
@@ -71,7 +77,7 @@ def assemble(
         ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in sub_goals]
         alone = config.experience == "own" and not config.mask_reached
         terminations = learned_terminations(engine, ensembles, running_only=alone, rule=config.termination)
-        if (reachable := engine.reachable()) is not None:
+        if not many and (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
     _check_rule(terminations, config)
     seen = None
@@ -156,21 +162,27 @@ def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termin
 
 
 def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
-    """Spec D4: what an engine of a domain with named starts is told; nothing where there is one place only.
+    """Spec D4, H6: what an engine is told of where episodes begin; nothing where there is one place, one layout only.
 
-    Where the domain has no such start, or has several and none is given, it is a ``UserError``.
+    Where the domain has no such start or no layouts, or has several starts and none is given, it is a ``UserError``.
     """
+    layouts: dict[str, Any] = {}
+    if config.layouts.strip():
+        if not domain.many_layouts:
+            raise UserError(ONE_LAYOUT, f"{domain.name}, layouts={config.layouts}", "Leave it out.")
+        seeds = layout_seeds(config.layouts, config.layout_seed)
+        layouts["layouts"] = Layouts(seeds, rng_for(seed, "layouts") if len(seeds) > 1 else None)
     if not domain.starts:
         if config.start or config.along:
             given = f"start={config.start}" if config.start else f"along={config.along}"
             raise UserError(f"{domain.name} has no named starts", given, "Leave it out.")
-        return {}
+        return layouts
     for start in config.start.split(",") if domain.many_starts else [config.start]:
         if start not in domain.starts:
             what = "unknown start" if start else "where are episodes to begin?"
             raise UserError(what, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
-    return {"start": config.start, "along": config.along, "memory": memory, "seed": seed}
+    return {"start": config.start, "along": config.along, "memory": memory, "seed": seed, **layouts}
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:
@@ -238,6 +250,8 @@ def check_fit(
         raise UserError(what, trained.path, f"Train them from {source.path}.")
     before = as_dict(type(config)()) | trained.config  # of settings from before there were any, the default
     for key in fixed:
+        if key == "layout_seed" and before["layouts"]:  # their layouts were many: they may live anywhere
+            continue
         if before[key] != getattr(config, key):
             what = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
             raise UserError(what, trained.path, f"Give --set {key}={before[key]}.")
@@ -271,17 +285,22 @@ def write_trained(
         save_tensors(folder / "initiation.safetensors", loop.initiation.state())
     if chooser := loop.chooser.state():
         save_tensors(folder / "meta.safetensors", chooser)
-    write_layout(folder, loop.engine, config.layout_seed, config.random_episodes, seed, config.start)
+    about = {name: of for name, of in (("start", config.start), ("layouts", config.layouts.strip())) if of}
+    if about.get("layouts", "").isdecimal():
+        seeds = layout_seeds(config.layouts, config.layout_seed)
+        about["layouts"] = f"{seeds[0]}-{seeds[-1]}"
+    write_layout(folder, loop.engine, config.layout_seed, config.random_episodes, seed, **about)
 
 
-def write_layout(folder: Path, engine: Engine, layout_seed: int, episodes: int, seed: int, start: str = "") -> None:
+def write_layout(folder: Path, engine: Engine, layout_seed: int, episodes: int, seed: int, **about: str) -> None:
     """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
-    Where the engine cannot tell them they are null, and no episode of random play was played.
+    Where the engine cannot tell them they are null, and no episode of random play was played. ``about`` stands there
+    too.
     """
     success = engine.random_success(episodes, rng_for(seed, "random-play")) if episodes else None
     facts = {
-        **({"start": start} if start else {}),
+        **about,
         "layout_seed": layout_seed,
         "shortest_path": engine.shortest_path(),
         "random_success": success,

@@ -90,6 +90,7 @@ class OptionLoop(Resumable):
         self._choose()
         ids, option = self.engine.ids.copy(), self.option.copy()
         actions = self.learner.act(ids, option, self.age, explore=explore)
+        layouts = [*self.engine.layouts.now] if self.engine.layouts else None
         step = step_of(self.engine, actions)
         reached = self.terminations.reached(step.next_ids, option, self.age)
         self.returns += self.gamma**self.age * step.rewards
@@ -105,7 +106,7 @@ class OptionLoop(Resumable):
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
             self.engine.restart(ended & ~over)
         if self.visited:
-            self.visited.see(step.next_ids, actions, step.terminated | step.truncated)
+            self.visited.see(step.next_ids, actions, step.terminated | step.truncated, layouts)
         self.recorder.see(step)
         self._finish_options(step, reached, ended)
         return moved

@@ -1,7 +1,7 @@
 """Spec B7: states that a policy visited while it learned, kept to train ensembles with."""
 
 import heapq
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ class Visited(Resumable):
 
     Whether a state is kept depends neither on when nor on how often it was visited, and no random numbers are drawn.
     At ``most`` so many are kept, which ones depends on ``seed``; their positions too, where the engine has them, or
-    else ``layout_seed``.
+    else their layout's seed, ``layout_seed`` where the engine does not say.
     """
 
     def __init__(self, engine: Engine, most: int, layout_seed: int, seed: int):
@@ -35,11 +35,19 @@ class Visited(Resumable):
         self._kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.int64]]] = {}
         self._worst: list[int] = []  # a heap of the hashes kept, negative: the largest first
 
-    def see(self, ids: NDArray[np.int64], actions: NDArray[np.int64], over: NDArray[np.bool_]) -> None:
-        """States (E,), the actions (E,) that led to them, and whether the episodes are over, bool (E,)."""
+    def see(
+        self,
+        ids: NDArray[np.int64],
+        actions: NDArray[np.int64],
+        over: NDArray[np.bool_],
+        layouts: Sequence[int] | None = None,
+    ) -> None:
+        """States (E,), the actions (E,) that led to them, whether episodes are over, bool (E,), and their layouts."""
         fresh = np.arange(len(ids)) if self._forgets else self._unknown(ids)
         if len(fresh):
-            pictures, places = self.engine.images(ids[fresh]), self._places(ids[fresh])
+            where = np.array(layouts if layouts else [self.layout_seed] * len(ids))[fresh, None]
+            pictures = self.engine.images(ids[fresh])
+            places = self.engine.positions(ids[fresh]) if self.engine.position_names else where
             steps = np.stack([actions[fresh], self._before[fresh]], axis=1)
             for picture, origin in zip(pictures, np.concatenate([steps, places], axis=1), strict=True):
                 self._offer(picture, origin)
@@ -52,11 +60,6 @@ class Visited(Resumable):
         fresh = np.flatnonzero(~self._known[ids])
         self._known[ids] = True
         return fresh
-
-    def _places(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        if self.engine.position_names:
-            return self.engine.positions(ids)
-        return np.full((len(ids), 1), self.layout_seed, dtype=np.int64)
 
     @property
     def origins(self) -> tuple[str, ...]:

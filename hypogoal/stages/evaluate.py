@@ -24,6 +24,7 @@ from hypogoal.experiments.cells import DERIVED
 from hypogoal.experiments.records import PLAN, read_plan
 from hypogoal.experiments.status import stamp_of
 from hypogoal.hypotheses.ensemble import THRESHOLD
+from hypogoal.meta.config import layout_seeds
 from hypogoal.needs import evaluation_needs
 
 __all__ = ["evaluate", "summary_table"]
@@ -32,13 +33,18 @@ SETTINGS = {"window": WINDOW, "solved": SOLVED, "gamma": GAMMA, "threshold": THR
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
 
 
-def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False, quiet: bool = False) -> dict[str, Any]:
+def evaluate(
+    run: Path, out: Path, *, layouts: str = "", force: bool = False, resume: bool = False, quiet: bool = False
+) -> dict[str, Any]:
     """Compute every number of the report and write an artefact: ``metrics.json``, ``numbers.csv``, ``arrays.h5``.
 
     ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them; none, or a damaged one, is a
-    ``UserError``. Returns what ``metrics.json`` holds, see its ``quantities``.
+    ``UserError``. On ``layouts``, 2000-2099, trained agents play, too, without learning. Returns what ``metrics.json``
+    holds, see its ``quantities``.
     """
     prepare()
+    seeds = tuple(layout_seeds(layouts)) if layouts else ()
+    settings = SETTINGS | ({"layouts": layouts} if layouts else {})
     out = claim(out, kind="evaluation", force=force, resume=resume)
     contents = find(run)
     inputs = [artefact.whole().path for artefact in contents.everything()]
@@ -50,18 +56,18 @@ def evaluate(run: Path, out: Path, *, force: bool = False, resume: bool = False,
         workers, needs = 1, evaluation_needs(data, 1)
     preflight("evaluate", out, needs, resume=resume, quiet=quiet)
     with create_artefact(
-        out, kind="evaluation", config=SETTINGS, seed=0, inputs=[*data, *inputs], force=force, resume=resume
+        out, kind="evaluation", config=settings, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:
         steps = Progress("evaluate", total=len(inputs), quiet=quiet)
         with create_hdf5(folder / "arrays.h5") as arrays, steps as progress:
-            work = Work(contents, arrays, progress)
+            work = Work(contents, arrays, progress, seeds)
             judge_ensembles(work, cases, workers)
             for question in QUESTIONS:
                 work.metrics |= question.numbers(work)
             metrics = plain(
                 {
                     "run": contents.run.resolve().name,
-                    "settings": {**SETTINGS, **(LADDERS if contents.ladders else {})},
+                    "settings": {**settings, **(LADDERS if contents.ladders else {})},
                     "missing": missing(work),
                     "ensembles": work.ensembles,
                     **work.metrics,
