@@ -1,7 +1,6 @@
-"""MiniGrid's DoorKey, options and agent trained over 1,000 layouts and tried on 100 others; labels are of one layout.
+"""MiniGrid's DoorKey, options and agent trained over 1,000 layouts and tried on 100 others; labels are of ten.
 
-Shows `layouts` and `evaluate --layouts`. Some 40 minutes on one core, most of it for drawing. In this folder, allowed
-by `export HYPOGOAL_TRUST=many_layouts:DOMAIN`:
+Shows `layouts` and `evaluate --layouts`; 40 minutes on one core. After `export HYPOGOAL_TRUST=many_layouts:DOMAIN`:
 
     hypogoal collect many_layouts:DOMAIN --out runs/many/data.h5
     hypogoal train-ensemble runs/many/data.h5 --out runs/many/ensemble
@@ -19,7 +18,7 @@ from hypogoal import GymnasiumDomain
 
 
 def make() -> gymnasium.Env:
-    """All of the grid, uint8 (48, 48, 3): a picture tells the layout; only a held key's colour is not in it."""
+    """All of the grid, uint8 (48, 48, 3): one picture tells the layout, and that a key is held by its absence."""
     env = gymnasium.make("MiniGrid-DoorKey-6x6-v0", highlight=False)
     return ImgObsWrapper(RGBImgObsWrapper(env, tile_size=8))
 
@@ -36,5 +35,6 @@ def wander(env, observation, rng) -> int:
 
 
 PLAY = {"layouts": "1000-1999", "max_episode_steps": 100, "replay": 50_000}
-DEFAULTS = {"collect": {"unlabelled_seeds": "1-20"}, "train-options": PLAY, "train-meta": PLAY}
+SEEDS = {"labelled_seeds": "0-9", "unlabelled_seeds": "10-29"}
+DEFAULTS = {"collect": SEEDS, "train-options": PLAY, "train-meta": PLAY}
 DOMAIN = GymnasiumDomain(make, ("hold-key", "open-door", "at-goal"), labels=labels, policy=wander, defaults=DEFAULTS)

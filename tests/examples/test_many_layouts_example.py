@@ -14,7 +14,7 @@ from hypogoal.cli import main
 EXAMPLE = Path(__file__).parents[2] / "examples" / "many_layouts.py"
 PLAY = settings("steps=160", "environments=4", "warm_up=50", "max_episode_steps=40", "random_episodes=0")
 SHORT = {  # appended to the page's commands, so that they end in seconds
-    "collect": settings("unlabelled_seeds=1", "heldout_seeds=1000", "steps=600"),
+    "collect": settings("labelled_seeds=0,1", "unlabelled_seeds=10", "heldout_seeds=11", "steps=2000"),
     "train-ensemble": settings("steps=20", "members=2", "workers=1"),
     "train-options": PLAY,
     "train-meta": PLAY,
