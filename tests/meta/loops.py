@@ -8,6 +8,8 @@ import corridor_env
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.domains import doorkey
+from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.meta import training
 from hypogoal.meta.config import MetaConfig
@@ -37,6 +39,11 @@ def gymnasium_corridor(count: int) -> Any:
     return corridor_env.SWIFT.make_engine(0, count, 30)
 
 
+def many(make: Any, count: int) -> Any:
+    """Environments whose episodes begin in layouts that are drawn."""
+    return make(100, count, 30, layouts=Layouts(range(40), rng_for(0, "layouts")))
+
+
 CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, shared, ppo": (Corridor, "light", {"initiation": "learned"}, "ppo"),
     "light, shared, gaussian": (Corridor, "light", {}, "gaussian"),
@@ -44,6 +51,8 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
     "light, thompson": (Corridor, "light", {}, "thompson"),
     "light, exp3": (Corridor, "light", {}, "exp3"),
+    "DoorKey, many layouts, random": (partial(many, doorkey.DOMAIN.make_engine), "light", {}, "random"),
+    "Gymnasium, many layouts, random": (partial(many, corridor_env.SWIFT.make_engine), "light", {}, "random"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
     "paper, own, random": (Corridor, "paper", {**OWN, "replay": 100}, "random"),
 }
