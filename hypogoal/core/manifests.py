@@ -111,6 +111,7 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
         ("domain", "network", "setting", "agent", "termination", "chooser", "start", "view", "localiser", "diversity"),
         _is_text,
     ),
+    "layouts": _is_text,
 }
 
 

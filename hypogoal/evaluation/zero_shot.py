@@ -1,7 +1,6 @@
 """Trained agents, and each of their options alone, on layouts that they are given: nothing is learned there (Spec H6).
 
-An agent that was trained over many layouts is to be judged on others. What limits it, its options tell: whether one
-stops where its member is wrong (a wrong yes), or does not get anywhere in time.
+What limits an agent, its options tell: they stop where their members are wrong (a wrong yes), or get nowhere in time.
 """
 
 from __future__ import annotations
@@ -42,10 +41,7 @@ Played = dict[str, NDArray[np.float64]]  # a number of each layout (L,)
 
 
 def shortest_ways(engine: Engine) -> NDArray[np.float64]:
-    """Steps from where each environment's episode begins to each true sub-goal and, last, to success: (E, G + 1).
-
-    NaN where nobody knows them, or no way leads there.
-    """
+    """Steps from each environment's state to each true sub-goal and, last, to success: (E, G + 1); NaN if not known."""
     from hypogoal.options.planned import FAR, distances  # with PyTorch, which a report needs not
 
     plan, labels = engine.plan(), engine.labels(engine.ids)
@@ -60,9 +56,10 @@ def shortest_ways(engine: Engine) -> NDArray[np.float64]:
 
 def _scored(success: NDArray[np.bool_], steps: NDArray[np.int64], shortest: NDArray[np.float64]) -> Played:
     """Success, and success in so many times the shortest way, of (E, ...) episodes; ``shortest`` fits them."""
-    soon = {name: success & (steps <= factor * shortest) for name, factor in WITHIN.items()}
-    return {"success": success.astype(np.float64)} | {
-        name: np.where(np.isnan(shortest), np.nan, of) for name, of in soon.items()
+    known = np.where(np.isnan(shortest), np.nan, 1.0)
+    return {
+        "success": success * 1.0,
+        **{name: known * (success & (steps <= of * shortest)) for name, of in WITHIN.items()},
     }
 
 
@@ -81,10 +78,10 @@ def play(loop: OptionLoop, chooser: Chooser, shortest: NDArray[np.float64], epis
 
 
 def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64]) -> Played:
-    """An option from where episodes begin, begun again when its time is up, till its member says yes: ``OF_OPTIONS``.
+    """``OF_OPTIONS`` of an option, begun where episodes begin and again when its time is up, till its member says yes.
 
-    It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then. It is given up after
-    ``PATIENCE`` timeouts, and not looked at (NaN) where the sub-goal holds from the beginning. ``shortest`` (E,).
+    It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
+    the beginning.
     """
     from hypogoal.options.choosers import Chooser
 
@@ -93,10 +90,9 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
             return np.full(len(ids), option)
 
     begin_anew(loop, Always())
-    engine = loop.engine
-    holds = engine.labels(engine.ids)[:, goal]
-    going, yes, there = np.ones((3, engine.count), dtype=np.bool_) & np.array([[True], [False], [False]])
-    steps = np.zeros(engine.count, dtype=np.int64)
+    engine, steps = loop.engine, np.zeros(loop.engine.count, dtype=np.int64)
+    holds, (yes, there) = engine.labels(engine.ids)[:, goal], np.zeros((2, engine.count), dtype=np.bool_)
+    going = ~yes
     for _ in range(PATIENCE * loop.config.option_timeout):
         moved = loop.advance(explore=False)
         steps[going] += 1
@@ -105,7 +101,7 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
         going &= ~moved.reached & (engine.elapsed > 0)  # nor did the episode end
         if not going.any():
             break
-    scored = _scored(there, steps, shortest) | {"wrong_yes": (yes & ~there).astype(np.float64)}
+    scored = _scored(there, steps, shortest) | {"wrong_yes": (yes & ~there) * 1.0}
     return {name: np.where(holds, np.nan, of) for name, of in scored.items()}
 
 

@@ -63,7 +63,6 @@ def assemble(
     arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
     if layouts:
         arguments["layouts"] = layouts
-    many = "layouts" in arguments
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
     if config.cap:
         if (shortest := engine.shortest_path()) is None:
@@ -77,6 +76,7 @@ def assemble(
         ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in sub_goals]
         alone = config.experience == "own" and not config.mask_reached
         terminations = learned_terminations(engine, ensembles, running_only=alone, rule=config.termination)
+        many = engine.layouts is not None and engine.layouts.many
         if not many and (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
     _check_rule(terminations, config)

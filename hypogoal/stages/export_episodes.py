@@ -33,9 +33,10 @@ def export_episodes(
     out = claim(out, kind="episodes", inputs=[meta], force=force)
     made = out.with_name(f".{out.name}.new")
     shutil.rmtree(made, ignore_errors=True)
+    where = source.config.get("layouts") or source.config["layout_seed"]
     described = (
         f"Episodes of an agent that chooses among {len(source.config['sub_goals']) * source.config['members']} options "
-        f"({source.config['domain']}, layout seed {source.config['layout_seed']}, seed {seed})."
+        f"({source.config['domain']}, layout seed {where}, seed {seed})."
     )
     loop = agent_of(source, seed)
 
