@@ -1,6 +1,6 @@
 """MiniGrid's DoorKey, options and agent trained over 1,000 layouts and tried on 100 others; labels are of ten.
 
-Shows `layouts` and `evaluate --layouts`; 40 minutes on one core. After `export HYPOGOAL_TRUST=many_layouts:DOMAIN`:
+Shows `layouts` and `evaluate --layouts`; some 40 minutes on one core. `export HYPOGOAL_TRUST=many_layouts:DOMAIN` first:
 
     hypogoal collect many_layouts:DOMAIN --out runs/many/data.h5
     hypogoal train-ensemble runs/many/data.h5 --out runs/many/ensemble
