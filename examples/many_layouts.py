@@ -1,6 +1,6 @@
 """MiniGrid's DoorKey, options and agent trained over 1,000 layouts and tried on 100 others; labels are of ten.
 
-Shows `layouts` and `evaluate --layouts`; some 40 minutes on one core. `export HYPOGOAL_TRUST=many_layouts:DOMAIN` first:
+Shows `layouts` and `evaluate --layouts`; about 40 minutes on a core. First `export HYPOGOAL_TRUST=many_layouts:DOMAIN`:
 
     hypogoal collect many_layouts:DOMAIN --out runs/many/data.h5
     hypogoal train-ensemble runs/many/data.h5 --out runs/many/ensemble
