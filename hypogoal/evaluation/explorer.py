@@ -52,7 +52,8 @@ def look(work: Work, judgement: Judgement) -> None:
     group["attributions"] = np.concatenate([np.zeros(shape, np.int8), *values])
     group["brightness"] = brightness(seen)
     counts = {"states": len(split.labels), "shown": len(picked), "explained": len(explained)}
-    work.looked["explorer"].append({"sub_goal": sub_goal, **counts})
+    reading = judgement.domain.reading if judgement.domain else ""
+    work.looked["explorer"].append({"sub_goal": sub_goal, **counts, "reading": reading})
 
 
 def pick_to_browse(
@@ -97,11 +98,13 @@ def explorer_section(material: Material) -> Block:
     source = page.pick(material.metrics["ensembles"], "path", found["ensemble"])
     shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
-        f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them: {shown:,} "
-        f"of {states:,} for a sub-goal, drawn so that every kind of outcome and every place comes up; how often one "
-        "does says nothing. Choose a state to see each member's verdict and what it goes by (orange speaks for "
-        "'reached', blue against it), and a member to see the options it became. The address of the page holds the "
-        "filters: it can be shared."
+        f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them. Choose a "
+        "state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against it. Choose "
+        f"a member to see the options it became. {found['sub_goals'][0].get('reading', '')}"
+    )
+    sample = (
+        f"{shown:,} of {states:,} states of a sub-goal, drawn so that every kind of outcome and every place comes up; "
+        "how often one does says nothing. The page's address holds the filters."
     )
     goals = [_goal(material, source, goal["sub_goal"]) for goal in found["sub_goals"]]
     places = list(dict.fromkeys(state["place"] for goal in goals for state in goal["states"] if state["place"]))
@@ -115,7 +118,7 @@ def explorer_section(material: Material) -> Block:
         "place": _any(sorted(places, key=_natural)),
         "kind": _any(sorted(kinds)),
     }
-    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}}
+    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "caption": sample}
     return page.section("explorer", TITLE, [text], [block])
 
 

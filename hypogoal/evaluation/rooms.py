@@ -36,7 +36,7 @@ from hypogoal.evaluation.numbers import (
     ranked,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, legend_below, styled
+from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
 from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
 
 if TYPE_CHECKING:
@@ -65,7 +65,6 @@ PAPER = (
     "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
     "positive is not said, so look at the differences between methods and N rather than at the level."
 )
-STYLES = ("-", "--", "-.", ":", (0, (5, 1)))  # 5 beside 6 colours: both come again together after 30
 BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 
 
@@ -567,7 +566,10 @@ def _draw_method(
     names: Sequence[str],
 ) -> None:
     index, count = names.index(name), len(names)
-    colour, line = METHOD_COLOURS[index % len(METHOD_COLOURS)], STYLES[index % len(STYLES)]
+    colour, line = (
+        METHOD_COLOURS[index % len(METHOD_COLOURS)],
+        STYLES[index % len(STYLES)],
+    )  # 5 and 6: both again after 30
     marker = MARKERS[index % len(MARKERS)]
     if len(groups) == 1:  # the others with one N lie at the same place
         groups = groups + (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)

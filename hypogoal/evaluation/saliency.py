@@ -1,4 +1,4 @@
-"""Figures 2 and 9: held-out states worth looking at, and what in them each member goes by (Spec F2)."""
+"""Figures 2 and 9: what each member goes by in a few held-out states (Spec F2)."""
 
 from __future__ import annotations
 
@@ -25,12 +25,6 @@ KINDS = {
     "disagree": "members disagree",
     "false positive": "a false positive",
 }
-EXAMPLES = {
-    "disagree": "members disagree",
-    "wrong": "all members wrong",
-    "right yes": "all right",
-    "right no": "all right",
-}
 NEEDED = "an ensemble artefact with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
 EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
@@ -38,10 +32,10 @@ KEY = 0.75  # inches below all pictures
 
 
 def look(work: Work, judgement: Judgement) -> None:
-    """Example states and attributions of the ensemble that is shown; from unseen rooms where positives are in them.
+    """Attributions of the ensemble that is shown; on states of unseen rooms where positives are in them.
 
-    ``examples/<sub-goal>`` and ``saliency/<sub-goal>`` are written: the states, and of the latter ``attributions``
-    float32 (n, K, h, w, C), in log-odds, to what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``.
+    ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
+    what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``.
     """
     if judgement.number != work.shown:
         return
@@ -49,11 +43,9 @@ def look(work: Work, judgement: Judgement) -> None:
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
     labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
-    examples = pick_examples(probabilities, verdicts, labels)
     explained = pick_to_explain(probabilities, verdicts, labels)
-    for name, picked in (("examples", examples), ("saliency", explained)):
-        picked = [(int(among[index]), kind) for index, kind in picked]
-        judgement.write_states(work.arrays.create_group(f"{name}/{sub_goal}"), picked)
+    picked = [(int(among[index]), kind) for index, kind in explained]
+    judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
     if explained:
         from hypogoal.evaluation.deep_lift import deep_lift, explanation
@@ -66,25 +58,6 @@ def look(work: Work, judgement: Judgement) -> None:
         group["seen"], group["baseline"] = seen, baseline
         states = explanation(found, explained)
     work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
-
-
-def pick_examples(
-    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]
-) -> list[tuple[int, str]]:
-    """States on which members disagree, all err, or all are right, so that a reader sees each.
-
-    Of N states with K members' probabilities and verdicts, (index, kind), of each kind a true and a false one:
-    ``disagree`` (the widest spread of probabilities), ``wrong`` (the most sure error), ``right yes`` and ``right no``;
-    fewer where there are none.
-    """
-    correct = verdicts == labels[:, None]
-    spread = probabilities.max(1) - probabilities.min(1)
-    error = np.abs(probabilities - labels[:, None]).min(1)
-    disagree, wrong, right = ~(verdicts.all(1) | (~verdicts).all(1)), ~correct.any(1), correct.all(1)
-    picked: list[tuple[int, str]] = []
-    for mask, order, kind in ((disagree, -spread, "disagree"), (wrong, -error, "wrong")):
-        picked += _first(mask & labels, order, kind) + _first(mask & ~labels, order, kind)
-    return [*picked, *_first(right & labels, error, "right yes"), *_first(right & ~labels, error, "right no")]
 
 
 def pick_to_explain(
@@ -116,40 +89,8 @@ def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], kind: str) -> l
 
 
 def sections(material: Material) -> list[Block]:
-    """States with each member's verdict, and what members look at."""
-    return [examples_section(material), saliency_section(material)]
-
-
-def examples_section(material: Material) -> Block:
-    """Held-out states with each member's verdict beside the truth."""
-    names = [name for name in material.arrays if name.startswith("examples/") and name.endswith("/observations")]
-    if not names:
-        missing = ["No example states: they need an ensemble artefact."]
-        return page.section("examples", "Example states", [], [], missing)
-    source = page.pick(material.metrics["ensembles"], "path", material.metrics["saliency"]["ensemble"])
-    text = (
-        f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
-        "probability that the sub-goal is reached. Orange: verdicts that differ from the truth. Chosen to show "
-        "each kind, so their frequency here says nothing."
-    )
-    order = [goal["sub_goal"] for goal in source["sub_goals"]]
-    goals = sorted((name.split("/")[1] for name in names), key=order.index)
-    return page.section("examples", "Example states", [text], [_example_cards(material, goal) for goal in goals])
-
-
-def _example_cards(material: Material, sub_goal: str) -> Block:
-    arrays = material.within(f"examples/{sub_goal}")
-    cards = []
-    for index, kind in enumerate(page.texts(arrays["kinds"])):
-        truth = bool(arrays["labels"][index])
-        lines = []
-        for member, probability in enumerate(arrays["probabilities"][index]):
-            said = page.verdict(probability, bool(arrays["verdicts"][index, member]), truth)
-            lines.append({**said, "text": f"member {member}: {said['text']}"})
-        place = page.texts(arrays["places"])[index]
-        title = f"{EXAMPLES[kind]}; truth: {'yes' if truth else 'no'}{f', {place}' if place else ''}"
-        cards.append(_state_card(arrays["observations"][index], sub_goal, truth, title, lines))
-    return {"kind": "cards", "heading": sub_goal, "cards": cards}
+    """What members look at."""
+    return [saliency_section(material)]
 
 
 def _state_card(
@@ -165,7 +106,7 @@ def saliency_section(material: Material) -> Block:
     title = "What members look at"
     if found is None:
         lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
-        return page.section("saliency", title, [], [], lacking)
+        return page.section("saliency", title, [], [], lacking, folded=True)
     states = [state for goal in found["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
     text = (
@@ -185,7 +126,7 @@ def saliency_section(material: Material) -> Block:
         for index, state in enumerate(goal["states"])
     ]
     missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
-    return page.section("saliency", title, [text, check if errors else ""], blocks, missing)
+    return page.section("saliency", title, [text, check if errors else ""], blocks, missing, folded=True)
 
 
 def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block:

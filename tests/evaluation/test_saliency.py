@@ -163,7 +163,7 @@ def test_attributions_are_to_what_members_see(tmp_path):
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
         here = Here(tmp_path, "down", tmp_path, {})
         work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None, shown=0)
-        look(work, Judgement(0, here, split, Unlabelled(observations[2:], None), (), judged))
+        look(work, Judgement(0, here, split, Unlabelled(observations[2:], None), None, judged))
         (found,) = work.looked["saliency"]
         group = arrays["saliency/down"]
         assert group["observations"].shape == (2, 1, 3, 1)
