@@ -306,7 +306,8 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
 def test_the_page_shows_all_of_it(run, page):
     """Spec F5, F6, F7: curves, hypotheses, examples, overlays, choices, provenance, with seeds in the captions."""
     for title in (
-        "Summary", "Run by run", "Hypotheses", "Explore the hypotheses", "Where options stop", "Which hypotheses are chosen", "What members look at", "Data, settings, provenance",
+        "Summary", "Run by run", "Hypotheses", "Explore the hypotheses", "Where options stop",
+        "Which hypotheses are chosen", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     assert page.count("<figure") == 4 and page.count("data:image/gif;base64,") == 1
