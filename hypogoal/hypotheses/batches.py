@@ -254,14 +254,12 @@ def _norms(layer: nn.Module) -> list[_BatchNorm]:
 
 def _uncounted(layer: nn.Module, norms: Sequence[_BatchNorm], inputs: Tensor) -> Tensor:
     """What a layer makes of inputs by their own statistics, the running ones left alone."""
-    tracking = [norm for norm in norms if norm.track_running_stats]
-    try:
-        for norm in tracking:
-            norm.track_running_stats = False
-        made: Tensor = layer(inputs)
-    finally:
-        for norm in tracking:
-            norm.track_running_stats = True
+    tracked = [norm.track_running_stats for norm in norms]
+    for norm in norms:
+        norm.track_running_stats = False
+    made: Tensor = layer(inputs)
+    for norm, tracks in zip(norms, tracked, strict=True):
+        norm.track_running_stats = tracks
     return made
 
 

@@ -44,6 +44,7 @@ class Ensemble(nn.Module):
             2), of what ``view`` shows, uint8 (N, h, w, C).
         trunk: the encoder (N, C, h, w) -> (N, F) that members share; None where each has its own.
         frozen: whether it is, and so always in evaluation mode.
+        parts: the trunk, to be run once, and the K networks behind it: :meth:`networks` where there is no trunk.
         thresholds: float32 (K,), the probabilities above which the members' verdicts are yes.
 
     Raises:
@@ -80,7 +81,7 @@ class Ensemble(nn.Module):
             networks = [nn.Sequential(*layers[:-own], *head) for head in heads]
             self.heads, self.members = nn.ModuleList(heads), tuple(networks)
         self._networks = tuple(map(reordered, networks))
-        self._parts = self.trunk and reordered(self.trunk), tuple(heads) or self._networks
+        self.parts = self.trunk and reordered(self.trunk), tuple(heads) or self._networks
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self.train()
 
@@ -94,10 +95,6 @@ class Ensemble(nn.Module):
     def networks(self) -> tuple[nn.Sequential, ...]:
         """The members in the order of layers that is fastest; weights and BatchNorm statistics are shared."""
         return self._networks
-
-    def parts(self) -> tuple[nn.Sequential | None, tuple[nn.Sequential, ...]]:
-        """:meth:`networks` as the trunk, to be run once, and what each member has behind it."""
-        return self._parts
 
     def train(self, mode: bool = True) -> Self:
         """Training or evaluation mode; of a frozen trunk always the latter."""
@@ -187,7 +184,7 @@ class Ensemble(nn.Module):
 
     def _logits(self, observations: NDArray[np.uint8]) -> Tensor:
         """(K, N, 2), each image's distinct patches computed once where that pays."""
-        trunk, heads = self._parts
+        trunk, heads = self.parts
         device = self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
             tables = patches.make_tables(observations, trunk or heads[0])
@@ -246,13 +243,11 @@ class Ensemble(nn.Module):
 
 def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:
     """(K, N, 2) of images or their patches: what each head makes of them, or of what the trunk makes of them once."""
-
-    def asked(network: nn.Sequential, seen: Tensor | patches.Batch) -> Tensor:
-        made: Tensor = patches.forward(network, seen) if isinstance(seen, patches.Batch) else network(seen)
-        return made
-
-    seen = images if trunk is None else asked(trunk, images)
-    return torch.stack([asked(head, seen) for head in heads])
+    made = [
+        patches.forward(network, images) if isinstance(images, patches.Batch) else network(images)
+        for network in (heads if trunk is None else [trunk])
+    ]
+    return torch.stack(made if trunk is None else [head(made[0]) for head in heads])
 
 
 def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:

@@ -15,8 +15,7 @@ from __future__ import annotations
 import copy
 import inspect
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -138,7 +137,9 @@ def build_network(
     if len(observation_shape) != 3 or min(observation_shape) < 1:
         raise UserError("member networks need images (H, W, C)", where, "Collect image observations.")
     height, width, channels = observation_shape
-    with _drawing_from(generator):
+    seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
+    with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
+        torch.manual_seed(seed)
         layers, hidden = parts_of(observation_shape)
         features = _features(layers, channels, height, width)
         if features is None:
@@ -159,22 +160,12 @@ def build_network(
 
 
 def another(head: nn.Sequential, generator: torch.Generator) -> nn.Sequential:
-    """A head of the same dense layers with fresh weights."""
+    """The same dense layers with weights of their own, drawn as PyTorch does."""
     made = copy.deepcopy(head)
-    with _drawing_from(generator):
-        for layer in made:
-            if isinstance(layer, nn.Linear):
-                layer.reset_parameters()
+    for layer in (layer for layer in made if isinstance(layer, nn.Linear)):
+        for value in layer.parameters():
+            nn.init.uniform_(value, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
     return made
-
-
-@contextmanager
-def _drawing_from(generator: torch.Generator) -> Iterator[None]:
-    """Modules draw their weights from the global state: lend it one of ours."""
-    seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        yield
 
 
 def _features(layers: list[nn.Module], channels: int, height: int, width: int) -> Tensor | None:

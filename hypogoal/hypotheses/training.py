@@ -112,7 +112,7 @@ def fit(
         ensemble.load_state_dict(saved["ensemble"])
         if isinstance(on_step, Report):
             on_step.restore(saved["told"])
-    trunk, networks = ensemble.parts()
+    trunk, networks = ensemble.parts
     by_ladder = config.batch_kind == "per-ladder"
     ladders = needed(origins, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
     states = TrainingStates(

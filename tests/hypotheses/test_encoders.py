@@ -111,9 +111,10 @@ def trained(network: str, config: EnsembleConfig = FEW, side: int = 16, **settin
 def test_large_networks_are_members(network: str, encoder: str, hidden_width: int, tmp_path: Path) -> None:
     """Spec C5, A8, D1, F2: a ResNet-18 and a frozen ViT-tiny train, store, load, end options and are explained."""
     engine = DoorKeyEngine(100, 4)
+    rng = np.random.default_rng(0)
     for _ in range(6):
-        engine.step(np.random.default_rng(0).integers(engine.n_actions, size=4))
-    ids = np.arange(engine.n_states)
+        engine.step(rng.integers(engine.n_actions, size=4))
+    ids = np.arange(min(engine.n_states, 12))
     images, labels = engine.images(ids), np.arange(len(ids)) % 2 == 0
     config = dataclasses.replace(FEW, network=network, encoder=encoder, hidden_width=hidden_width)
     fresh = Ensemble(network, images.shape[1:], 2, torch_generator(0, "weights"), None, encoder, hidden_width).state()
@@ -149,8 +150,8 @@ def test_large_networks_are_members(network: str, encoder: str, hidden_width: in
     found = attributed(back, images[:1], mean_state(images))
     differences = np.abs(found.log_odds - found.baseline_log_odds)
     assert found.method == INTEGRATED and found.values.shape == (1, 2, *images.shape[1:])
-    assert (found.completeness_error() < 0.05 * differences + 1e-3).all()
-    assert np.abs(found.values).sum() > 1e-3
+    assert (found.completeness_error() < 0.1 * differences + 1e-6).all()
+    assert (np.abs(found.values).sum((0, 2, 3, 4)) > 1e-4).all()
 
 
 def flat(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:

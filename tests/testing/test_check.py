@@ -21,6 +21,7 @@ from hypogoal.diversity import OBJECTIVES as OURS
 from hypogoal.diversity import Objective, dbat, load_objective, none
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.hypotheses.networks import NETWORKS
 from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
 
 TESTS = Path(__file__).parents[1]
