@@ -1,16 +1,18 @@
-"""Members on a frozen backbone: a small vision transformer sees the images once, each member is a head on its features.
+r"""Members on a frozen backbone: a small vision transformer sees images once, each member is a head on its features.
 
     hypogoal collect doorkey --out runs/backbone/data.h5
-    hypogoal train-ensemble runs/backbone/data.h5 --out runs/backbone/ensemble --set network=frozen_backbone:vit --set encoder=frozen --set hidden_width=64
     export HYPOGOAL_TRUST=frozen_backbone:vit
-    hypogoal train-options runs/backbone/ensemble --out runs/backbone/options
-    hypogoal train-meta runs/backbone/ensemble --options runs/backbone/options --out runs/backbone/meta
+    hypogoal train-ensemble runs/backbone/data.h5 --out runs/backbone/ensemble --set network=frozen_backbone:vit \
+        --set encoder=frozen --set hidden_width=64
+    hypogoal train-options runs/backbone/ensemble --out runs/backbone/options --set steps=20000
+    hypogoal train-meta runs/backbone/ensemble --options runs/backbone/options --out runs/backbone/meta \
+        --set steps=20000
     hypogoal evaluate runs/backbone
     hypogoal report runs/backbone
 
-Its weights here are random, so that nothing is downloaded; docs/extending.md has the line for one of timm's. It takes
-ten minutes of a CPU core, half of them the options.
-"""  # noqa: E501 - commands, as they are typed
+Its weights are random, so that nothing is downloaded; docs/extending.md has the line for one of timm's. It takes five
+minutes of a CPU core.
+"""
 
 import torch
 from torch import Tensor, nn
@@ -34,4 +36,4 @@ class ViT(nn.Module):
 
 def vit(observation_shape: tuple[int, ...]) -> nn.Module:
     """An encoder: from the shape (H, W, C) of observations to a module."""
-    return ViT(observation_shape, depth=4)
+    return ViT(observation_shape, width=96, depth=2)

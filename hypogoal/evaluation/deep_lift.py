@@ -73,8 +73,8 @@ def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -
         [{"member": member, **{name: float(of[state, member]) for name, of in columns.items()}} for member in every]
         for state in range(len(picked))
     ]
-    about = {"method": attributions.method}
-    return [{"kind": kind, "members": rows, **about} for (_, kind), rows in zip(picked, members, strict=True)]
+    method = attributions.method
+    return [{"kind": kind, "method": method, "members": rows} for (_, kind), rows in zip(picked, members, strict=True)]
 
 
 def method_of(member: nn.Module) -> str:

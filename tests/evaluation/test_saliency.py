@@ -106,6 +106,8 @@ def test_deep_lift_explains_what_its_rules_hold_for(layers, method):
     torch.manual_seed(0)
     member = nn.Sequential(*layers, nn.LazyLinear(2))
     member(torch.zeros(1, 1, 2, 2))
+    for weight in member.parameters():
+        nn.init.uniform_(weight, 0.1, 0.9)
     state = np.array([[[9], [200]], [[30], [90]]], np.uint8)
     found = attributed(Members(member), state[None], 0 * state)
     assert method_of(member) == found.method == method
