@@ -81,6 +81,7 @@ class TrainingStates:
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
         self._trunk, self._features = trunk, None
+        self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # that all networks learn
         if trunk is not None and frozen and not (grey or jitter):
             chunks = [np.arange(at, min(at + CHUNK, len(images))) for at in range(0, len(images), CHUNK)]
             with torch.no_grad():

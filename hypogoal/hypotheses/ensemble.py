@@ -75,11 +75,13 @@ class Ensemble(nn.Module):
             self.members: nn.ModuleList | tuple[nn.Sequential, ...] = nn.ModuleList(networks)
         else:
             layers, own = list(networks[0]), 3 if hidden_width else 1
-            self.trunk = nn.Sequential(*layers[:-own]).requires_grad_(not self.frozen)
+            self.trunk = nn.Sequential(*layers[:-own])
             heads = [nn.Sequential(*layers[-own:])]
             heads += (another(heads[0], generator) for _ in range(members - 1))
             networks = [nn.Sequential(*layers[:-own], *head) for head in heads]
             self.heads, self.members = nn.ModuleList(heads), tuple(networks)
+            if self.frozen:
+                self.trunk.requires_grad_(False)
         self._networks = tuple(map(reordered, networks))
         self.parts = self.trunk and reordered(self.trunk), tuple(heads) or self._networks
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))

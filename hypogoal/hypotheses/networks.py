@@ -1,9 +1,8 @@
 """Spec C5: member networks, chosen by name.
 
 Each is an ``nn.Sequential`` from float (N, C, H, W) in 0..1 to logits (N, 2), column 1 being "sub-goal reached". Ours
-are of plain modules used once: DeepLift attributes rightly only through such, and only with each ReLU before its
-MaxPool. :func:`reordered` gives the same function in the order that is faster to train. An own one may begin with any
-module, an encoder: it is trained and asked as it is, without the short cuts for plain layers.
+are of plain modules used once: DeepLift is right only of such, and with each ReLU before its MaxPool; the same in an
+order that is faster to train is :func:`reordered`. An own one may begin with any module, an encoder.
 
 The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors'
 public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of
@@ -82,8 +81,7 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
 
 
 def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
-    """The function that makes network ``name`` for observations (H, W, C): of :data:`NETWORKS`, an installed entry
-    point, or ``module:function``.
+    """What makes network ``name`` of a shape (H, W, C): of :data:`NETWORKS`, an entry point, or ``module:function``.
 
     No such network, one that cannot be loaded, or code that the user did not allow (see :mod:`hypogoal.core.own_code`)
     is a ``UserError``.
@@ -93,8 +91,7 @@ def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
     built_in = {network: f"{__name__}:{function.__name__}" for network, function in NETWORKS.items()}
     made_for = load_own(name, "network", ENTRY_POINTS, built_in)
     if not callable(made_for):
-        do = "Give a function: channels -> (layers, hidden widths), or observation_shape -> a module."
-        raise UserError("this is no member network", name, do)
+        raise UserError("this is no member network", name, "Give a function of channels or of observation_shape.")
     return _checked(name, made_for)
 
 

@@ -128,7 +128,6 @@ def fit(
         trunk=trunk,
         frozen=ensemble.frozen,
     )
-    shared = [] if trunk is None or ensemble.frozen else [*trunk.parameters()]
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
     def state(number: int, part: _Round | None) -> State:
@@ -139,8 +138,7 @@ def fit(
     drawing = [states.device] if states.device.type == "cuda" else []
     with checkpoints, torch.random.fork_rng(devices=drawing):  # Dropout and the like draw there
         for number, members in enumerate(rounds[first:], start=first):
-            seeds, before = seed_for(seed, "batches", number), number * config.steps
-            part = _Round(networks, members, states, config, seeds, before, shared)
+            part = _Round(networks, members, states, config, seed_for(seed, "batches", number), number * config.steps)
             if saved and number == first:
                 part.restore(saved["part"])
             for step in part.steps(on_step):
@@ -162,8 +160,7 @@ def _diverse(config: EnsembleConfig) -> bool:
 
 
 class _Round:
-    """The training of ``members``, and of the weights that all have, against each other and against those before them,
-    which are frozen.
+    """The training of ``members`` against each other and against those before them, which are frozen.
 
     It stops at the first loss or weight that is NaN or Inf, looking every ``REPORT_EVERY`` steps.
     """
@@ -176,7 +173,6 @@ class _Round:
         config: EnsembleConfig,
         seed: int,
         steps_before: int,
-        shared: Sequence[nn.Parameter],
     ):
         self.members, self.states, self.config, self.seed, self.before = members, states, config, seed, steps_before
         self.networks = [networks[member].train() for member in members]
@@ -185,7 +181,7 @@ class _Round:
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
         self.optimiser = torch.optim.Adam(
-            [*shared, *(weight for network in self.networks for weight in network.parameters())],
+            [*states.shared, *(weight for network in self.networks for weight in network.parameters())],
             lr=config.learning_rate,
             weight_decay=config.l2_weight,
             fused=True,

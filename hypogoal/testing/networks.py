@@ -28,7 +28,7 @@ class _Network:
 
     def tests(self) -> Iterator[Test]:
         yield "builds", self.builds
-        yield "explained", self.explained
+        yield "explained", lambda: f"by {method_of(self.network())}"
         yield "same weights for the same seed", self.repeats
         yield "same answers however asked", self.agrees
         yield "gradients", self.gradients
@@ -50,9 +50,6 @@ class _Network:
         promise(logits.shape == (3, 2), text, "Leave the last layer to hypogoal: it gives 2.")
         count = sum(weight.numel() for weight in network.parameters())
         return f"{self.shape} images, {count} weights"
-
-    def explained(self) -> str:
-        return f"by {method_of(self.network())}"
 
     def repeats(self) -> str:
         first, second = self.network(), self.network()
