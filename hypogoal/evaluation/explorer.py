@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 MOST_STATES = 300  # over all sub-goals, for the page's sake
 MOST_OF_ONE = 180  # of one sub-goal
 MOST_EXPLAINED = 120  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
+MOST_INTEGRATED = 12  # where they are integrated gradients: of a large network seconds
 PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 TITLE = "Explore the hypotheses"
 
@@ -33,7 +34,7 @@ def look(work: Work, judgement: Judgement) -> None:
     """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
     if judgement.number != work.browsed:
         return
-    from hypogoal.evaluation.deep_lift import deep_lift
+    from hypogoal.evaluation.deep_lift import DEEP_LIFT, attributed, method_of
 
     split, sub_goal, verdicts = judgement.split, judgement.case.sub_goal, judgement.judged.verdicts
     sub_goals = len(judgement.case.config["sub_goals"])
@@ -45,13 +46,14 @@ def look(work: Work, judgement: Judgement) -> None:
     group = work.arrays.create_group(f"explorer/{sub_goal}")
     judgement.write_states(group, list(zip(picked.tolist(), names, strict=True)))
     group["rows"] = picked
-    explained = picked[: min(len(picked), MOST_EXPLAINED // sub_goals)]
-    ensemble, seen, baseline = judgement.see(explained)
-    values = [to_bytes(flat(deep_lift(ensemble, seen[i : i + 8], baseline).values)) for i in range(0, len(seen), 8)]
+    ensemble, seen, baseline = judgement.see(picked[: MOST_EXPLAINED // sub_goals])
+    if method_of(ensemble.members[0]) != DEEP_LIFT:
+        seen = seen[: MOST_INTEGRATED // sub_goals]
+    values = [to_bytes(flat(attributed(ensemble, seen[i : i + 8], baseline).values)) for i in range(0, len(seen), 8)]
     shape = (0, len(ensemble), *seen.shape[1:3])
     group["attributions"] = np.concatenate([np.zeros(shape, np.int8), *values])
     group["brightness"] = brightness(seen)
-    counts = {"states": len(split.labels), "shown": len(picked), "explained": len(explained)}
+    counts = {"states": len(split.labels), "shown": len(picked), "explained": len(seen)}
     reading = judgement.domain.reading if judgement.domain else ""
     work.looked["explorer"].append({"sub_goal": sub_goal, **counts, "reading": reading})
 

@@ -48,10 +48,10 @@ def look(work: Work, judgement: Judgement) -> None:
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
     if explained:
-        from hypogoal.evaluation.deep_lift import deep_lift, explanation
+        from hypogoal.evaluation.deep_lift import attributed, explanation
 
         ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
-        found = deep_lift(ensemble, seen, baseline)
+        found = attributed(ensemble, seen, baseline)
         group = work.arrays[f"saliency/{sub_goal}"]
         values = found.values.astype(np.float32)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
@@ -101,7 +101,7 @@ def _state_card(
 
 
 def saliency_section(material: Material) -> Block:
-    """DeepLift of every member of one ensemble on a few held-out states."""
+    """Attributions of every member of one ensemble on a few held-out states."""
     found = material.metrics["saliency"]
     title = "What members look at"
     if found is None:
@@ -109,8 +109,9 @@ def saliency_section(material: Material) -> Block:
         return page.section("saliency", title, [], [], lacking, folded=True)
     states = [state for goal in found["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
+    method = states[0].get("method", "DeepLift") if states else "DeepLift"  # evaluations of earlier versions do not say
     text = (
-        f"DeepLift attributions (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
+        f"Attributions by {method} (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
         f"{found['seed']}) on a few held-out states, against {found['baseline']}: what a state has in common with the "
         "usual one gets none. Orange speaks for 'reached', blue against it, each picture on its own scale; the state "
         "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
@@ -158,8 +159,9 @@ def figures(material: Material) -> Iterator[Drawn]:
         place = page.texts(arrays["places"])[0]
         error = max(member["completeness_error"] for member in goal["states"][0]["members"])
         about = (
-            f"DeepLift attributions of each member of {found['ensemble']} (seed {found['seed']}) on a held-out state "
-            f"of {goal['sub_goal']}{f' ({place})' if place else ''}: {KINDS[goal['states'][0]['kind']]}. Against "
+            f"Attributions by {goal['states'][0].get('method', 'DeepLift')} of each member of {found['ensemble']} "
+            f"(seed {found['seed']}) on a held-out state of {goal['sub_goal']}{f' ({place})' if place else ''}: "
+            f"{KINDS[goal['states'][0]['kind']]}. Against "
             f"{found['baseline']}. Orange speaks for 'reached', blue against it; each picture has a scale of its own. "
             f"They add up to the difference in log-odds within {error:.0e}."
         )

@@ -6,13 +6,17 @@ import ast
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 from test_docs import blocks, commands
 
+from hypogoal import load_ensemble
 from hypogoal.cli import main
 from hypogoal.dataset import open_dataset
+from hypogoal.evaluation import explorer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
@@ -110,6 +114,37 @@ def test_the_audits_page_audits_its_classifier(tmp_path: Path) -> None:
     fooled = [f"{row['layout']:.0f}" for row in rows if row["fooled"] == 100]
     assert f"On layouts {', '.join(fooled[:-1])} and {fooled[-1]} every" in page.read_text(encoding="utf-8")
     assert sum(row["there"] for row in rows) == 1_600 and {row["mended_there"] for row in rows} == {100}
+
+
+def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A1-A8, B6, C5, F2: the example's own commands; the page's lines rebuild a member without hypogoal."""
+    example = EXAMPLES / "frozen_backbone.py"
+    text = example.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 40
+    (tmp_path / example.name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    lines = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", "").splitlines()
+    monkeypatch.setattr(explorer, "MOST_INTEGRATED", 2)
+    two = settings("sub_goals=collect-red-key,open-red-door")
+    few = {**SHORT, "collect": settings("unlabelled_seeds=1", "heldout_layouts=1")}
+    few["train-ensemble"] = [*SHORT["train-ensemble"], *two]
+    for words in (line.split() for line in lines):
+        if words[:1] == ["export"]:
+            monkeypatch.setenv(*words[1].split("="))
+        elif words[:1] == ["hypogoal"]:
+            assert main([*words[1:], *few.get(words[1], ())]) == 0, words
+    run = tmp_path / "runs" / "backbone"
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    states = [state for goal in metrics["saliency"]["sub_goals"] for state in goal["states"]]
+    assert states and all(state["method"] == "integrated gradients" for state in states)
+    worst = max(member["completeness_error"] for state in states for member in state["members"])
+    assert worst < 1e-3
+    assert "Attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    found: dict[str, Any] = {}
+    exec(compile(blocks(EXAMPLES.parent / "docs" / "formats.md", "python")[4], "formats.md", "exec"), found)
+    logits = load_ensemble(run / "ensemble", "collect-red-key").logits(found["images"].numpy())[:, 0]
+    np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-5)
 
 
 @pytest.mark.atari
