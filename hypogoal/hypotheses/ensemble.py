@@ -37,7 +37,8 @@ class Ensemble(nn.Module):
         members: K, at least 1.
         generator: draws the initial weights.
         view: what members see of an observation; all of it where None.
-        encoder, hidden_width: as of ``EnsembleConfig``.
+        encoder: as of ``TrainEnsembleConfig``.
+        hidden_width: the same.
 
     Attributes:
         members: K ``nn.Sequential``, float (N, C, h, w) in 0..1 (``networks.as_input``) -> logits (N,

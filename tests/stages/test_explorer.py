@@ -159,8 +159,8 @@ tiles()[0].dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbl
 const second = document.activeElement.getAttribute("data-state");
 document.querySelectorAll("#explorer-detail button")[1].click();
 tiles()[0].click();
-const top = (tile) => tile.getBoundingClientRect().top;
-const columns = [...tiles()].filter((tile) => top(tile) === top(tiles()[0])).length;
+const height = (tile) => tile.getBoundingClientRect().top;
+const columns = [...tiles()].filter((tile) => height(tile) === height(tiles()[0])).length;
 tiles()[0].dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowDown", bubbles: true }));
 const below = Number(document.activeElement.getAttribute("data-state")) === columns && columns > 1;
 tiles()[0].click();
