@@ -10,8 +10,8 @@ r"""Members on a frozen backbone: a small vision transformer sees images once, e
     hypogoal evaluate runs/backbone
     hypogoal report runs/backbone
 
-Its weights are random, so that nothing is downloaded; docs/extending.md has the line for one of timm's. It takes some five
-minutes of a CPU core.
+Its weights are random, so that nothing is downloaded; docs/extending.md has the line for one of timm's. It takes some
+five minutes of a CPU core.
 """
 
 import torch
