@@ -16,7 +16,7 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.learners.baselines.settings import BaselineConfig, DQNSettings, hyperparameters
-from hypogoal.meta.training import write_layout
+from hypogoal.meta.training import cut, played_world, write_layout
 from hypogoal.needs import baseline_needs
 
 
@@ -45,11 +45,12 @@ def train_baseline(
     inputs = [data] if data else []
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
-    world = _world_of(data, domain, played) if data else {}
+    world = played_world(played, _world_of(data, domain, played) if data else {}, config.world)
     chosen = hyperparameters(config.agent, config.setting)
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world)
+    cut(engine, config.cap)
     env = EngineEnv(engine)
     size = math.prod(env.observation_space.shape or (1,))
     replay = chosen.replay if isinstance(chosen, DQNSettings) else 0
