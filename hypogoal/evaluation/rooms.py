@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,6 @@ from hypogoal.evaluation.numbers import (
     PICKED,
     Metrics,
     Rows,
-    by_groups,
     by_method,
     grouped,
     methods_lacking,
@@ -46,8 +43,8 @@ if TYPE_CHECKING:
 # among the labelled ones.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
-TABLED = {"unseen": "unseen rooms", "all": "all rooms"}  # scopes of the table and of Figure 3
-FIGURE = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}  # scores of the table
+TABLED = {"unseen": "unseen rooms", "all": "all rooms"}  # scopes of Figure 3
+FIGURE = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}  # scores of Figure 3
 SCORED = (*FIGURE, "ranking")  # of which best, mean, ... are told
 WHICH = {
     "best": "best member",
@@ -260,23 +257,6 @@ SUMMARY = (
     page.number("mean", "distance.mean", page.deviation, 1),
     page.number("at base: best", "distance.reached_base.mean", page.percent),
 )
-DIFFERENCES = (
-    METHOD,
-    N,
-    page.number("disagree, unlabelled", "disagreement_unlabelled", page.deviation, 3),
-    page.number("disagree, held-out", "disagreement_heldout", page.deviation, 3),
-    page.number("tied on validation", "tied", page.fixed, 1),
-    *(
-        # which an evaluation of before does not have
-        page.number(
-            f"ranking, {which}",
-            lambda entry, which=which: entry["scores"]["unseen"].get("ranking", {}).get(which),
-            page.deviation,
-            3,
-        )
-        for which in ("best", "mean", "worst")
-    ),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -353,7 +333,7 @@ def _stopped(rows: Sequence[Entry]) -> str:
 
 
 def rooms_section(material: Material) -> Block:
-    """Figure 3, its tables and every kind of false positive."""
+    """Figure 3 and its table; what else is known of members and rooms is in ``metrics.json``."""
     title = "Hypotheses against labelled ladders"
     if not material.metrics["rooms"]:
         lacking = ["Figure 3: it needs ensemble artefacts of data whose held-out states say which rooms training saw."]
@@ -368,8 +348,7 @@ def rooms_section(material: Material) -> Block:
     blocks = []
     for rows in _by_sub_goal(material):
         blocks += [page.shown(material, figure) for figure in _drawn(material, rows)]
-        blocks += [*(_table(rows, scope) for scope in TABLED), _differences(rows)]
-        blocks += kinds_tables(material, rows)
+        blocks.append(_table(rows))
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
     return page.section("rooms", title, [text], blocks)
 
@@ -378,44 +357,27 @@ def _by_sub_goal(material: Material) -> list[list[Entry]]:
     return list(grouped(material.metrics["rooms"], itemgetter("sub_goal")).values())
 
 
-def _table(rows: Sequence[Entry], scope: str) -> Block:
+def _table(rows: Sequence[Entry]) -> Block:
     return page.table(
         (
             METHOD,
             N,
-            *(
-                page.number(f"{name} {which}", f"scores.{scope}.{score}.{which}", page.deviation, 2)
-                for score, name in (("balanced_accuracy", "bal."), ("accuracy", "acc."))
-                for which in WHICH
-            ),
-            page.number("seeds", "ensembles"),
+            *UNSEEN,
+            page.number("disagree, unlabelled", "disagreement_unlabelled", page.deviation, 3),
+            page.number("disagree, held-out", "disagreement_heldout", page.deviation, 3),
         ),
         rows,
         tight=True,
-        heading=f"On held-out states of {TABLED[scope]}",
-        caption="Balanced accuracy (bal.) and accuracy (acc.) of the best, the validated, the mean and the "
-        f"worst member: mean over ensemble seeds ± standard deviation over them. {_never(rows, scope)}"
-        f"{_why_dashes(rows) if scope == 'unseen' else PAPER}",
+        caption="Balanced accuracy on held-out states of unseen rooms of the best, the validated, the mean and the "
+        "worst member; accuracy (acc.) of the best one on those of all rooms; the share of states on which two "
+        "members' verdicts differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
+        f"{_never(rows)}{_why_dashes(rows)}{PAPER}",
     )
 
 
-def _differences(rows: Sequence[Entry]) -> Block:
-    return page.table(
-        DIFFERENCES,
-        rows,
-        tight=True,
-        heading="How different the members are, and what they know",
-        caption="Share of states on which two members' verdicts differ, mean over pairs; mean over seeds ± standard "
-        "deviation. Tied: members with the same, highest balanced accuracy in the rooms of labelled groups, of which "
-        "the first counts as validated; where all are tied, validation chooses nothing. Ranking: share of pairs of a "
-        "positive and a negative of unseen rooms in which a member gives the positive the higher probability (area "
-        "under the ROC curve); what lies between that and balanced accuracy is where its threshold is.",
-    )
-
-
-def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
-    """What accuracy is worth here: that of a member that never says yes, by N."""
-    found = {entry["groups"]: entry["always_no"][scope] for entry in rows if entry["always_no"][scope] is not None}
+def _never(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What accuracy on all rooms is worth here: that of a member that never says yes, by N."""
+    found = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
     every = sorted(found.items(), key=str)
     told = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
     return f"Never saying yes has accuracy {page.listed(told)}. " if told else ""
@@ -548,58 +510,6 @@ def _draw_method(
         axes.errorbar(groups, mean, deviation, color=colour, capsize=3, linewidth=1.2)
     else:
         axes.fill_between(groups, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
-
-
-def _at_each_n(material: Material, rows: Sequence[Entry]) -> Iterator[tuple[str, list[tuple[str, list[Entry]]]]]:
-    """For each N of the rows its name, and of every method what the rooms say of its ensembles (seeds)."""
-    judged = grouped(of_rooms(material.metrics["ensembles"]), cell_of)
-    for groups in by_groups(rows):
-        here = [entry for entry in rows if entry["groups"] == groups]
-        cells = [judged.get((entry["method"], groups, entry["sub_goal"]), []) for entry in here]
-        rooms = [[goal["rooms"] for _, goal in cell] for cell in cells]
-        yield group_name(here[0]), list(zip([entry["method"] for entry in here], rooms, strict=True))
-
-
-def kinds_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
-    """A table for each N: what share of each kind of negatives members call reached."""
-    blocks: list[Block] = []
-    for place, (groups, methods) in enumerate(_at_each_n(material, rows)):
-        found = [of for _, judged in methods for rooms in judged for of in rooms["false_positives"]]
-        lines = {(of["scope"], of["kind"]): of for of in found}
-        columns = [
-            page.label("held-out states of", lambda of: TABLED[of["scope"]], once=True),
-            page.label("negatives", "kind"),
-            page.number("states", "negatives", "{:,}".format),
-            *(
-                page.number(f"{method}: {name}", partial(_called_reached, judged, name))
-                for (method, judged), name in product(methods, ("mean", "validated"))
-            ),
-        ]
-        name = f"False positives by kind, N={groups}"
-        caption = (
-            "Share of each kind of negatives that a member calls reached, in %: mean over members and "
-            "seeds, and of the validated member, mean over seeds. Balanced accuracy hides these: a "
-            "member that says yes on the ladder ends an option half-way."
-        )
-        heading, folded = ("", name) if place else (name, "")
-        more: dict[str, Any] = {"heading": heading, "folded": folded, "caption": caption}
-        blocks += [page.table(columns, lines.values(), tight=True, **more)] if lines else []
-    return blocks
-
-
-def _called_reached(judged: Sequence[Entry], which: str, negatives: Entry) -> str:
-    """Of these negatives in every seed's rooms, in percent."""
-    alike = [
-        (of["share"], rooms["validated"]["member"])
-        for rooms in judged
-        for of in rooms["false_positives"]
-        if (of["scope"], of["kind"]) == (negatives["scope"], negatives["kind"])
-    ]
-    if which == "mean":
-        shares = [float(np.mean(share)) for share, _ in alike]
-    else:
-        shares = [share[member] for share, member in alike if member is not None]
-    return page.fixed(100 * float(np.mean(shares)) if shares else None, 1)
 
 
 QUESTION = Question(
