@@ -249,12 +249,6 @@ def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:
     return lambda entry: f"{entry['method']} ({entry['sub_goal']})" if several else str(entry["method"])
 
 
-def noted(member: int, words: Mapping[str, int | None], most: int | None = None) -> str:
-    """A member's number with the words that are of it, ``most`` of them: ``2 (best, validated)``."""
-    told = [word for word, of in words.items() if of == member][:most]
-    return f"{member} ({', '.join(told)})" if told else str(member)
-
-
 def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "") -> Block:
     """A list of names and texts, folded until asked for."""
     return {"kind": "facts", "folded": folded, "rows": list(rows), "heading": heading}
