@@ -255,12 +255,6 @@ COLUMNS = (
     page.number("score", "score", page.spread, 2),
     page.number("runs", "success.n"),
 )
-MEMBERS = (
-    page.label("sub-goal", "sub_goal", once=True),
-    page.number("member", "member"),
-    page.number("quality", "quality", page.fixed, 2),
-    page.number("preference among its sub-goal's", "conditional_preference", page.fixed, 2),
-)
 
 
 def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
@@ -276,7 +270,7 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The table, and the members of the first run."""
+    """One table; each member's quality and preference are in ``numbers.csv``."""
     agents = material.metrics.get("choosing", [])
     if not agents:
         return []
@@ -287,11 +281,8 @@ def sections(material: Material) -> list[Block]:
         "how often the better of two that differ by .2 is taken (chance .5), and how much of the way from the mean to "
         "the best quality it goes (chance 0)."
     )
-    blocks = [
-        page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED),
-        page.table(MEMBERS, agents[0]["runs"][0]["members"], folded=f"Members of {agents[0]['runs'][0]['path']}"),
-    ]
-    return [page.section("choosing", TITLE, [text], blocks)]
+    table = page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED)
+    return [page.section("choosing", TITLE, [text], [table])]
 
 
 QUESTION = Question(
