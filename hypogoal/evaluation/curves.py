@@ -343,19 +343,6 @@ INTERVALS = (
     page.number("discounted return", "discounted_return", page.interval, 2),
     page.number("runs", "success.n"),
 )
-EVERY_RUN = (
-    page.label("agent", "name", once=True),
-    page.number("layout", "layout_seed"),
-    page.number("seed", "seed"),
-    page.number("budget", "steps", page.thousands),
-    page.number("episodes", "episodes"),
-    page.number("success", "success", page.percent),
-    page.number("steps", "length", page.fixed, 1),
-    page.number("× shortest", "length_over_shortest", page.fixed, 2),
-    page.number(*NEARLY, page.fixed, 2),
-    page.number("return", "discounted_return", page.fixed, 2),
-    page.number("95 % at", "steps_to_95", lambda steps: "never" if steps is None else page.thousands(steps)),
-)
 LAYOUTS = (
     page.label("layout seed", lambda layout: str(layout["layout_seed"])),
     page.number("shortest path, steps", "shortest_path", page.fixed, 0),
@@ -372,7 +359,7 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The summary with film and curves, and every run's numbers, of a run with agents."""
+    """The summary with film and curves, intervals and layouts, of a run with agents."""
     if not material.of_agents():
         return []
     return [summary_section(material), *([runs_section(material)] if material.metrics["agents"] else [])]
@@ -471,7 +458,7 @@ def runs_of(agent: Entry) -> str:
 
 
 def runs_section(material: Material) -> Block:
-    """Every run's numbers; intervals and pairs from three runs on, since one run's are its numbers once more."""
+    """How hard layouts are; intervals and pairs from three runs on. Each run's numbers are in ``numbers.csv``."""
     agents = material.metrics["agents"]
     digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
     spread = [
@@ -485,7 +472,6 @@ def runs_section(material: Material) -> Block:
     ]
     blocks = [
         *(spread if max(len(agent["runs"]) for agent in agents) >= SEVERAL else ()),
-        page.table(EVERY_RUN, [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]]),
         page.table(
             LAYOUTS,
             material.metrics["layouts"],
@@ -493,7 +479,7 @@ def runs_section(material: Material) -> Block:
             caption="Random play: uniformly random primitive actions, the same cap.",
         ),
     ]
-    return page.section("runs", "Run by run", [], blocks, folded=True)
+    return page.section("runs", "Intervals and layouts", [], blocks, folded=True)
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -541,7 +527,7 @@ def _others(agents: Sequence[Mapping[str, Any]]) -> str:
     alike = [{(run["layout_seed"], run["seed"]) for run in agent["runs"]} for agent in agents]
     if all(runs == alike[0] for runs in alike):
         return "the same layouts and seeds"
-    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see the table of runs"
+    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see numbers.csv"
 
 
 @dataclass(frozen=True)
