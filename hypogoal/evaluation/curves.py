@@ -496,7 +496,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
     others = cycle(look for look in OTHERS if look not in used)
     looks = [COLOURS.get(agent["name"]) or next(others) for agent in agents]
     lines = [
-        Line(agent["name"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
+        Line(agent["name"], arrays["curves/grid"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
         for index, (agent, look) in enumerate(zip(agents, looks, strict=True))
     ]
     bounds: Bounds
@@ -511,7 +511,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
         which_figure, name, dotted = "Beside Figure 6 of the paper", "shortest path", "the shortest path"
     values = [value for value in values if value is not None]
     references = [(name, float(np.mean(values)))] if values else []
-    drawn = learning_curves(arrays["curves/grid"], lines, axis, references, bounds)
+    drawn = learning_curves(lines, axis, references, bounds)
     reference = f" Dotted: mean over layouts of {dotted}." if references else ""
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
@@ -532,9 +532,10 @@ def _others(agents: Sequence[Mapping[str, Any]]) -> str:
 
 @dataclass(frozen=True)
 class Line:
-    """One agent's curve: values float (R, G), a row per layout or run, NaN where it has no value."""
+    """One agent's curve: values float (R, G) at ``steps`` (G,), a row per layout or run, NaN where it has no value."""
 
     name: str
+    steps: NDArray[np.int64]
     values: NDArray[np.float64]
     colour: str
     style: Any = SOLID
@@ -547,14 +548,13 @@ def reward_bounds(lines: Sequence[Line]) -> Bounds:
 
 
 def learning_curves(
-    grid: NDArray[np.int64],
     lines: Sequence[Line],
     quantity: str,
     references: Sequence[tuple[str, float]] = (),
     bounds: Bounds = (0.0, None),
 ) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps, ``grid`` (G,), a line per agent; the mean, and of few
-    layouts or runs each, of more a band of one standard error.
+    """Figure 6: a quantity of episodes against environment steps, a line per agent; the mean, and of few layouts or
+    runs each, of more a band of one standard error.
 
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
@@ -563,12 +563,12 @@ def learning_curves(
         figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
         axes = figure.subplots()
         for line in lines:
-            _draw_curve(axes, grid / 1000, line)
+            _draw_curve(axes, line)
         for name, value in references:
             axes.axhline(value, color=GREY, linewidth=1.2, linestyle=":", label=name)
         axes.set_xlabel("environment steps, in thousands")
         axes.set_ylabel(quantity)
-        axes.set_xlim(0, grid[-1] / 1000)
+        axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
         label_lines(figure, axes, 2, handlelength=2.4)
     return figure
@@ -579,8 +579,8 @@ def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return by_layout(values, [run["layout_seed"] for run in agent["runs"]])[0]
 
 
-def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
-    known = np.ma.masked_invalid(line.values)
+def _draw_curve(axes: Axes, line: Line) -> None:
+    steps, known = line.steps / 1000, np.ma.masked_invalid(line.values)
     mean = known.mean(0).filled(np.nan)
     look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
     axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)

@@ -436,19 +436,16 @@ def bands(rows: Sequence[Mapping[str, Any]]) -> str:
     return "bands, and bars where a method has one N (those methods side by side)" if any(alone) else "bands"
 
 
-def scores_over_groups(
-    rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]], names: Sequence[str] = ()
-) -> Figure | None:
+def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:
     """Figure 3: scores against the number of labelled ladder groups; bands of one standard deviation.
 
     A method with one N has an error bar instead of a band, a little beside the other methods'. Dotted is what it takes
     no seeing to score.
 
     Rows are of :func:`rooms_table`; those without N are left out, and where all are there is no figure. A panel is a
-    title, and of which scope, score and member; two are in a row. Methods are coloured in the order of ``names``, by
-    default that of the rows.
+    title, and of which scope, score and member; two are in a row. Methods are coloured in the order of the rows.
     """
-    names, rows = names or list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
+    names, rows = list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
     if not rows:
         return None
     with styled():
@@ -481,8 +478,6 @@ def scores_over_groups(
             place.set_xlabel("labelled ladder groups, N")
         for place in axes[:, 0]:
             place.set_ylabel("fraction")
-        for place in axes.flat[len(panels) :]:
-            place.set_visible(False)
         legend_below(figure, list(axes.flat), 3, handlelength=2.6)
         return figure
 
@@ -495,12 +490,8 @@ def _draw_method(
     deviation: NDArray[np.float64],
     names: Sequence[str],
 ) -> None:
-    index, count = names.index(name), len(names)
-    colour, line = (
-        METHOD_COLOURS[index % len(METHOD_COLOURS)],
-        STYLES[index % len(STYLES)],
-    )  # 5 and 6: both again after 30
-    marker = MARKERS[index % len(MARKERS)]
+    index, count = names.index(name), len(names)  # of colours there are 6, of lines 5: both again after 30
+    colour, line, marker = (looks[index % len(looks)] for looks in (METHOD_COLOURS, STYLES, MARKERS))
     if len(groups) == 1:  # the others with one N lie at the same place
         groups = groups + (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
     axes.plot(groups, mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=name)
