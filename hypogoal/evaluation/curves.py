@@ -343,12 +343,6 @@ INTERVALS = (
     page.number("discounted return", "discounted_return", page.interval, 2),
     page.number("runs", "success.n"),
 )
-LAYOUTS = (
-    page.label("layout seed", lambda layout: str(layout["layout_seed"])),
-    page.number("shortest path, steps", "shortest_path", page.fixed, 0),
-    page.number("random play succeeds", "random_success", page.percent),
-    page.number("episodes of random play", "random_episodes"),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -359,10 +353,11 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The summary with film and curves, intervals and layouts, of a run with agents."""
+    """The summary with film and curves, of a run with agents; intervals of three runs or more, one run's are none."""
     if not material.of_agents():
         return []
-    return [summary_section(material), *([runs_section(material)] if material.metrics["agents"] else [])]
+    several = max((len(agent["runs"]) for agent in material.metrics["agents"]), default=0) >= SEVERAL
+    return [summary_section(material), *([runs_section(material)] if several else [])]
 
 
 def summary_section(material: Material) -> Block:
@@ -458,28 +453,18 @@ def runs_of(agent: Entry) -> str:
 
 
 def runs_section(material: Material) -> Block:
-    """How hard layouts are; intervals and pairs from three runs on. Each run's numbers are in ``numbers.csv``."""
+    """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
     digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
-    spread = [
+    blocks = [
         page.table(
             INTERVALS,
             agents,
-            heading="Intervals",
             caption=f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
         ),
         *page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits),
     ]
-    blocks = [
-        *(spread if max(len(agent["runs"]) for agent in agents) >= SEVERAL else ()),
-        page.table(
-            LAYOUTS,
-            material.metrics["layouts"],
-            heading="How hard the layouts are",
-            caption="Random play: uniformly random primitive actions, the same cap.",
-        ),
-    ]
-    return page.section("runs", "Intervals and layouts", [], blocks, folded=True)
+    return page.section("runs", "Intervals and pairs", [], blocks, folded=True)
 
 
 def figures(material: Material) -> list[Drawn]:

@@ -43,15 +43,10 @@ if TYPE_CHECKING:
 # among the labelled ones.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
-TABLED = {"unseen": "unseen rooms", "all": "all rooms"}  # scopes of Figure 3
-FIGURE = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}  # scores of Figure 3
-SCORED = (*FIGURE, "ranking")  # of which best, mean, ... are told
-WHICH = {
-    "best": "best member",
-    "validated": "validated member",
-    "mean": "mean of members",
-    "worst": "worst member",
-}
+TABLED = ("unseen", "all")  # scopes of the tables and of Figure 3
+SCORED = ("balanced_accuracy", "accuracy", "ranking")  # of which best, mean, ... are told
+WHICH = ("best", "validated", "mean", "worst")
+SHOWN = {"best": "best member", "validated": "validated member", "mean": "mean of members"}
 SHARE = "share of states"
 SPREAD = ("mean", "standard_deviation")  # of the figures
 CELL = ("method", "groups", "sub_goal")  # what rows are over seeds of
@@ -346,9 +341,8 @@ def rooms_section(material: Material) -> Block:
         "groups, which a user could pick too."
     )
     blocks = []
-    for rows in _by_sub_goal(material):
-        blocks += [page.shown(material, figure) for figure in _drawn(material, rows)]
-        blocks.append(_table(rows))
+    for figure, rows in zip(figures(material), _by_sub_goal(material), strict=True):
+        blocks += [page.shown(material, figure), _table(rows)]
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
     return page.section("rooms", title, [text], blocks)
 
@@ -394,37 +388,24 @@ def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def figures(material: Material) -> Iterator[Drawn]:
-    """Figure 3, and what it leaves out."""
-    for rows in _by_sub_goal(material):
-        yield from _drawn(material, rows)
-
-
-def _drawn(material: Material, rows: Sequence[Entry]) -> Iterator[Drawn]:
-    """Of one sub-goal the best member, then every way to pick one."""
-    suffix = f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
-    methods = {entry["method"] for entry in rows}
-    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
-    panels = [
-        (f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
-        for score in ("accuracy", "balanced_accuracy")
-        for scope in ("all", "unseen")
-    ]
-    caption = (
-        "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
-        f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
-        f"Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. {_why_dashes(rows)}{PAPER}"
-    )
-    nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
-    title, drawn = "Figure 3: the best member against labelled ladder groups", scores_over_groups(rows, panels)
-    yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
-    panels = [(name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
-    caption = (
-        "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
-        f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
-        "Only the second can be had without labels from the rooms it is for."
-    )
-    title, drawn = "Balanced accuracy on unseen rooms", scores_over_groups(rows, panels)
-    yield Drawn(f"unseen{suffix}", title, drawn, caption, "As above.", file=f"figure3-unseen{suffix}")
+    """Figure 3, and what it leaves out, of each sub-goal."""
+    by_sub_goal = _by_sub_goal(material)
+    for rows in by_sub_goal:
+        methods = {entry["method"] for entry in rows}
+        seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
+        panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
+        panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
+        caption = (
+            "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
+            "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
+            f"mean one; mean over ensemble seeds, {bands(rows)}: ± one standard deviation over seeds, as in the paper. "
+            f"Dotted: never saying yes. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. "
+            f"{_why_dashes(rows)}{PAPER}"
+        )
+        nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
+        title, drawn = "Figure 3: members against labelled ladder groups", scores_over_groups(rows, panels)
+        suffix = f"-{rows[0]['sub_goal']}" if len(by_sub_goal) > 1 else ""
+        yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
 
 
 def bands(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -274,7 +274,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
         "Explore the hypotheses", "Ranking, whatever the threshold", "What members look at",
         "Data, settings, provenance",
     ]  # fmt: skip
-    assert page.count("<figure") == 5
+    assert page.count("<figure") == 4
     assert "about 70 % for the best member at N=1" in page
     assert "Its test files include training rooms" in page
     assert "At N=3 no unseen room has a ladder base left" in page
@@ -284,7 +284,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     assert "not drawn" not in re.sub(r"rooms that are not drawn none", "", page)
     assert "Missing in this run" not in page
     names = {path.stem for path in (run / "report" / "figures").iterdir()}
-    assert names == {"figure3", "unseen", "figure4", "figure5-1L-N2", "figure5-2-6-N2"}
+    assert names == {"figure3", "figure4", "figure5-1L-N2", "figure5-2-6-N2"}
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
     links = re.findall(r'(?:src|href)="([^"]+)"', page)
@@ -300,7 +300,7 @@ def test_the_papers_figures_as_files(run, metrics, tmp_path):
     """Spec F1-F4: Figures 2 to 5 and 9 of one sub-goal; what the agents' figures would need."""
     written, missing = draw_figures(run, tmp_path, "png")
     assert [path.stem for path in written] == [
-        "figure2", "figure3", "figure3-unseen", "figure4", "figure5-1L-N2", "figure5-2-6-N2", "figure9", "captions",
+        "figure2", "figure3", "figure4", "figure5-1L-N2", "figure5-2-6-N2", "figure9", "captions",
     ]  # fmt: skip
     assert [line.partition(":")[0] for line in missing] == ["Figure 6", "Figure 7", "Figure 8"]
 
@@ -315,7 +315,7 @@ def test_ensembles_alone(tmp_path):
         "no options artefact of a ladder (Figures 4 and 5)",
     ]
     page = report(tmp_path).read_text(encoding="utf-8")
-    assert page.count("<figure") == 2
+    assert page.count("<figure") == 1
     assert page.count("train-options with --set start=LADDER") == 2
     assert "Learning curves" not in page
     Console(width=80, file=io.StringIO()).print(summary_table(metrics))

@@ -307,7 +307,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
 def test_the_page_shows_all_of_it(run, page):
     """Spec F5, F6, F7: curves, hypotheses, examples, overlays, choices, provenance, with seeds in the captions."""
     for title in (
-        "Summary", "Intervals and layouts", "Hypotheses", "Explore the hypotheses",
+        "Summary", "Hypotheses", "Explore the hypotheses",
         "Which hypotheses are chosen, and where they stop", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
