@@ -40,7 +40,7 @@ from hypogoal.evaluation.numbers import (
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
-from hypogoal.evaluation.rooms import CELL, of_rooms
+from hypogoal.evaluation.rooms import CELL, WHICH, group_name, of_rooms
 from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, within
 from hypogoal.hypotheses.scores import most_and_least
 
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
-WHICH = ("best", "validated", "mean", "worst")
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
 SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
 _NAMES = (*WHICH, "executions_deviation", *SHARES)
@@ -374,11 +373,11 @@ OVER_LADDERS = (
 
 
 def summary(metrics: Metrics) -> list[Table]:
-    """Figure 4 by N and method, mean over ladders; at most 80 wide."""
+    """Figure 4 by method and N."""
     rows = metrics["distance"]["over_ladders"] if metrics["distance"]["options"] else []
-    method = page.label("method", page.method_of(rows))
     title = "Distance from a true base where options stop, mean over ladders"
-    return [page.terminal(title, (OVER_LADDERS[0], method, *STOPPED, SHARED[0]), _ordered(rows))] if rows else []
+    columns = (page.label("method", page.method_of(rows)), page.number("N", group_name), *STOPPED, SHARED[0])
+    return [page.terminal(title, columns, rows)] if rows else []
 
 
 def sections(material: Material) -> list[Block]:
