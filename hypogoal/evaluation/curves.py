@@ -386,13 +386,13 @@ def summary_section(material: Material) -> Block:
 
 def _answers(material: Material) -> list[str]:
     """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
-    agents, window = material.metrics["agents"], material.metrics["settings"]["window"]
+    agents = material.metrics["agents"]
     shown = variants(agents)
     several = len(shown) > 1
     paragraphs = []
     for agent in shown:
         name = f"the agent '{agent['name']}'" if several else "the option agent"
-        text = _achieved(agent, name, window)
+        text = _achieved(agent, name)
         control = control_of(material, agent)
         alike = not several or control is None or same_settings(agent, control)
         among = f"uniformly random choice among options of {'the same members' if alike else 'its ensemble'}"
@@ -413,14 +413,14 @@ def _answers(material: Material) -> list[str]:
     return paragraphs
 
 
-def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
+def _achieved(agent: Mapping[str, Any], name: str) -> str:
     success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
     if success is None:
         return f"No episode of {name} came to its end ({runs_of(agent)}): it needs more steps."
     against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
     return (
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
-        f"{_episodes(agent, window)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
+        f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
 
 
@@ -434,12 +434,11 @@ def _listed(others: Sequence[tuple[str, Entry]]) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _episodes(agent: Mapping[str, Any], window: int) -> str:
+def _episodes(agent: Mapping[str, Any]) -> str:
     """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
-    counts = [min(window, run["episodes"]) for run in agent["runs"] if run["episodes"]]
-    fewest, most = min(counts), max(counts)
-    count = str(most) if fewest == most else f"{fewest} to {most}"
-    return f"{count} training episode{'s' if most > 1 else ''}"
+    windows = sorted({run["window"] for run in agent["runs"] if run["window"]})
+    count = f"{windows[0]} to {windows[-1]}" if len(windows) > 1 else str(windows[0])
+    return f"{count} training episode{'s' if windows[-1] > 1 else ''}"
 
 
 def runs_of(agent: Entry) -> str:

@@ -155,12 +155,6 @@ def of_rooms(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
     return [(ensemble, goal) for ensemble in ensembles for goal in ensemble["sub_goals"] if "rooms" in goal]
 
 
-def cell_of(judged: tuple[Entry, Entry]) -> tuple[str, int | None, str]:
-    """Method, N and sub-goal of one of these."""
-    ensemble, goal = judged
-    return ensemble["method"], ensemble["groups"], goal["sub_goal"]
-
-
 def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
@@ -170,7 +164,8 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     disagreement on unlabelled and held-out states.
     """
     table = []
-    for key, judged in sorted(grouped(of_rooms(ensembles), cell_of).items(), key=lambda item: by_method(item[0])):
+    cells = grouped(of_rooms(ensembles), lambda of: (of[0]["method"], of[0]["groups"], of[1]["sub_goal"]))
+    for key, judged in sorted(cells.items(), key=lambda item: by_method(item[0])):
         cell, goals = " ".join(map(str, key)), [goal for _, goal in judged]
         scopes = [goal["rooms"]["scopes"] for goal in goals]
         entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
