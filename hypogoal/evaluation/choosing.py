@@ -290,15 +290,4 @@ QUESTION = Question(
     rows=rows,
     summary=summary,
     sections=sections,
-    meanings={
-        "quality": (
-            "fraction",
-            "share of an option's greedy executions that bring about the true sub-goal, the episode not lost; begun "
-            "where the agent decides, the option is offered and the sub-goal can be had within its timeout",
-        ),
-        "conditional_preference": ("ratio", "chosen / expected among the members offered of the chosen sub-goal"),
-        "within_rho": ("Spearman's rho, -1..1", "of quality and conditional preference, mean over sub-goals"),
-        "pair": ("fraction", "how often the better of two members is taken, whose qualities differ by .2; chance .5"),
-        "score": ("ratio", "(quality taken - mean quality offered) / (best - mean); chance 0"),
-    },
 )

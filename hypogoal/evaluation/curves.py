@@ -626,12 +626,5 @@ QUESTION = Question(
     summary=summary,
     sections=sections,
     figures=figures,
-    meanings={
-        "near": (
-            "fraction",
-            "share of the last 100 training episodes (scope frozen: of those played after training) that succeeded "
-            f"within {NEAR} times the layout's shortest path",
-        )
-    },
     needed={"figure6": "options, meta or baseline artefacts: train-meta, train-baseline"},
 )

@@ -396,7 +396,7 @@ class Question:
     rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()  # of ``numbers.csv``
     # Methods against each other, by their key in ``comparisons``.
     pairs: Callable[[Entry], dict[str, Rows]] = lambda metrics: {}
-    # Unit and meaning of its quantities, those that ``quantities.toml`` does not have.
+    # Unit and meaning of its quantities, of a question of your own; others are in ``quantities.toml``.
     meanings: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     summary: Callable[[Entry], list[Table]] = lambda metrics: []  # tables for a terminal
     sections: Callable[[Material], list[Block]] = lambda material: []  # those that the run has anything for
