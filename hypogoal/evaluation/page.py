@@ -163,8 +163,8 @@ def table(
     }
 
 
-def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, sections: bool = False) -> Table:
-    """The same table for a terminal, 79 columns wide; a line between groups of rows where ``sections``."""
+def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
+    """The same table for a terminal, 79 columns wide; a line between groups of rows."""
     drawn = table(columns, entries)
     found = Table(title=title, title_justify="left", width=79)
     for column in columns:
@@ -173,7 +173,7 @@ def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, s
         else:
             found.add_column(column.title, ratio=1, overflow="fold")
     for index, row in enumerate(drawn["rows"]):
-        if sections and index and row["mark"]:
+        if index and row["mark"]:
             found.add_section()
         found.add_row(*(str(cell["text"] if isinstance(cell, dict) else cell) for cell in row["cells"]))
     return found
