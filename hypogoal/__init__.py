@@ -5,9 +5,9 @@ first use, so that ``import hypogoal`` and the command line's ``--help`` stay fa
 """
 
 import importlib
+import sys
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
-
-import gymnasium
 
 __version__ = "0.9.0"
 
@@ -40,7 +40,29 @@ def __dir__() -> list[str]:
     return __all__
 
 
-# As packages with environments do: Gymnasium finds them once this one is imported. Their modules are loaded when one
-# is made.
-gymnasium.register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
-gymnasium.register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
+def _register() -> None:
+    """Have Gymnasium find the environments; their modules are loaded when one is made."""
+    from gymnasium import register
+
+    register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
+    register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
+
+
+class _OnceGymnasiumIsThere:
+    """Registers them as soon as someone imports Gymnasium: its import is most of this one's time, and few need it."""
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> Any:
+        if name != "gymnasium" or self not in sys.meta_path:
+            return None
+        sys.meta_path.remove(self)
+        spec: Any = find_spec(name)
+        if spec is not None and spec.loader is not None:
+            load = spec.loader.exec_module
+            spec.loader.exec_module = lambda module: (load(module), _register())
+        return spec
+
+
+if "gymnasium" in sys.modules:
+    _register()
+else:
+    sys.meta_path.insert(0, _OnceGymnasiumIsThere())  # type: ignore[arg-type]
