@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from hypogoal.core.config import resolve
+from hypogoal.core.config import DOMAIN, as_dict, describe, from_values, load_preset, resolve
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import AuditConfig, TrainMetaConfig, TrainOptionsConfig
@@ -17,6 +17,27 @@ CONFIGS: Mapping[str, type] = {
 }
 STAGES = ("collect", *CONFIGS)  # whose settings are its domain's
 TABLES = (*STAGES, "run")  # of presets
+
+
+def options_of(stage: str) -> dict[str, dict[str, Any]]:
+    """The settings of a stage that people change most, by the option of its command that is short for ``--set``."""
+    described = describe(CONFIGS[stage]) if stage in CONFIGS else ()
+    return {f"--{row['name'].replace('_', '-')}": row for row in described if row["often"]}
+
+
+def described(config_class: type, stage: str, domain: str, preset: str | None = None) -> list[dict[str, Any]]:
+    """Every setting of a stage, see :func:`hypogoal.core.config.describe`, as a domain and a preset have them."""
+    instead: list[tuple[Mapping[str, Any], str]] = []
+    if domain != DOMAIN:  # whose defaults are the classes' own: quicker than to load it
+        from hypogoal.domains.base import defaults_of, load_domain
+
+        sources = load_domain(domain, given=True).sources
+        instead.append((defaults_of(domain, stage, given=True), sources.get(stage, f"{domain}'s own")))
+    if preset is not None:
+        values = load_preset(preset, stage, domain, TABLES)
+        checked = as_dict(from_values(config_class, values, stage))
+        instead.append(({key: checked[key] for key in values}, f"preset {preset}"))
+    return describe(config_class, *instead)
 
 
 def configuration(

@@ -8,6 +8,7 @@ default > default.
 import dataclasses
 import difflib
 import hashlib
+import inspect
 import json
 import math
 import re
@@ -35,10 +36,12 @@ def setting(
     choices: Iterable[Any] | None = None,
     low: float | None = None,
     high: float | None = None,
+    often: bool = False,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values."""
+    """A dataclass field with its unit, meaning, source and allowed values; ``often``: people change it most."""
     allowed = {"choices": None if choices is None else tuple(choices), "low": low, "high": high}
-    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
+    about = {"meaning": meaning, "unit": unit, "source": source, "often": often, **allowed}
+    return dataclasses.field(default=default, metadata=about)
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
@@ -146,16 +149,22 @@ def as_dict(config: Any) -> dict[str, Any]:
     }
 
 
-def describe(config_class: type, defaults: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
-    """Every setting with default (a domain's own where given), type, unit, meaning, source and allowed values."""
+def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
+    """Every setting with default, type, unit, meaning, source, allowed values, and what it is a part of.
+
+    ``instead`` are what has values other than the class's (a domain, a preset), each with its name, the last first.
+    """
     kinds = typing.get_type_hints(config_class)
     rows = []
     for field in dataclasses.fields(config_class):
-        kind = kinds[field.name]
-        default = (defaults or {}).get(field.name, field.default)
+        kind, default, about = kinds[field.name], field.default, dict(field.metadata)
+        for values, source in instead:
+            if field.name in values:
+                default, about["source"] = values[field.name], source
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
-        rows.append(row | {key: field.metadata.get(key) for key in ("unit", "meaning", "source")})
-        rows[-1]["allowed"] = _allowed(field.metadata)
+        rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source", "often")})
+        home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))
+        rows[-1] |= {"allowed": _allowed(about), "part": (home.__doc__ or "").partition("\n")[0]}
     return rows
 
 

@@ -17,6 +17,7 @@ class OptionConfig:
         "what follows on each action",
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
+        often=True,
     )
     experience: str = setting(
         "shared",
