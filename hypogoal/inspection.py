@@ -16,13 +16,21 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_text
+from hypogoal.core.files import read_end, read_json, read_text
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
+from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
+RESULTS = {  # numbers of logs, in the order in which they are told: their names
+    "balanced_accuracy": "best member's balanced accuracy",
+    **{name: name for name in ("success", "length", "reached", "terminated", "duration")},
+    **{name: f"{name} loss" for name in ("labelled", "diversity")},
+    "episodes": "episodes",
+    "step": "steps",
+}
+LARGEST = 1e300  # of a number that is told
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
 
@@ -37,10 +45,38 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
+        return {"kind": "data", "path": str(path), "counts": dataset.counts(), **about, "config": dataset.config}
     artefact = open_artefact(path)
-    keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
-    return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
+    keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
+    about = {"path": str(path), **artefact.manifest, "result": result_of(path)}
+    return {key: about.get(key) for key in ("path", *keys)}
+
+
+def result_of(path: Path) -> dict[str, float]:
+    """What an artefact's training came to: its logs' last numbers, the mean over sub-goals; empty without a log.
+
+    Of scores it is the best member's on all held-out states.
+    """
+    last = {
+        tuple(str(line.get(key, "")) for key in ("sub_goal", "member")): line
+        for log in (LOG, SCORES)
+        for line in _logged(path / log)
+        if line.get("scope", "all") == "all"
+    }
+    found: dict[str, dict[str, float]] = {}
+    for (goal, _), line in last.items():
+        for key, name in RESULTS.items():
+            if type(value := line.get(key)) in (int, float) and -LARGEST < value < LARGEST:
+                found.setdefault(name, {})[goal] = max(value, found.get(name, {}).get(goal, value))
+    return {name: sum(found[name].values()) / len(found[name]) for name in RESULTS.values() if name in found}
+
+
+def _logged(log: Path) -> Iterator[dict[str, Any]]:
+    """The objects of a log; what is damaged is for ``verify`` to tell."""
+    for line in read_end(log):
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(value := json.loads(line), dict):
+                yield value
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
@@ -65,12 +101,13 @@ def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
 
 
 def lines(about: dict[str, Any]) -> list[str]:
-    """A description as text, a line a fact."""
+    """A description as text, a line a fact, what it came to first."""
     if about["kind"] == "run":
-        return [f"{part['path']}: {part['kind']}" for part in about["artefacts"]]
-    text = [f"{about['path']}: {about['kind']}"]
+        return [line for part in about["artefacts"] for line in lines(part)[:1]]
+    result = ", ".join(f"{name} {value:.4g}" for name, value in (about.get("result") or {}).items())
+    text = [f"{about['path']}: {about['kind']}" + (f"; {result}" if result else "")]
     for key, value in about.items():
-        if key in ("path", "kind") or value is None:
+        if key in ("path", "kind", "result") or value is None:
             continue
         if isinstance(value, dict):
             text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]

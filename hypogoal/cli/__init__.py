@@ -12,14 +12,16 @@ import re
 import signal
 import sys
 import time
+from dataclasses import fields
 from typing import Annotated, Any
 
 import typer
 
-from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has the stages first
+from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
+from hypogoal.settings import CONFIGS, TABLES
 
 NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller settings."
 # What torch, and whoever loads a library, raises in place of a MemoryError.
@@ -76,11 +78,23 @@ def main(arguments: list[str] | None = None) -> int:
         ended = getattr(error, "exit_code", None)
         if ended is not None:
             message = getattr(error, "format_message", lambda: "")()
-            return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(ended)
+            return _fail(f"{message.rstrip('.')}. {_advice(error)}", 2) if message else int(ended)
         message, code = _told(error)
         if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a pipe that nobody reads any more
             raise
         return _fail(message, code)
+
+
+def _advice(error: Any) -> str:
+    """What to do about words that a command does not take; settings are often taken for options."""
+    context, option = getattr(error, "ctx", None), getattr(error, "option_name", "")
+    stage = getattr(context, "info_name", "")
+    if not hasattr(error, "possibilities") or stage not in TABLES:
+        return f"See '{context.command_path if context else 'hypogoal'} --help'."
+    key = option.lstrip("-").replace("-", "_")
+    known = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
+    told = f"It is a setting: give --set {key}=VALUE" if known else "Settings are given as --set key=VALUE"
+    return f"{told}; 'hypogoal config {stage}' lists them."
 
 
 def _told(error: BaseException) -> tuple[str, int]:

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from hypogoal.cli.common import Quiet, Set, app, values_of
+from hypogoal.cli.common import MANY, Quiet, Set, app, values_of
 from hypogoal.core.terminal import draw, give
 
 benchmark = typer.Typer(help="Score diversity objectives where the answer is known.", no_args_is_help=True)
-app.add_typer(benchmark, name="benchmark")
+app.add_typer(benchmark, name="benchmark", rich_help_panel=MANY)
 
 
 @benchmark.callback()
@@ -17,7 +17,7 @@ def _group() -> None:
     """Score diversity objectives where the answer is known."""
 
 
-@benchmark.command("which-feature")
+@benchmark.command("which-feature", epilog="Example: [bold]hypogoal benchmark which-feature --out runs/wf[/bold]")
 def which_feature(
     out: Annotated[Path, typer.Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
     diversity: Annotated[

@@ -9,23 +9,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
+from hypogoal.cli.common import (
+    OWN,
+    Force,
+    Out,
+    Quiet,
+    Seed,
+    Set,
+    after_data,
+    command,
+    print_counts,
+    print_next,
+    seed_option,
+)
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import give, say
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
 
 
-@app.command("import")
+@command(OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
     source: Annotated[
         Path, typer.Argument(help="A .npz file, a folder of .npy files or of images, or a Minari dataset's folder.")
     ],
     out: Out,
     sub_goal: Annotated[
-        list[str] | None, typer.Option(help="A sub-goal's name, in the order of the labels' columns; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="<str>", help="A sub-goal's name, in the order of the labels' columns; repeatable."),
     ] = None,
     label: Annotated[
         list[str] | None,
@@ -40,7 +52,7 @@ def import_(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a data file of own states: arrays, images, or a Minari dataset with label functions."""
+    """Make a data file of own arrays, images or Minari data."""
     from hypogoal.core import own_code
     from hypogoal.stages.import_data import import_data as stage
 
@@ -54,21 +66,22 @@ def import_(
             force=force,
         )  # fmt: skip
     print_counts(counts, quiet)
+    print_next(quiet, *after_data(out))
     give(out)
 
 
-@app.command()
+@command(OWN, "export data/doorkey.h5 --out states.npz")
 def export(
     source: Annotated[Path, typer.Argument(help="A data file, or the folder of a meta artefact.")],
     out: Annotated[Path, typer.Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
     episodes: Annotated[int, typer.Option(min=1, help="Of the agent, where it is one.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="Of the agent's draws of options.")] = 0,
+    seed: Annotated[int, seed_option("Of the agent's draws of options.")] = 0,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write states as NumPy arrays, or an agent's episodes as a Minari dataset, for other software.
+    """Write states or an agent's episodes for other software.
 
-    'import' takes both again.
+    States as NumPy arrays, episodes as a Minari dataset. 'import' takes both again.
     """
     if source.is_dir():
         from hypogoal.stages.export_episodes import export_episodes
@@ -83,7 +96,7 @@ def export(
     give(out)
 
 
-@app.command()
+@command(OWN, "label doorkey --out marks/door-open")
 def label(
     source: Annotated[
         str,
@@ -93,7 +106,7 @@ def label(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
-    layout_seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="The layout that is played first.")] = 0,
+    layout_seed: Annotated[int, seed_option("The layout that is played first.")] = 0,
     arg: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="Of the environment, such as --arg start=2-6.")
     ] = None,
@@ -103,9 +116,10 @@ def label(
     ] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a folder that there is.")] = False,
 ) -> None:
-    """Mark states by hand, in a window: p positive, n negative, u unlabelled; 'import' takes the folder.
+    """Mark states by hand, in a window; 'import' takes them.
 
-    Every mark is on the disk at once. --heldout adds states of other layouts to a folder, to judge members by.
+    Keys: p positive, n negative, u unlabelled. Every mark is on the disk at
+    once. --heldout adds states of other layouts to a folder, to judge members.
     """
     from hypogoal.core import own_code
     from hypogoal.stages.label import label as stage
@@ -117,7 +131,7 @@ def label(
         )  # fmt: skip
     say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
     if all(counts.values()):
-        say(f"next: hypogoal import {out} --out {out.with_suffix('.h5')}")
+        print_next(False, "import", out, "--out", out.with_suffix(".h5"))
     give(out)
 
 
@@ -135,18 +149,19 @@ def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-@app.command()
+@command(OWN, "check mine:DOMAIN")
 def check(
     domain: Annotated[str | None, typer.Argument(help="A domain: a name or module:object.")] = None,
     diversity: Annotated[str | None, typer.Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, typer.Option(help="A member network: a name or module:function.")] = None,
     set_: Set = None,
     seed: Seed = 0,
-    layout_seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
+    layout_seed: Annotated[int, seed_option("The layout that is played.")] = 0,
 ) -> None:
-    """Check that an own domain, diversity objective or network keeps to its contract; exit code 2 when not.
+    """Does an own domain, objective or network keep its contract?
 
-    --set changes how states of the domain are collected, as for 'collect'; they are collected twice.
+    Exit code 2 when not. --set changes how states of the domain are collected,
+    as for 'collect'; they are collected twice.
     """
     from hypogoal.core import own_code
 

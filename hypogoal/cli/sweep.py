@@ -6,26 +6,45 @@ from typing import Annotated, Any
 
 import typer
 
-from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, values_of
+from hypogoal.cli.common import (
+    MAKE,
+    MANY,
+    AsJson,
+    Device,
+    Force,
+    Preset,
+    Quiet,
+    Set,
+    command,
+    echo,
+    seed_option,
+    values_of,
+)
 from hypogoal.core.terminal import draw, give, say
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")]
 SLURM = "Slurm (with --engine slurm)"
 
 
-@app.command()
+@command(MAKE, "run doorkey --preset demo --out runs/demo")
 def run(
     experiment: Annotated[str, typer.Argument(help="doorkey, montezuma-ladders or which-feature.")],
-    out: Out,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="What to write. [dim]\\[default: runs/EXPERIMENT][/dim]")
+    ] = None,
     preset: Preset = None,
     set_: Set = None,
+    seed: Annotated[int | None, seed_option("The one run seed, instead of the experiment's.", "--seed")] = None,
     device: Device = "auto",
     force: Force = False,
     resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
     quiet: Quiet = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
+    """Chain all stages: from nothing to a report.
+
+    --set takes KEY=VALUE or STAGE.KEY=VALUE.
+    """
     from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.core.drafts import place_of
@@ -33,8 +52,9 @@ def run(
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
-    out = place_of(out)
-    planned = plan(experiment, out, preset=preset, assignments=set_ or (), device=device, short=True)
+    out = place_of(out or Path("runs", experiment))
+    seeds = None if seed is None else str(seed)
+    planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
     if dry_run:
         _list(planned)
         return
@@ -49,7 +69,7 @@ def run(
     give(out / "report" / "index.html")
 
 
-@app.command()
+@command(MANY, "sweep figure6 --out runs/figure6 --seeds 0-2 --dry-run")
 def sweep(
     out: Annotated[Path, typer.Option("--out", help="The sweep's folder. Started again on it, a sweep goes on.")],
     experiment: Annotated[
@@ -85,12 +105,16 @@ def sweep(
     ] = 120,
     sbatch: Annotated[
         list[str] | None,
-        typer.Option(rich_help_panel=SLURM, help="Another option for sbatch, as --sbatch=--account=x; repeatable."),
+        typer.Option(
+            metavar="<str>",
+            rich_help_panel=SLURM,
+            help="Another option for sbatch, as --sbatch=--account=x; repeatable.",
+        ),
     ] = None,
 ) -> None:
-    """Run every cell of an experiment that is not finished: seeds, layouts, ladders, methods.
+    """Run an experiment's cells: seeds, layouts, methods.
 
-    --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
+    What is finished is not run again. --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
     """
     from hypogoal.core.drafts import place_of
 
