@@ -40,7 +40,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def _register() -> None:
+def _register(_imported: object = None) -> None:
     """Have Gymnasium find the environments; their modules are loaded when one is made."""
     from gymnasium import register
 
@@ -48,21 +48,21 @@ def _register() -> None:
     register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
 
 
-class _OnceGymnasiumIsThere:
-    """Registers them as soon as someone imports Gymnasium: its import is most of this one's time, and few need it."""
+class _Registration:
+    """Waits until someone imports Gymnasium, which takes longer than all that is imported here, and few need it."""
 
-    def find_spec(self, name: str, path: object = None, target: object = None) -> Any:
+    def find_spec(self, name: str, *_: object) -> Any:
         if name != "gymnasium" or self not in sys.meta_path:
             return None
         sys.meta_path.remove(self)
-        spec: Any = find_spec(name)
-        if spec is not None and spec.loader is not None:
-            load = spec.loader.exec_module
-            spec.loader.exec_module = lambda module: (load(module), _register())
+        loader: Any = getattr(spec := find_spec(name), "loader", None)
+        if loader is not None:
+            load = loader.exec_module
+            loader.exec_module = lambda module: _register(load(module))
         return spec
 
 
 if "gymnasium" in sys.modules:
     _register()
 else:
-    sys.meta_path.insert(0, _OnceGymnasiumIsThere())  # type: ignore[arg-type]
+    sys.meta_path.insert(0, _Registration())

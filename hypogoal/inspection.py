@@ -23,13 +23,9 @@ from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
-RESULTS = {  # numbers of logs, in the order in which they are told: their names
-    "balanced_accuracy": "best member's balanced accuracy",
-    **{name: name for name in ("success", "length", "reached", "terminated", "duration")},
-    **{name: f"{name} loss" for name in ("labelled", "diversity")},
-    "episodes": "episodes",
-    "step": "steps",
-}
+# Numbers of logs, in the order in which they are told: what they are called.
+RESULTS = {"balanced_accuracy": "best member's balanced accuracy", "labelled": "labelled loss"}
+RESULTS |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
 LARGEST = 1e300  # of a number that is told
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
@@ -53,30 +49,22 @@ def _describe_part(path: Path) -> dict[str, Any]:
 
 
 def result_of(path: Path) -> dict[str, float]:
-    """What an artefact's training came to: its logs' last numbers, the mean over sub-goals; empty without a log.
+    """What an artefact's training came to: its logs' last numbers, means over sub-goals.
 
-    Of scores it is the best member's on all held-out states.
+    Of scores the best member's. Empty without a log; what is damaged in one is for ``verify`` to tell.
     """
-    last = {
-        tuple(str(line.get(key, "")) for key in ("sub_goal", "member")): line
-        for log in (LOG, SCORES)
-        for line in _logged(path / log)
-        if line.get("scope", "all") == "all"
-    }
-    found: dict[str, dict[str, float]] = {}
-    for (goal, _), line in last.items():
-        for key, name in RESULTS.items():
-            if type(value := line.get(key)) in (int, float) and -LARGEST < value < LARGEST:
-                found.setdefault(name, {})[goal] = max(value, found.get(name, {}).get(goal, value))
-    return {name: sum(found[name].values()) / len(found[name]) for name in RESULTS.values() if name in found}
-
-
-def _logged(log: Path) -> Iterator[dict[str, Any]]:
-    """The objects of a log; what is damaged is for ``verify`` to tell."""
-    for line in read_end(log):
+    last: dict[tuple[str, str], dict[str, Any]] = {}
+    for text in (text for log in (LOG, SCORES) for text in read_end(path / log)):
         with contextlib.suppress(ValueError, RecursionError):
-            if isinstance(value := json.loads(line), dict):
-                yield value
+            if isinstance(line := json.loads(text), dict) and line.get("scope", "all") == "all":
+                last[str(line.get("sub_goal")), str(line.get("member"))] = line
+    found: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
+    for (goal, _), line in last.items():
+        for name in RESULTS:
+            value: Any = line.get(name)
+            if type(value) in (int, float) and -LARGEST < value < LARGEST:
+                found[name][goal] = max(value, found[name].get(goal, value))
+    return {told: sum(found[name].values()) / len(found[name]) for name, told in RESULTS.items() if found[name]}
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
@@ -107,13 +95,11 @@ def lines(about: dict[str, Any]) -> list[str]:
     result = ", ".join(f"{name} {value:.4g}" for name, value in (about.get("result") or {}).items())
     text = [f"{about['path']}: {about['kind']}" + (f"; {result}" if result else "")]
     for key, value in about.items():
-        if key in ("path", "kind", "result") or value is None:
-            continue
-        if isinstance(value, dict):
+        if isinstance(value, dict) and key != "result":
             text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
         elif key == "inputs" and value:
             text += [f"{key}:", *(f"  {item['kind']} {item['path']}" for item in value)]
-        else:
+        elif key not in ("path", "kind", "result") and value is not None:
             text.append(f"{key}: {value}")
     return text
 

@@ -16,6 +16,7 @@ from dataclasses import fields
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
@@ -40,15 +41,10 @@ def _version(value: bool) -> None:
 
 @app.callback()
 def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show it and exit.")] = False,
+    debug: Annotated[bool, Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """Stages: collect, train-ensemble, train-options, train-meta, evaluate, report.
-
-    'run' chains them, 'sweep' runs them over seeds, layouts, ladders and methods.
-    """
+    """What stands before a command."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -87,14 +83,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _advice(error: Any) -> str:
     """What to do about words that a command does not take; settings are often taken for options."""
-    context, option = getattr(error, "ctx", None), getattr(error, "option_name", "")
+    context, key = getattr(error, "ctx", None), getattr(error, "option_name", "").lstrip("-").replace("-", "_")
     stage = getattr(context, "info_name", "")
     if not hasattr(error, "possibilities") or stage not in TABLES:
         return f"See '{context.command_path if context else 'hypogoal'} --help'."
-    key = option.lstrip("-").replace("-", "_")
     known = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
-    told = f"It is a setting: give --set {key}=VALUE" if known else "Settings are given as --set key=VALUE"
-    return f"{told}; 'hypogoal config {stage}' lists them."
+    return f"Settings are given as --set {key if known else 'key'}=VALUE; 'hypogoal config {stage}' lists them."
 
 
 def _told(error: BaseException) -> tuple[str, int]:

@@ -8,49 +8,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from hypogoal.cli.common import (
-    OWN,
-    Force,
-    Out,
-    Quiet,
-    Seed,
-    Set,
-    after_data,
-    command,
-    print_counts,
-    print_next,
-    seed_option,
-)
+from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import give, say
+
+PLAYED = "a domain, a Gymnasium environment's id, or module:object."
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
 
 
-@command(OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
+@cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
-    source: Annotated[
-        Path, typer.Argument(help="A .npz file, a folder of .npy files or of images, or a Minari dataset's folder.")
-    ],
-    out: Out,
-    sub_goal: Annotated[
-        list[str] | None,
-        typer.Option(metavar="<str>", help="A sub-goal's name, in the order of the labels' columns; repeatable."),
-    ] = None,
-    label: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=MODULE:FUNCTION", help="Of a Minari dataset: a sub-goal and who labels it."),
-    ] = None,
-    key: Annotated[str, typer.Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
-    heldout: Annotated[
-        float, typer.Option(min=0.01, max=0.9, help="Share of the labelled states held out, where none are given.")
-    ] = 0.2,
-    domain: Annotated[str, typer.Option(help="What the states are of, for train-options.")] = "imported",
-    seed: Seed = 0,
-    force: Force = False,
-    quiet: Quiet = False,
+    source: Annotated[Path, Argument(help="A .npz file, or a folder: of .npy files, of images, a Minari dataset's.")],
+    out: cli.Out,
+    sub_goal: Annotated[list[str] | None, Option(help="In the order of the labels' columns; repeatable.")] = None,
+    label: Annotated[list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Of Minari: who labels.")] = None,
+    key: Annotated[str, Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
+    heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
+    domain: Annotated[str, Option(help="What the states are of, for train-options.")] = "imported",
+    seed: cli.Seed = 0,
+    force: cli.Force = False,
+    quiet: cli.Quiet = False,
 ) -> None:
     """Make a data file of own arrays, images or Minari data."""
     from hypogoal.core import own_code
@@ -65,19 +47,19 @@ def import_(
             source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,
             force=force,
         )  # fmt: skip
-    print_counts(counts, quiet)
-    print_next(quiet, *after_data(out))
+    cli.print_counts(counts, quiet)
+    cli.print_next(quiet, "train-ensemble", out, "--out", Path("runs", out.stem, "ensemble"))
     give(out)
 
 
-@command(OWN, "export data/doorkey.h5 --out states.npz")
+@cli.command(cli.OWN, "export data/doorkey.h5 --out states.npz")
 def export(
-    source: Annotated[Path, typer.Argument(help="A data file, or the folder of a meta artefact.")],
-    out: Annotated[Path, typer.Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Of the agent, where it is one.")] = 20,
-    seed: Annotated[int, seed_option("Of the agent's draws of options.")] = 0,
-    force: Force = False,
-    quiet: Quiet = False,
+    source: Annotated[Path, Argument(help="A data file, or the folder of a meta artefact.")],
+    out: Annotated[Path, Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
+    episodes: Annotated[int, Option(min=1, help="Of the agent, where it is one.")] = 20,
+    seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Of the agent's draws of options.")] = 0,
+    force: cli.Force = False,
+    quiet: cli.Quiet = False,
 ) -> None:
     """Write states or an agent's episodes for other software.
 
@@ -96,25 +78,15 @@ def export(
     give(out)
 
 
-@command(OWN, "label doorkey --out marks/door-open")
+@cli.command(cli.OWN, "label doorkey --out marks/door-open")
 def label(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="States to look at: a data file, a .npz file or a folder of images. Or what to play: a domain, a "
-            "Gymnasium environment's id, or module:object."
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
-    layout_seed: Annotated[int, seed_option("The layout that is played first.")] = 0,
-    arg: Annotated[
-        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Of the environment, such as --arg start=2-6.")
-    ] = None,
-    heldout: Annotated[bool, typer.Option("--heldout", help="The states are for evaluation.")] = False,
-    fps: Annotated[
-        int, typer.Option(min=0, max=60, help="Play in real time, so many steps a second; 0: a step for each key.")
-    ] = 0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a folder that there is.")] = False,
+    source: Annotated[str, Argument(help=f"To look at: a data file, .npz file or folder of images; to play: {PLAYED}")],
+    out: Annotated[Path, Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
+    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played first.")] = 0,
+    arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Of the environment: start=2-6.")] = None,
+    heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
+    fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps a second; 0: a step for each key.")] = 0,
+    resume: Annotated[bool, Option("--resume", help="Go on with a folder that there is.")] = False,
 ) -> None:
     """Mark states by hand, in a window; 'import' takes them.
 
@@ -131,7 +103,7 @@ def label(
         )  # fmt: skip
     say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
     if all(counts.values()):
-        print_next(False, "import", out, "--out", out.with_suffix(".h5"))
+        cli.print_next(False, "import", out, "--out", out.with_suffix(".h5"))
     give(out)
 
 
@@ -149,14 +121,14 @@ def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-@command(OWN, "check mine:DOMAIN")
+@cli.command(cli.OWN, "check mine:DOMAIN")
 def check(
-    domain: Annotated[str | None, typer.Argument(help="A domain: a name or module:object.")] = None,
-    diversity: Annotated[str | None, typer.Option(help="A diversity objective: a name or module:function.")] = None,
-    network: Annotated[str | None, typer.Option(help="A member network: a name or module:function.")] = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    layout_seed: Annotated[int, seed_option("The layout that is played.")] = 0,
+    domain: Annotated[str | None, Argument(help=cli.DOMAINS, autocompletion=cli.offer("domain"))] = None,
+    diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
+    network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
+    set_: cli.Set = None,
+    seed: cli.Seed = 0,
+    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
 ) -> None:
     """Does an own domain, objective or network keep its contract?
 

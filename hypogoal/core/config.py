@@ -36,12 +36,10 @@ def setting(
     choices: Iterable[Any] | None = None,
     low: float | None = None,
     high: float | None = None,
-    often: bool = False,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values; ``often``: people change it most."""
+    """A dataclass field with its unit, meaning, source and allowed values."""
     allowed = {"choices": None if choices is None else tuple(choices), "low": low, "high": high}
-    about = {"meaning": meaning, "unit": unit, "source": source, "often": often, **allowed}
-    return dataclasses.field(default=default, metadata=about)
+    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
@@ -162,9 +160,9 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
             if field.name in values:
                 default, about["source"] = values[field.name], source
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
-        rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source", "often")})
+        rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source")})
         home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))
-        rows[-1] |= {"allowed": _allowed(about), "part": (home.__doc__ or "").partition("\n")[0]}
+        rows[-1] |= {"allowed": _allowed(about), "part": (home.__doc__ or "").partition(".")[0]}
     return rows
 
 

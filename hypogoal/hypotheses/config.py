@@ -11,23 +11,15 @@ BEYOND = "own: beyond the paper"
 
 @dataclass(frozen=True)
 class EnsembleConfig:
-    """What the members are, and how they learn.
+    """What the members are, and how they learn. Spec C6: the defaults are DoorKey's values (Table 3)."""
 
-    Spec C6: DoorKey's values (Table 3) are the defaults; Montezuma's are those of Table 1.
-    """
-
-    members: int = setting(
-        3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64, often=True
-    )
+    members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(
         "dbat",
         "diversity objective: dbat, none, another of docs/concepts.md, or module:function",
         source="Eq. (1)",
-        often=True,
     )
-    diversity_weight: float = setting(
-        1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0, often=True
-    )
+    diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     schedule: str = setting(
         "simultaneous",
         "members at once (the double sum of Eq. (1)), or one after the other against those before it",
@@ -38,7 +30,6 @@ class EnsembleConfig:
         "doorkey",
         "member network: doorkey, montezuma, montezuma-crop, tiles, or module:function",
         source="the paper's appendix",
-        often=True,
     )
     encoder: str = setting(
         "separate",
@@ -56,7 +47,6 @@ class EnsembleConfig:
         source="own choice, the paper says none: docs/results/hypotheses-doorkey.md",
         low=1,
         high=10_000_000,
-        often=True,
     )
     learning_rate: float = setting(2e-4, "Adam's learning rate", source="Table 3", low=0.0, high=1.0)
     l2_weight: float = setting(1e-4, "L2 regularisation, Adam's weight decay", source="Table 3", low=0.0, high=1.0)

@@ -61,7 +61,7 @@ class PlayConfig(OptionConfig):
         low=0.0,
         high=1.0,
     )
-    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0, often=True)
+    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     max_episode_steps: int = setting(
         500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
     )
@@ -81,7 +81,6 @@ class PlayConfig(OptionConfig):
         "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
         "hardly ever gets there; dwell:N, N yes on end; or oracle, the true sub-goals (upper bound)",
         source="paper: learned; the others ours",
-        often=True,
     )
     save_visited: int = setting(
         0,
@@ -97,12 +96,7 @@ class TrainOptionsConfig(PlayConfig):
     """How the options are learned, and for how long."""
 
     steps: int = setting(
-        60_000,
-        "environment steps, all environments together",
-        unit="steps",
-        source="paper: 3e5 for each option",
-        low=1,
-        often=True,
+        60_000, "environment steps, all environments together", unit="steps", source="paper: 3e5 for each option", low=1
     )
     steps_for: str = setting(
         "all",
@@ -130,14 +124,13 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
     """How options are learned and chosen, and for how long."""
 
     steps: int = setting(
-        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1, often=True
+        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
     chooser: str = setting(
         "ppo",
         "the meta-policy, uniform choice among those offered, or a bandit that sees no state (thompson, exp3)",
         source="ours: controls; Thompson 1933; Auer et al. 2002",
         choices=("ppo", "random", "thompson", "exp3"),
-        often=True,
     )
 
 
@@ -148,7 +141,7 @@ class AuditConfig(TrainOptionsConfig):
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
     mask_reached: bool = setting(False, "do not begin executions where the classifier says yes already")
-    steps: int = setting(80_000, "environment steps, those of all policies together", unit="steps", low=1, often=True)
+    steps: int = setting(80_000, "environment steps, those of all policies together", unit="steps", low=1)
     chooser: str = setting("even", "the policy with the fewest steps so far plays, or any", choices=("random", "even"))
     threshold: float = setting(
         0.0,
@@ -157,9 +150,5 @@ class AuditConfig(TrainOptionsConfig):
         high=1.0,
     )
     mend: float = setting(
-        0.95,
-        "a second policy is learned against yes above this higher probability; 0: none",
-        low=0.0,
-        high=1.0,
-        often=True,
+        0.95, "a second policy is learned against yes above this higher probability; 0: none", low=0.0, high=1.0
     )

@@ -17,7 +17,6 @@ class OptionConfig:
         "what follows on each action",
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
-        often=True,
     )
     experience: str = setting(
         "shared",

@@ -79,11 +79,11 @@ def hyperparameters(agent: str, name: str) -> PPOSettings | DQNSettings:
 class BaselineConfig:
     """Which agent, on which layout, for how long; the hyperparameters are those above."""
 
-    agent: str = setting("ppo", "the algorithm", source="paper, Figure 6", choices=("ppo", "dqn"), often=True)
+    agent: str = setting("ppo", "the algorithm", source="paper, Figure 6", choices=("ppo", "dqn"))
     steps: int = setting(
-        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1, often=True
+        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
-    layout_seed: int = setting(100, "the layout to learn on", source="paper, Figure 6", low=0, often=True)
+    layout_seed: int = setting(100, "the layout to learn on", source="paper, Figure 6", low=0)
     environments: int = setting(0, "environments stepped together; 0 for the setting's own", low=0, high=4096)
     max_episode_steps: int = setting(
         500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
@@ -95,5 +95,4 @@ class BaselineConfig:
         "hyperparameters: the paper's tables, or tuned ones",
         source="paper, Figure 6",
         choices=("paper", "tuned"),
-        often=True,
     )
