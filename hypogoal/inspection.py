@@ -26,7 +26,6 @@ from hypogoal.domains.base import installed_domain
 # Numbers of logs, in the order in which they are told: what they are called.
 RESULTS = {"balanced_accuracy": "best member's balanced accuracy", "labelled": "labelled loss"}
 RESULTS |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
-LARGEST = 1e300  # of a number that is told
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
 
@@ -49,10 +48,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
 
 
 def result_of(path: Path) -> dict[str, float]:
-    """What an artefact's training came to: its logs' last numbers, means over sub-goals.
-
-    Of scores the best member's. Empty without a log; what is damaged in one is for ``verify`` to tell.
-    """
+    """The last numbers of an artefact's logs, if any: means over sub-goals, of scores the best member's."""
     last: dict[tuple[str, str], dict[str, Any]] = {}
     for text in (text for log in (LOG, SCORES) for text in read_end(path / log)):
         with contextlib.suppress(ValueError, RecursionError):
@@ -62,7 +58,7 @@ def result_of(path: Path) -> dict[str, float]:
     for (goal, _), line in last.items():
         for name in RESULTS:
             value: Any = line.get(name)
-            if type(value) in (int, float) and -LARGEST < value < LARGEST:
+            if type(value) in (int, float) and abs(value) < 1e300:
                 found[name][goal] = max(value, found[name].get(goal, value))
     return {told: sum(found[name].values()) / len(found[name]) for name, told in RESULTS.items() if found[name]}
 

@@ -13,9 +13,7 @@ ENTRIES = (
     "With commas between: dbat, none, another objective (docs/concepts.md) or module:function, each also with a weight "
     "(dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
 )
-benchmark = typer.Typer(
-    cls=cli.Commands, help="Score diversity objectives where the answer is known.", no_args_is_help=True
-)
+benchmark = typer.Typer(cls=cli.Commands, no_args_is_help=True)
 cli.app.add_typer(benchmark, name="benchmark", rich_help_panel=cli.MANY)
 
 
@@ -24,11 +22,7 @@ def _group() -> None:
     """Score diversity objectives where the answer is known."""
 
 
-@benchmark.command(
-    "which-feature",
-    rich_help_panel=cli.MANY,
-    epilog="Example: [bold]hypogoal benchmark which-feature --out runs/wf[/bold]",
-)
+@cli.command(cli.MANY, "benchmark which-feature --out runs/which", "which-feature", benchmark)
 def which_feature(
     out: Annotated[Path, Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
     diversity: Annotated[str, Option(help=ENTRIES)] = "dbat,none,oracle",
@@ -41,7 +35,7 @@ def which_feature(
     set_: cli.Set = None,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Which features do members find, of several that fit the labels equally well?
+    """Which features do members find, of several that fit?
 
     Small scenes have planted features (--factors): colour, shape and place of
     an object, and how many boxes there are. In the labelled ones all say the

@@ -55,7 +55,7 @@ class Commands(TyperGroup):
 
 
 def _short_types(options: Any) -> Any:
-    """Options with short types for ``--help``: none for a switch, ``<int>`` where there is a range or a list."""
+    """Options with short types for ``--help``: none of a switch, ``<int>`` of a range or a list."""
     for option in options:
         if getattr(option, "is_flag", False):
             option.metavar = ""
@@ -76,9 +76,9 @@ app = typer.Typer(
 )
 
 
-def command(panel: str, example: str, name: str | None = None) -> Any:
+def command(panel: str, example: str, name: str | None = None, of: typer.Typer = app) -> Any:
     """Makes a function a command of a group, whose ``--help`` ends with an example."""
-    return app.command(name, rich_help_panel=panel, epilog=f"Example: [bold]hypogoal {example}[/bold]")
+    return of.command(name, rich_help_panel=panel, epilog=f"Example: [bold]hypogoal {example}[/bold]")
 
 
 def offer(kind: str) -> Any:
@@ -154,10 +154,7 @@ class Given:
 
 
 def stage(panel: str, name: str, example: str) -> Callable[[Callable[..., None]], None]:
-    """Makes a function a command that trains or collects: it gets a :class:`Given` of what all have, then its own.
-
-    The settings that people change most are options too, see :func:`hypogoal.settings.options_of`.
-    """
+    """Makes a function a command that trains or collects: it gets a :class:`Given` of what all have, then its own."""
     signature = inspect.signature(_shared)
     shared = [one for one in signature.parameters.values() if name != "collect" or one.name != "device"]
     panel_of_settings = f"Settings, with doorkey's defaults (all: hypogoal config {name})"

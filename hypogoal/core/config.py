@@ -148,10 +148,7 @@ def as_dict(config: Any) -> dict[str, Any]:
 
 
 def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
-    """Every setting with default, type, unit, meaning, source, allowed values, and what it is a part of.
-
-    ``instead`` are what has values other than the class's (a domain, a preset), each with its name, the last first.
-    """
+    """Every setting with default (of the last of ``instead``, values and source, that has one), meaning and so on."""
     kinds = typing.get_type_hints(config_class)
     rows = []
     for field in dataclasses.fields(config_class):
