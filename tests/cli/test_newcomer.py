@@ -141,7 +141,7 @@ def test_config_says_where_a_value_is_from(capsys: pytest.CaptureFixture[str]) -
     )
     assert rows("train-meta", "--domain", "which-feature")["steps"]["source"] == "which-feature's own"
     demo = rows("train-meta", "--preset", "demo")["steps"]
-    assert (demo["default"], demo["source"]) == (160_000, "preset demo")
+    assert (demo["default"], demo["source"]) == (50_000, "preset demo")
 
 
 def test_config_loads_no_domain_where_it_needs_none() -> None:
