@@ -27,7 +27,8 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
         sub_goal: for example ``open-red-door``.
 
     Returns:
-        An ensemble; ``ensemble.predict(observations)`` gives float32 (N, K) from uint8 (N, *obs_shape).
+        An ensemble; ``ensemble.predict(observations)`` gives float32 (N, K) from (N, *obs_shape), uint8 or
+        float32 as it was trained.
 
     Raises:
         UserError: not an ensemble artefact, or no such sub-goal.
@@ -74,8 +75,8 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
             own.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
     initiation = None
     if INITIATION in artefact.manifest["files"]:
-        learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
-        initiation = Narrowed(learned, shape, len(goals) * members, config["initiation_threshold"])
+        learned = load_tensors(artefact.path / INITIATION)
+        initiation = Narrowed(learned, source.config, len(goals) * members, config["initiation_threshold"])
     masked = config["mask_reached"]
     if not isinstance(masked, bool):
         raise UserError("the manifest's setting 'mask_reached' is malformed", artefact.path / MANIFEST, AGAIN)

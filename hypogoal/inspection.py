@@ -20,7 +20,7 @@ from hypogoal.core.files import read_json, read_text
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
 from hypogoal.core.tensors import load_tensors
-from hypogoal.dataset import SPLITS, open_dataset
+from hypogoal.dataset import PICTURE, SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
@@ -37,6 +37,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
+        about |= {"observation_dtype": str(dataset.observation_dtype)}
         return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
     artefact = open_artefact(path)
     keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
@@ -94,8 +95,9 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     if not path.is_file():
         raise UserError("contact sheets are of data files", path, "Give the .h5 file that 'hypogoal collect' wrote.")
     dataset = open_dataset(path)
-    if len(dataset.observation_shape) != 3:
-        raise UserError("the states are no pictures", f"observation shape {dataset.observation_shape}")
+    if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
+        given = f"{dataset.observation_dtype} {dataset.observation_shape}"
+        raise UserError("the states are no pictures", given, f"Read them with 'hypogoal export {path} --out X.npz'.")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []

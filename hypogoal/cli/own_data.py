@@ -168,17 +168,17 @@ def _verdicts(
     from hypogoal.core.config import resolve
     from hypogoal.testing import check_domain, check_network, check_objective
 
-    shape: tuple[int, ...] = (64, 64, 3)
+    seen: tuple[Any, ...] = ()
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
         found = load_domain(domain, given=True)
         config: object = resolve(found.config_class, stage="collect", assignments=assignments)
         yield from check_domain(found, config, layout_seed=layout_seed, seed=seed)
-        shape = tuple(found.observation_shape)
+        seen = tuple(found.observation_shape), found.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective
 
         yield from check_objective(load_objective(diversity))
     if network is not None:
-        yield from check_network(network, shape)
+        yield from check_network(network, *seen)

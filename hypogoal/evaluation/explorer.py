@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import settings_of, variants
 from hypogoal.evaluation.page import Block, Entry, Material, Question
@@ -31,7 +32,7 @@ TITLE = "Explore the hypotheses"
 
 def look(work: Work, judgement: Judgement) -> None:
     """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
-    if judgement.number != work.browsed:
+    if judgement.number != work.browsed or judgement.split.observations.dtype != PICTURE:
         return
     from hypogoal.evaluation.deep_lift import deep_lift
 
@@ -84,6 +85,12 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
         here = groups == group
         turn[here] = np.arange(here.sum())
     return order[np.argsort(turn, kind="stable")]
+
+
+def sections(material: Material) -> list[Block]:
+    """The browser; nothing where there are states, but no pictures of them."""
+    found = material.metrics.get("explorer")
+    return [explorer_section(material)] if found is None or found["sub_goals"] else []
 
 
 def explorer_section(material: Material) -> Block:
@@ -231,5 +238,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=lambda material: [explorer_section(material)],
+    sections=sections,
 )

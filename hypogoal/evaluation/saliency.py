@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +13,12 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hypogoal.core.hdf5 import fixed
+from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
-from hypogoal.evaluation.plots import BLUE, VERMILLION, grid_of_pictures, show_picture, styled
+from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
@@ -31,9 +34,11 @@ EXAMPLES = {
     "right yes": "all right",
     "right no": "all right",
 }
-NEEDED = "an ensemble artefact with a member that calls a held-out state reached: train-ensemble"
+NEEDED = "an ensemble artefact on pictures with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
 EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
+MOST_AVERAGED = 256  # states over which attributions to features are averaged
+MOST_BARS = 15  # features
 KEY = 0.75  # inches below all pictures
 
 
@@ -41,10 +46,13 @@ def look(work: Work, judgement: Judgement) -> None:
     """Example states and attributions of the ensemble that is shown; from unseen rooms where positives are in them.
 
     ``examples/<sub-goal>`` and ``saliency/<sub-goal>`` are written: the states, and of the latter ``attributions``
-    float32 (n, K, h, w, C), in log-odds, to what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``.
+    float32 (n, K, h, w, C), in log-odds, to what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``. Where
+    they are no pictures, also what each feature's attribution is on average: see :func:`of_features`.
     """
     if judgement.number != work.shown:
         return
+    if judgement.split.observations.dtype != PICTURE:
+        of_features(work, judgement)
     split, sub_goal, judged = judgement.split, judgement.case.sub_goal, judgement.judged
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
@@ -66,6 +74,18 @@ def look(work: Work, judgement: Judgement) -> None:
         group["seen"], group["baseline"] = seen, baseline
         states = explanation(found, explained)
     work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
+
+
+def of_features(work: Work, judgement: Judgement) -> None:
+    """``features/<sub-goal>/{attributions,names}``: absolute ones on average over held-out states, (K, numbers)."""
+    from hypogoal.evaluation.deep_lift import deep_lift
+
+    count = len(judgement.split.labels)
+    ensemble, seen, baseline = judgement.see(np.linspace(0, count - 1, min(count, MOST_AVERAGED)).astype(np.int64))
+    group = work.arrays.create_group(f"features/{judgement.case.sub_goal}")
+    values = np.abs(deep_lift(ensemble, seen, baseline).values).mean(0)
+    group["attributions"] = values.reshape(len(ensemble), -1)
+    group["names"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
 
 
 def pick_examples(
@@ -116,8 +136,9 @@ def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], kind: str) -> l
 
 
 def sections(material: Material) -> list[Block]:
-    """States with each member's verdict, and what members look at."""
-    return [examples_section(material), saliency_section(material)]
+    """States with each member's verdict, and what members look at; of no pictures the latter."""
+    examples = [] if material.within("features") else [examples_section(material)]
+    return [*examples, saliency_section(material)]
 
 
 def examples_section(material: Material) -> Block:
@@ -166,6 +187,7 @@ def saliency_section(material: Material) -> Block:
     if found is None:
         lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
         return page.section("saliency", title, [], [], lacking)
+    bars = [page.shown(material, drawn) for drawn in feature_figures(material)]
     states = [state for goal in found["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
     text = (
@@ -175,15 +197,21 @@ def saliency_section(material: Material) -> Block:
         "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
         "that goes by what will not be there elsewhere cannot transfer."
     )
+    if bars:
+        text = (
+            f"DeepLift attributions of each member of {found['ensemble']} (seed {found['seed']}) to the features of "
+            f"held-out states, against {found['baseline']}. A member that goes by what means something else elsewhere "
+            "cannot transfer."
+        )
     check = (
         f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
         f"{max(errors, default=0.0):.0e} (log-odds)."
     )
     blocks = [
         _cards(material, goal["sub_goal"], index, state)
-        for goal in found["sub_goals"]
+        for goal in ([] if bars else found["sub_goals"])
         for index, state in enumerate(goal["states"])
-    ]
+    ] + bars
     missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
     return page.section("saliency", title, [text, check if errors else ""], blocks, missing)
 
@@ -206,8 +234,34 @@ def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block
     return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
 
 
+def feature_figures(material: Material) -> Iterator[Drawn]:
+    """Of observations that are no pictures: which features each member goes by, a plot for each sub-goal."""
+    for goal in dict.fromkeys(name.split("/")[0] for name in material.within("features")):
+        arrays = material.within(f"features/{goal}")
+        caption = f"Mean absolute attribution (DeepLift) on held-out states of {goal}, the {MOST_BARS} largest at most."
+        plot = bars_of_features(arrays["attributions"], page.texts(arrays["names"]))
+        yield Drawn(f"features-{goal}", f"What members go by: {goal}", plot, caption, heading=goal)
+
+
+def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:
+    """Bars side by side, those of features that members (K, numbers) go by most."""
+    order = np.argsort(-values.mean(0), kind="stable")[:MOST_BARS]
+    high, places = 0.8 / len(values), np.arange(len(order))
+    with drawing(0.7 + 0.35 * len(order), 4) as (figure, axes):
+        for member, of_member in enumerate(values):
+            colour = PALETTE[member % len(PALETTE)]
+            axes.barh(places + high * member, of_member[order], high, color=colour, label=f"member {member}")
+        axes.set_yticks(places + (0.8 - high) / 2, [names[feature] for feature in order])
+        axes.invert_yaxis()
+        axes.set_xlabel("mean absolute attribution, log-odds")
+    return figure
+
+
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 2 and 9: of each sub-goal the first state that is explained, a true positive where there is one."""
+    if material.within("features"):
+        yield from feature_figures(material)
+        return
     found = material.metrics["saliency"]
     goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
     for goal in goals:

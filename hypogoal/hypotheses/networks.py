@@ -1,8 +1,8 @@
 """Spec C5: member networks, chosen by name.
 
-Each is a plain ``nn.Sequential`` of modules used once, from float (N, C, H, W) in 0..1 to logits (N, 2),
-column 1 being "sub-goal reached". DeepLift attributes rightly only through such modules, and only with each
-ReLU before its MaxPool. :func:`reordered` gives the same function in the order that is faster to train.
+Each is a plain ``nn.Sequential`` of modules used once, from float (N, C, H, W) in 0..1, or what else :func:`as_input`
+gives, to logits (N, 2), column 1 being "sub-goal reached". DeepLift attributes rightly only through such modules, and
+only with each ReLU before its MaxPool. :func:`reordered` gives the same function in the order that is faster to train.
 
 The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors'
 public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of
@@ -14,8 +14,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
@@ -23,8 +24,10 @@ from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
+from hypogoal.dataset import NUMBERS, PICTURE
 
 CLASSES = 2
+AUTO = "auto"  # the network that suits the observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_PIXELS = 1024  # of a side, up to which it is looked for how large an image must be
 ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
@@ -70,13 +73,24 @@ def tiles(channels: int) -> Parts:
     return [*_convolution(channels, 16, 8, 8), *_convolution(16, 16, 3, 1)], (64,)
 
 
+def mlp(channels: int) -> Parts:
+    """Two hidden dense layers, for observations of any shape."""
+    return [], (256, 256)
+
+
 NETWORKS: dict[str, Callable[[int], Parts]] = {
     "doorkey": doorkey,
     "montezuma": montezuma,
     "montezuma-crop": montezuma_crop,
     "tiles": tiles,
+    "mlp": mlp,
 }
-"""By name: number of channels -> convolutional part, and the widths of the hidden dense layers behind it."""
+"""By name: number of channels, the last axis -> convolutional part, and widths of the hidden dense layers behind it."""
+
+
+def network_for(name: str, dtype: np.dtype[Any]) -> str:
+    """``auto`` by what observations are; any other name as it is."""
+    return {PICTURE: "doorkey", NUMBERS: "mlp"}[dtype] if name == AUTO else name
 
 
 def load_network(name: str) -> Callable[[int], Parts]:
@@ -109,24 +123,25 @@ def _checked(name: str, parts_of: Callable[[int], Parts]) -> Callable[[int], Par
 
 
 def build_network(name: str, observation_shape: tuple[int, ...], generator: torch.Generator) -> nn.Sequential:
-    """A member network, float (N, C, H, W) -> logits (N, 2), on the CPU, for observations of shape (H, W, C).
+    """A member network, what :func:`as_input` gives -> logits (N, 2), on the CPU, for observations of this shape.
 
     ``generator`` draws the initial weights (PyTorch's default distributions). An unknown network (see
-    :func:`load_network`), BatchNorm hidden in another of its layers, or observations that are no images or too small
-    for it are a ``UserError``.
+    :func:`load_network`), BatchNorm hidden in another of its layers, or observations that it does not take, images too
+    small for it, say, are a ``UserError``.
     """
     parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
-    if len(observation_shape) != 3 or min(observation_shape) < 1:
-        raise UserError("member networks need images (H, W, C)", where, "Collect image observations.")
-    height, width, channels = observation_shape
+    example, channels = as_input(torch.zeros(1, *observation_shape)), observation_shape[-1]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
         torch.manual_seed(seed)
         layers, hidden = parts_of(channels)
         if any(isinstance(part, _BatchNorm) for layer in layers for part in layer.modules() if part is not layer):
             raise UserError("BatchNorm inside another layer", name, "Make it a layer of its own.")
-        features = _features(layers, channels, height, width)
+        features = _features(layers, example)
+        if features is None and len(observation_shape) != 3:
+            do = "Give --set network=mlp, or a network of your own (--set network=module:function)."
+            raise UserError(f"the network {name!r} takes images (H, W, C)", where, do)
         if features is None:
             side = smallest_side(layers, channels)
             if side is None:
@@ -143,23 +158,27 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
     return nn.Sequential(*layers).train()
 
 
-def _features(layers: list[nn.Module], channels: int, height: int, width: int) -> Tensor | None:
-    """What a convolutional part makes of an image; None where the image is too small for it."""
+def _features(layers: list[nn.Module], example: Tensor) -> Tensor | None:
+    """What a convolutional part makes of an input (1, ...); None where it does not take that."""
     try:
         with torch.no_grad():
-            return nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
-    except RuntimeError:
+            return nn.Sequential(*layers).eval()(example)
+    except (RuntimeError, ValueError):
         return None
 
 
 def smallest_side(layers: list[nn.Module], channels: int) -> int | None:
     """The side, in pixels, of the smallest square image that a convolutional part takes; None where it takes none."""
+
+    def fits(side: int) -> bool:
+        return _features(layers, torch.zeros(1, channels, side, side)) is not None
+
     takes = 1
-    while _features(layers, channels, takes, takes) is None:
+    while not fits(takes):
         takes *= 2
         if takes > MOST_PIXELS:
             return None
-    return bisect_left(range(takes), True, lo=1, key=lambda side: _features(layers, channels, side, side) is not None)
+    return bisect_left(range(takes), True, lo=1, key=fits)
 
 
 def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
@@ -167,7 +186,7 @@ def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
     height, width, channels = observation_shape
     ways = ["give larger ones"]
     for name, parts_of in NETWORKS.items():
-        if _features(parts_of(channels)[0], channels, height, width) is not None:
+        if _features(parts_of(channels)[0], torch.zeros(1, channels, height, width)) is not None:
             ways.append(f"--set network={name}")
     own = "a network of your own (--set network=module:function)"
     return f"It takes {side}x{side} pixels: {', '.join(ways)}, or {own}."
@@ -199,5 +218,9 @@ def folded(network: nn.Sequential) -> nn.Sequential:
 
 
 def as_input(observations: Tensor) -> Tensor:
-    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the memory order (channels last) it came in."""
-    return observations.permute(0, 3, 1, 2).to(torch.float32).div_(255.0)
+    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the memory order (channels last) it came in.
+
+    What is no picture stays as it is, but that of (N, H, W, C) the last axis comes first, too.
+    """
+    ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
+    return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered

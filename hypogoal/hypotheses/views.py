@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, Standard, standard_of, standardised
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, Pixels, RamLocaliser, fit_localiser
 
@@ -18,29 +21,55 @@ CHUNK = 1024  # states at once: so many crops are gathered from whole images at 
 
 
 class FullView(nn.Module):
-    """All of an observation, as it is: the paper's view."""
+    """All of a picture, as it is: the paper's view."""
 
-    needs_positions = False
+    needs_positions, dtype = False, PICTURE
 
     def __init__(self, observation_shape: tuple[int, ...]):
         super().__init__()
         self.shape = observation_shape
 
     def see(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
+        self, observations: Any, positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> NDArray[np.uint8]:
         """The observations."""
         assert not margin, "all of it has nothing around it"
         return observations
 
 
+class StandardView(nn.Module):
+    """All of an observation that is no picture: each number's deviations from its mean in the training data."""
+
+    needs_positions, dtype = False, NUMBERS
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, observation_shape: tuple[int, ...], *training: Observations):
+        super().__init__()
+        self.shape = observation_shape
+        for name, values in zip(("mean", "deviation"), standard_of(observation_shape, *training), strict=True):
+            self.register_buffer(name, torch.from_numpy(values))
+
+    def standard(self) -> Standard:
+        """Mean and deviation, (*shape)."""
+        return self.mean.cpu().numpy(), self.deviation.cpu().numpy()
+
+    def see(
+        self, observations: Observations, positions: NDArray[np.int64] | None = None, *, margin: int = 0
+    ) -> NDArray[np.float32]:
+        """float32 (N, *shape) of as many."""
+        return standardised(observations, self.standard())
+
+
 class AgentView(nn.Module):
     """A window around the agent, whom the localiser finds; what is outside the image is 0.
 
     The same window for every frame of a stack, around where the agent is in the last. Its ``shape`` is (height, width,
-    C), in pixels, of observations (H, W, C). ``needs_positions`` says whether the localiser reads positions, which no
+    C), in pixels, of pictures (H, W, C). ``needs_positions`` says whether the localiser reads positions, which no
     policy may see: an oracle.
     """
+
+    dtype = PICTURE
 
     def __init__(self, observation_shape: tuple[int, ...], height: int, width: int, localiser: Localiser):
         super().__init__()
@@ -49,7 +78,7 @@ class AgentView(nn.Module):
         self.needs_positions = localiser.needs_positions
 
     def see(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
+        self, observations: Any, positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> NDArray[np.uint8]:
         """Windows uint8 (N, height, width, C) of uint8 (N, H, W, C), with ``margin`` pixels more on every side.
 
@@ -102,9 +131,12 @@ def needed(origins: Origins | None, names: tuple[str, ...], why: str) -> Origins
     return origins
 
 
+View = FullView | StandardView | AgentView
+
+
 def view_of(
-    observations: NDArray[np.uint8],
-    unlabelled: NDArray[np.uint8],
+    observations: Any,
+    unlabelled: Any,
     config: EnsembleConfig,
     seed: int,
     origins: Origins | None,
@@ -112,9 +144,16 @@ def view_of(
     agent_pixels: Pixels | None,
     *,
     fitted: bool,
-) -> FullView | AgentView:
-    """What the members are to see; a localiser that learns is trained here, or where not ``fitted`` to be loaded."""
+) -> View:
+    """What the members are to see; what learns of it is trained here, or where not ``fitted`` to be loaded."""
     shape = observations.shape[1:]
+    if observations.dtype == NUMBERS:
+        for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
+            if (given := getattr(config, name)) != value:
+                raise UserError(
+                    "that is for pictures, and these observations are none", f"{name}={given}", f"Set {name}={value}."
+                )
+        return StandardView(shape, *((observations, unlabelled) if fitted else ()))
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")

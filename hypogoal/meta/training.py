@@ -17,8 +17,10 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
+from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.hypotheses.views import StandardView
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.bandits import BANDITS
@@ -47,11 +49,13 @@ def assemble(
     seed: int,
     device: str = "cpu",
     ends: Callable[[Engine], Terminations] | None = None,
+    standard: Standard | None = None,
 ) -> OptionLoop:
     """The environments of one layout, an ensemble's options in them, fresh policies of these and over these.
 
     ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, start states; ``ends`` gives terminations that are no ensemble's. Where the domain has no such start, or
+    several, start states; ``ends`` gives terminations that are no ensemble's, and
+    ``standard`` what goes with them. Where the domain has no such start, or
     not the true sub-goals at which options are to end, it is a ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
@@ -63,6 +67,14 @@ def assemble(
         if (shortest := engine.shortest_path()) is None:
             raise UserError("nobody knows this layout's shortest path", f"cap={config.cap:g}", "Give cap=0.")
         engine.max_steps = math.ceil(config.cap * shortest)
+    if engine.observation_dtype != PICTURE:
+        for name in ("network", "meta_network"):
+            if getattr(config, name, "") == "paper":
+                raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
+        view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
+        engine.standard = (
+            view.standard() if isinstance(view, StandardView) else standard or standard_of(engine.observation_shape)
+        )
     if ends:
         terminations = ends(engine)
     elif oracle:

@@ -1,6 +1,7 @@
 """Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,10 +10,12 @@ from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import DEVIATIONS, NUMBERS, Standard, standard_of
 from hypogoal.domains.base import Engine
 from hypogoal.options.windows import AgentWindows
 
 CELL = 8  # pixels
+WIDTH = 128  # of dense layers
 SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
 
@@ -76,8 +79,38 @@ class PictureEmbedding(nn.Module):
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
-def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | PictureEmbedding:
-    """Cells where whole ones fill the image, else convolutions over it; a ``UserError`` where it is too small."""
+class NumberEmbedding(nn.Module):
+    """Observations that are no pictures: each number's deviations from a mean, see ``dataset.standardised``."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, standard: Standard):
+        super().__init__()
+        for name, values in zip(("mean", "deviation"), standard, strict=True):
+            self.register_buffer(name, torch.from_numpy(values.copy()))
+        self.features = self.mean.numel()
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """float32 (N, *shape) -> float32 (N, features)."""
+        return ((observations - self.mean) / self.deviation).clamp(-DEVIATIONS, DEVIATIONS).flatten(1)
+
+
+def blank_standard(about: Mapping[str, Any]) -> Standard | None:
+    """Of an ensemble manifest's configuration, a standard to load another into; None where it sees pictures."""
+    shape = tuple(about["observation_shape"])
+    return standard_of(shape) if about.get("observation_dtype") == str(NUMBERS) else None
+
+
+Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding
+
+
+def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None) -> Embedding:
+    """By what is seen: numbers where there is a ``standard`` of them; else of a picture cells where whole ones fill it,
+    or convolutions over it; a ``UserError`` where it is too small.
+    """
+    if standard is not None:
+        return NumberEmbedding(standard)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:
@@ -87,15 +120,15 @@ def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | Picture
 
 
 class LightNetwork(nn.Module):
-    """An embedding of images and two dense layers; where the images are made of cells, it takes tile codes as well."""
+    """An embedding of what is seen and two dense layers; where that is made of cells, it takes tile codes as well."""
 
-    def __init__(self, cells: CellEmbedding | PictureEmbedding, width: int = 128):
+    def __init__(self, cells: Embedding, width: int = WIDTH):
         super().__init__()
         self.cells = cells
         self.trunk = nn.Sequential(nn.Linear(cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
 
     def forward(self, images: Tensor) -> Tensor:
-        """What :meth:`head` gives for uint8 (N, H, W, C); see also :class:`Pixels`."""
+        """What :meth:`head` gives for observations (N, *obs); see also :class:`Pixels`."""
         return self.head(self.trunk(self.cells(images)))
 
     def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
@@ -111,8 +144,15 @@ class LightNetwork(nn.Module):
 class LightQNetwork(LightNetwork):
     """One trunk and a head per member (Spec D8): values float32 (N, members, actions) of every member's policy."""
 
-    def __init__(self, observation_shape: tuple[int, ...], members: int, actions: int, width: int = 128):
-        super().__init__(embedding_for(observation_shape), width)
+    def __init__(
+        self,
+        observation_shape: tuple[int, ...],
+        members: int,
+        actions: int,
+        width: int = WIDTH,
+        standard: Standard | None = None,
+    ):
+        super().__init__(embedding_for(observation_shape, standard), width)
         self.members, self.actions = members, actions
         self.heads = nn.Linear(width, members * actions)
 
@@ -187,7 +227,7 @@ class Pixels:
 
     def __init__(self, engine: Pictures, most: int, device: torch.device):
         self.engine, self.device = engine, device
-        self._images = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
+        self._images: NDArray[np.uint8] = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
         self._pixels = torch.zeros(self._images.shape) if device.type == "cpu" else None
 
     def of(self, ids: NDArray[np.int64]) -> Tensor:

@@ -11,14 +11,15 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below, load_fitting
+from hypogoal.dataset import Observations, Standard
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.options.exploration import actions_of
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork, blank_standard
 from hypogoal.options.windows import SIDE, around_agent, localiser_of
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
-Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
+Policies = Callable[[int], Callable[[Observations], int]]
 
 
 def make_policies(
@@ -36,7 +37,7 @@ def make_policies(
     if config["network"] == "planned":
         what = "planned options go by what follows in their domain's engine, which is not in the artefact"
         raise UserError(what, "network=planned", "Load options that were learned.")
-    shape = tuple(about["observation_shape"])
+    shape, standard = tuple(about["observation_shape"]), blank_standard(about)
     options = len(config["sub_goals"]) * config["members"]
     last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"
     outputs = len(weights[last]) // (options if config["network"] == "light" else 1) if last in weights else 0
@@ -46,7 +47,7 @@ def make_policies(
     if config["network"] != "light":
         return PaperPolicies(weights, shape, options, actions)
     around = localiser_of(ensemble) if ensemble and config.get("policy_view", "full") == "agent-crop" else None
-    return LightPolicies(weights, shape, options, actions, around)
+    return LightPolicies(weights, shape, options, actions, around, standard)
 
 
 class LightPolicies:
@@ -59,19 +60,20 @@ class LightPolicies:
         options: int,
         actions: NDArray[np.int64],
         localiser: Localiser | None = None,
+        standard: Standard | None = None,
     ):
         self.localiser = localiser
         shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
-        make = partial(LightQNetwork, shape, options, len(actions))
+        make = partial(LightQNetwork, shape, options, len(actions), standard=standard)
         self.network = load_fitting(make, below("online.", weights), "options.safetensors")
         self.actions = actions
 
-    def __call__(self, option: int) -> Callable[[NDArray[np.uint8]], int]:
+    def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
         return partial(self._act, option)
 
     @torch.no_grad()
-    def _act(self, option: int, observation: NDArray[np.uint8]) -> int:
+    def _act(self, option: int, observation: Any) -> int:
         if self.localiser:
             observation = around_agent(self.localiser, observation[None])[0]
         values = self.network(_as_batch(observation))[0, option]
@@ -92,7 +94,7 @@ class PaperPolicies:
             self._networks[option] = load_fitting(make, weights, "options.safetensors").eval()
         return self._networks[option]
 
-    def __call__(self, option: int) -> Callable[[NDArray[np.uint8]], int]:
+    def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
         return _Execution(self.network(option), self.actions)
 
@@ -109,11 +111,11 @@ class _Execution:
         self.hidden: Tensor | None = None
 
     @torch.no_grad()
-    def __call__(self, observation: NDArray[np.uint8]) -> int:
+    def __call__(self, observation: Observations) -> int:
         """The action in an observation."""
         values, self.hidden = self.network(self.network.embed(_as_batch(observation))[:, None], self.hidden)
         return int(self.actions[int(values[0, 0].argmax())])
 
 
-def _as_batch(observation: NDArray[np.uint8]) -> Tensor:
+def _as_batch(observation: Observations) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(observation[None]))

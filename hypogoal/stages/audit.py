@@ -21,6 +21,7 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.run import read_table
 from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.hypotheses.thresholds import log_odds_of
+from hypogoal.hypotheses.views import StandardView
 from hypogoal.meta.config import AuditConfig
 from hypogoal.meta.training import assemble, columns_of, description, start_arguments, train, write_trained
 from hypogoal.needs import play_needs
@@ -43,19 +44,20 @@ def audit(
 ) -> dict[str, Any]:
     """Train a policy against a classifier, beside it one against the mended one; write ``out``, return its audit.json.
 
-    The classifier is a ``member`` of an ensemble artefact, or ``module:function`` from observations uint8 (N, *obs) to
+    The classifier is a ``member`` of an ensemble artefact, or ``module:function`` from observations (N, *obs) to
     probabilities (N,). The truth is that of the domain's ``sub_goal``.
     """
     device, world = prepare(device), load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
     lived: dict[str, Any] = {}
-    inputs, threshold = [], config.threshold or THRESHOLD
+    inputs, threshold, standard = [], config.threshold or THRESHOLD, None
     if ":" in classifier and not Path(classifier).is_dir():
         classify = own_classifier(classifier)
     else:
         source = open_artefact(Path(classifier), "ensemble").whole()
         ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
         classify, inputs = member_of(ensemble, member), [source.path]
+        standard = ensemble.view.standard() if isinstance(ensemble.view, StandardView) else None
         threshold = config.threshold or float(ensemble.thresholds[member])
         lived = source.config["domain_config"] if source.config["domain"] == domain else lived
     edges = np.array([threshold, config.mend] if config.mend else [threshold])
@@ -77,7 +79,7 @@ def audit(
         rule, length = rule_of(config.termination)
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 
-    loop = assemble(world, Path(), about, config, seed, device, ends)
+    loop = assemble(world, Path(), about, config, seed, device, ends, standard)
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
     settings = description(loop, world, about, config, classifier=classifier, member=member, steps=steps)
     with create_artefact(

@@ -9,6 +9,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
@@ -66,7 +67,12 @@ def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int)
     folder.mkdir()
     for index in range(count):
         artefact, episode = agents[index % len(agents)], index // len(agents)
-        config, frames = artefact.config, play_episode(agent_of(artefact, seed=episode))
+        config, loop = artefact.config, agent_of(artefact, seed=episode)
+        if loop.engine.observation_dtype != PICTURE:
+            raise UserError(
+                "videos are of pictures, which this agent does not see", artefact.path, "Leave --videos out."
+            )
+        frames = play_episode(loop)
         name = artefact.path.relative_to(run).as_posix().replace("/", "-")
         gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
         (folder / f"{name}-episode-{episode}.gif").write_bytes(gif)

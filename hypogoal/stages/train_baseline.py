@@ -13,7 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
-from hypogoal.dataset import open_dataset
+from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.learners.baselines.settings import BaselineConfig, DQNSettings, hyperparameters
 from hypogoal.meta.training import write_layout
@@ -50,8 +50,10 @@ def train_baseline(
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world)
+    if data and engine.observation_dtype != PICTURE:
+        engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
     env = EngineEnv(engine)
-    size = math.prod(env.observation_space.shape or (1,))
+    size = math.prod(env.observation_space.shape or (1,)) * (env.observation_space.dtype or PICTURE).itemsize
     replay = chosen.replay if isinstance(chosen, DQNSettings) else 0
     preflight("train-baseline", out, baseline_needs(size, replay), resume=resume, quiet=quiet)
     about = as_dict(config) | {"domain": domain, "domain_config": world}

@@ -150,7 +150,8 @@ def test_a_policy_collects() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("FLOATS", "observations must be images"),
+        ("WORDY", "observations must be images, uint8 .* or numbers"),
+        ("MIXED", "observations mix pictures with others: cell, image. Wrap it in .*FilterObservation"),
         ("STEERED", "actions must be Discrete"),
         ("LYING", "another observation than its space says"),
         ("NEVER", "on-the-moon never holds"),
