@@ -1,7 +1,4 @@
-"""A room seen as numbers: options for two sub-goals, and an agent that learns to fetch a key and bring it to the exit.
-
-All stages to the report take two minutes on one core; of the agent's last 100 episodes nearly all succeed.
-"""
+"""A room seen as numbers: options fetch a key and go to the exit, an agent chooses among them. 2 minutes, one core."""
 
 import gymnasium
 import numpy as np
@@ -33,7 +30,7 @@ class KeyRoom(gymnasium.Env):
 
 
 def at_exit(env):
-    return bool(env.unwrapped.position[0] > 0.85 and env.unwrapped.position[1] < 0.15)
+    return bool(env.unwrapped.position[0] > 0.8 and env.unwrapped.position[1] < 0.2)
 
 
 PLAY = {"option_timeout": 20, "max_episode_steps": 200}

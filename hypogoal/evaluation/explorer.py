@@ -87,12 +87,6 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
     return order[np.argsort(turn, kind="stable")]
 
 
-def sections(material: Material) -> list[Block]:
-    """The browser; nothing where there are states, but no pictures of them."""
-    found = material.metrics.get("explorer")
-    return [explorer_section(material)] if found is None or found["sub_goals"] else []
-
-
 def explorer_section(material: Material) -> Block:
     """A browser of held-out states, with filters."""
     found = material.metrics.get("explorer")
@@ -238,5 +232,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=sections,
+    sections=lambda material: [] if material.of_numbers() else [explorer_section(material)],
 )

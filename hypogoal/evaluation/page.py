@@ -68,6 +68,10 @@ class Material:
         start = f"{folder}/"
         return {name.removeprefix(start): of for name, of in self.arrays.items() if name.startswith(start)}
 
+    def of_numbers(self) -> bool:
+        """Whether observations are no pictures."""
+        return bool(self.within("features"))
+
     def of_ladders(self) -> bool:
         """Whether the run has anything of labelled ladders."""
         return bool(self.metrics["rooms"] or self.metrics["distance"]["options"])

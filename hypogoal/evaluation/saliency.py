@@ -137,8 +137,7 @@ def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], kind: str) -> l
 
 def sections(material: Material) -> list[Block]:
     """States with each member's verdict, and what members look at; of no pictures the latter."""
-    examples = [] if material.within("features") else [examples_section(material)]
-    return [*examples, saliency_section(material)]
+    return [*([] if material.of_numbers() else [examples_section(material)]), saliency_section(material)]
 
 
 def examples_section(material: Material) -> Block:
@@ -259,11 +258,9 @@ def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figu
 
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 2 and 9: of each sub-goal the first state that is explained, a true positive where there is one."""
-    if material.within("features"):
-        yield from feature_figures(material)
-        return
+    yield from feature_figures(material)
     found = material.metrics["saliency"]
-    goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
+    goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"] and not material.of_numbers()]
     for goal in goals:
         arrays = material.within(f"saliency/{goal['sub_goal']}")
         state = {name: arrays[name][0] for name in EXPLAINED}

@@ -110,9 +110,9 @@ def numbers(work: Work) -> dict[str, Any]:
                 continue
             ensemble = artefact.input("ensemble")
             match, choices = match_of(ensemble, about["layout_seed"]), read_choices(folder / "choices.csv")
-            seen = open_artefact(ensemble, "ensemble").config.get("observation_dtype", str(PICTURE))
-            stops = read_terminations(folder / "terminations.h5").items() if seen == str(PICTURE) else ()
-            for option, states in stops:
+            for option, states in read_terminations(folder / "terminations.h5").items():
+                if states.dtype != PICTURE:
+                    break
                 place = f"terminations/{about['path']}/{option}"
                 work.arrays[place] = overlay(states)
                 work.arrays[place].attrs["states"] = len(states)
@@ -120,7 +120,6 @@ def numbers(work: Work) -> dict[str, Any]:
                 work.arrays[f"choices/{about['path']}/{column}"] = counts
             of = {name: about[name] for name in ("path", "seed", "layout_seed")}
             chosen = selection_of_run(choices, match, config["sub_goals"], config["members"])
-            of["pictures"] = seen == str(PICTURE)
             rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})
         if rows:
             metrics.append({"name": agent["name"], "runs": rows})
@@ -196,19 +195,13 @@ MEMBERS = (
 
 def sections(material: Material) -> list[Block]:
     """Where options stop and which are chosen, of a run with agents."""
-    if not material.of_agents():
-        return []
-    return [terminations_section(material), choices_section(material)][0 if _pictured(_agent(material)) else 1 :]
+    drawn = [] if material.of_numbers() else [terminations_section]
+    return [draw(material) for draw in (*drawn, choices_section)] if material.of_agents() else []
 
 
 def _agent(material: Material) -> Entry | None:
     """The variant of the option agent that is shown."""
     return next(iter(variants(material.metrics["selection"])), None)
-
-
-def _pictured(agent: Entry | None) -> bool:
-    """Whether its states are pictures; an evaluation of an earlier version knows no others."""
-    return agent is None or agent["runs"][0].get("pictures", True)
 
 
 def _name(run: Entry) -> str:
@@ -299,7 +292,7 @@ def _members(run: Entry, *, folded: bool) -> Block:
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 7 and 8 and the other sub-goals', of the agent's first run."""
     agent, selection = _agent(material), material.metrics["selection"]
-    run = agent["runs"][0] if agent and _pictured(agent) else {"sub_goals": []}
+    run = agent["runs"][0] if agent and not material.of_numbers() else {"sub_goals": []}
     for goal in run["sub_goals"]:
         sides = [_side(material, run["path"], goal, word) for word in MOST if goal[word] is not None]
         if not sides:

@@ -18,7 +18,7 @@ from hypogoal.dataset import NUMBERS, Observations
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
-from hypogoal.hypotheses.networks import as_input, build_network, folded, reordered
+from hypogoal.hypotheses.networks import as_input, build_network, folded, network_for, reordered
 from hypogoal.hypotheses.views import AgentView, FullView, StandardView, View
 
 THRESHOLD = 0.5  # of the probability, where none was chosen
@@ -59,8 +59,9 @@ class Ensemble(nn.Module):
         view: View | None = None,
     ):
         super().__init__()
-        self.network, self.observation_shape = network, tuple(int(size) for size in observation_shape)
+        self.observation_shape = tuple(int(size) for size in observation_shape)
         self.view = view or FullView(self.observation_shape)
+        self.network = network = network_for(network, self.view.dtype)
         self.members = nn.ModuleList(build_network(network, self.view.shape, generator) for _ in range(members))
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self._networks = tuple(reordered(member) for member in self.members if isinstance(member, nn.Sequential))

@@ -131,14 +131,15 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
     """
     parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
-    example, channels = as_input(torch.zeros(1, *observation_shape)), observation_shape[-1]
+    channels = observation_shape[-1]
+    sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
         torch.manual_seed(seed)
         layers, hidden = parts_of(channels)
         if any(isinstance(part, _BatchNorm) for layer in layers for part in layer.modules() if part is not layer):
             raise UserError("BatchNorm inside another layer", name, "Make it a layer of its own.")
-        features = _features(layers, example)
+        features = _features(layers, *sizes)
         if features is None and len(observation_shape) != 3:
             do = "Give --set network=mlp, or a network of your own (--set network=module:function)."
             raise UserError(f"the network {name!r} takes images (H, W, C)", where, do)
@@ -158,27 +159,23 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
     return nn.Sequential(*layers).train()
 
 
-def _features(layers: list[nn.Module], example: Tensor) -> Tensor | None:
-    """What a convolutional part makes of an input (1, ...); None where it does not take that."""
+def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
+    """What a convolutional part makes of an input (1, *sizes); None where it does not take that, too small an image."""
     try:
         with torch.no_grad():
-            return nn.Sequential(*layers).eval()(example)
+            return nn.Sequential(*layers).eval()(torch.zeros(1, *sizes))
     except (RuntimeError, ValueError):
         return None
 
 
 def smallest_side(layers: list[nn.Module], channels: int) -> int | None:
     """The side, in pixels, of the smallest square image that a convolutional part takes; None where it takes none."""
-
-    def fits(side: int) -> bool:
-        return _features(layers, torch.zeros(1, channels, side, side)) is not None
-
     takes = 1
-    while not fits(takes):
+    while _features(layers, channels, takes, takes) is None:
         takes *= 2
         if takes > MOST_PIXELS:
             return None
-    return bisect_left(range(takes), True, lo=1, key=fits)
+    return bisect_left(range(takes), True, lo=1, key=lambda side: _features(layers, channels, side, side) is not None)
 
 
 def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
@@ -186,7 +183,7 @@ def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
     height, width, channels = observation_shape
     ways = ["give larger ones"]
     for name, parts_of in NETWORKS.items():
-        if _features(parts_of(channels)[0], torch.zeros(1, channels, height, width)) is not None:
+        if _features(parts_of(channels)[0], channels, height, width) is not None:
             ways.append(f"--set network={name}")
     own = "a network of your own (--set network=module:function)"
     return f"It takes {side}x{side} pixels: {', '.join(ways)}, or {own}."

@@ -22,7 +22,6 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Pixels
-from hypogoal.hypotheses.networks import network_for
 from hypogoal.hypotheses.thresholds import NEED_UNLABELLED, PAPER, thresholds
 from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 
@@ -104,8 +103,7 @@ def fit(
         fitted=not saved,
     )
     generator = torch_generator(seed, "weights")
-    network = network_for(config.network, observations.dtype)
-    ensemble = Ensemble(network, observations.shape[1:], config.members, generator, view)
+    ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)
     ensemble.to(device)
     if saved:
         ensemble.load_state_dict(saved["ensemble"])

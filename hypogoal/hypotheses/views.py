@@ -44,11 +44,11 @@ class StandardView(nn.Module):
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, observation_shape: tuple[int, ...], *training: Observations):
+    def __init__(self, observation_shape: tuple[int, ...], standard: Standard | None = None):
         super().__init__()
         self.shape = observation_shape
-        for name, values in zip(("mean", "deviation"), standard_of(observation_shape, *training), strict=True):
-            self.register_buffer(name, torch.from_numpy(values))
+        for name, values in zip(("mean", "deviation"), standard or standard_of(observation_shape), strict=True):
+            self.register_buffer(name, torch.from_numpy(values.copy()))
 
     def standard(self) -> Standard:
         """Mean and deviation, (*shape)."""
@@ -150,10 +150,8 @@ def view_of(
     if observations.dtype == NUMBERS:
         for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
             if (given := getattr(config, name)) != value:
-                raise UserError(
-                    "that is for pictures, and these observations are none", f"{name}={given}", f"Set {name}={value}."
-                )
-        return StandardView(shape, *((observations, unlabelled) if fitted else ()))
+                raise UserError("these observations are no pictures", f"{name}={given}", f"Set {name}={value}.")
+        return StandardView(shape, standard_of(shape, observations, unlabelled) if fitted else None)
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")

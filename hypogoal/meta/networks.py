@@ -1,6 +1,7 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +14,8 @@ class LightMetaNetwork(LightNetwork):
     """Cells, or numbers where there is a ``standard`` of them, two dense layers, actor and critic."""
 
     def __init__(self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None):
-        super().__init__(CellEmbedding(observation_shape) if standard is None else NumberEmbedding(standard))
+        kind = CellEmbedding if standard is None else partial(NumberEmbedding, standard=standard)
+        super().__init__(kind(observation_shape))
         self.outputs = nn.Linear(WIDTH, options + 1)
         _quiet_start(self.outputs)
 

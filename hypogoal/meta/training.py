@@ -54,9 +54,8 @@ def assemble(
     """The environments of one layout, an ensemble's options in them, fresh policies of these and over these.
 
     ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, start states; ``ends`` gives terminations that are no ensemble's, and
-    ``standard`` what goes with them. Where the domain has no such start, or
-    not the true sub-goals at which options are to end, it is a ``UserError``.
+    several, start states; ``ends`` gives terminations that are no ensemble's, ``standard`` what goes with them. Where
+    the domain has no such start, or not the true sub-goals at which options are to end, it is a ``UserError``.
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = columns_of(domain, sub_goals) if oracle else []
@@ -72,9 +71,8 @@ def assemble(
             if getattr(config, name, "") == "paper":
                 raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
         view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
-        engine.standard = (
-            view.standard() if isinstance(view, StandardView) else standard or standard_of(engine.observation_shape)
-        )
+        standard = view.standard() if isinstance(view, StandardView) else standard
+        engine.standard = standard or standard_of(engine.observation_shape)
     if ends:
         terminations = ends(engine)
     elif oracle:

@@ -12,6 +12,7 @@ from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import DEVIATIONS, NUMBERS, Standard, standard_of
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.views import StandardView
 from hypogoal.options.windows import AgentWindows
 
 CELL = 8  # pixels
@@ -79,17 +80,13 @@ class PictureEmbedding(nn.Module):
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
-class NumberEmbedding(nn.Module):
-    """Observations that are no pictures: each number's deviations from a mean, see ``dataset.standardised``."""
+class NumberEmbedding(StandardView):
+    """Observations that are no pictures, float32 (N, *shape): each number's deviations from a mean."""
 
-    mean: Tensor
-    deviation: Tensor
-
-    def __init__(self, standard: Standard):
-        super().__init__()
-        for name, values in zip(("mean", "deviation"), standard, strict=True):
-            self.register_buffer(name, torch.from_numpy(values.copy()))
-        self.features = self.mean.numel()
+    @property
+    def features(self) -> int:
+        """How many numbers."""
+        return self.mean.numel()
 
     def forward(self, observations: Tensor) -> Tensor:
         """float32 (N, *shape) -> float32 (N, features)."""
@@ -106,11 +103,12 @@ Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding
 
 
 def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None) -> Embedding:
-    """By what is seen: numbers where there is a ``standard`` of them; else of a picture cells where whole ones fill it,
-    or convolutions over it; a ``UserError`` where it is too small.
+    """Numbers where they have a ``standard``; else cells where whole ones fill the image, or convolutions over it.
+
+    Where that is too small it is a ``UserError``.
     """
     if standard is not None:
-        return NumberEmbedding(standard)
+        return NumberEmbedding(observation_shape, standard)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:
@@ -122,10 +120,10 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
 class LightNetwork(nn.Module):
     """An embedding of what is seen and two dense layers; where that is made of cells, it takes tile codes as well."""
 
-    def __init__(self, cells: Embedding, width: int = WIDTH):
+    def __init__(self, cells: Embedding):
         super().__init__()
         self.cells = cells
-        self.trunk = nn.Sequential(nn.Linear(cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.trunk = nn.Sequential(nn.Linear(cells.features, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU())
 
     def forward(self, images: Tensor) -> Tensor:
         """What :meth:`head` gives for observations (N, *obs); see also :class:`Pixels`."""
@@ -145,16 +143,11 @@ class LightQNetwork(LightNetwork):
     """One trunk and a head per member (Spec D8): values float32 (N, members, actions) of every member's policy."""
 
     def __init__(
-        self,
-        observation_shape: tuple[int, ...],
-        members: int,
-        actions: int,
-        width: int = WIDTH,
-        standard: Standard | None = None,
+        self, observation_shape: tuple[int, ...], members: int, actions: int, standard: Standard | None = None
     ):
-        super().__init__(embedding_for(observation_shape, standard), width)
+        super().__init__(embedding_for(observation_shape, standard))
         self.members, self.actions = members, actions
-        self.heads = nn.Linear(width, members * actions)
+        self.heads = nn.Linear(WIDTH, members * actions)
 
     def head(self, features: Tensor) -> Tensor:
         """float32 (N, members, actions)."""

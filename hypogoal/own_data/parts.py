@@ -11,18 +11,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import free_memory, human
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import (
-    NUMBERS,
-    PICTURE,
-    Collected,
-    Observations,
-    States,
-    digest,
-    hard_to_judge,
-    hard_to_learn,
-    leave_out,
-    require_names,
-)
+from hypogoal.dataset import Collected, States, digest, hard_to_judge, hard_to_learn, leave_out, require_names
 from hypogoal.domains.gymnasium_engine import channels_first
 
 COPIES = 4  # of the states, all held in memory at once while they are compared and written
@@ -51,11 +40,11 @@ def collected_of(
     """
     warned: list[str] = []
     images = as_observations(parts.observations, "the labelled observations")
-    if images.dtype == NUMBERS and images.ndim == 4:
+    if images.dtype == np.float32 and images.ndim == 4:
         warned.append(
             f"float32 {images.shape[1:]} are numbers, which no network takes for a picture; give uint8 for one"
         )
-    if parts.features and (images.dtype != NUMBERS or len(parts.features) != images[0].size):
+    if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
         given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
         raise UserError("there are not as many names of features as numbers", given, "Give one for each.")
     shape = images.shape[1:]
@@ -102,7 +91,7 @@ def require_memory(size: int, where: Path) -> None:
         raise UserError(what, where, "Give fewer states.")
 
 
-def _apart(states: States, others: Sequence[Observations], kind: str, of: str, do: str, warned: list[str]) -> States:
+def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, of: str, do: str, warned: list[str]) -> States:
     """States of a ``kind`` that look like none of the others, which are ``of`` another; none left: a ``UserError``."""
     kept = leave_out(states, *others)
     count = len(states.labels)
@@ -114,7 +103,7 @@ def _apart(states: States, others: Sequence[Observations], kind: str, of: str, d
     return kept
 
 
-def as_observations(values: NDArray[Any], what: str, like: Observations | None = None) -> Observations:
+def as_observations(values: NDArray[Any], what: str, like: NDArray[Any] | None = None) -> NDArray[Any]:
     """Pictures uint8 (N, H, W, C), of whole numbers (N, H, W, C) or (N, H, W); else numbers, float32 (N, *shape).
 
     What is neither, none at all, or of another kind than those that they are to be ``like`` is a ``UserError``.
@@ -128,12 +117,12 @@ def as_observations(values: NDArray[Any], what: str, like: Observations | None =
         if low < 0 or high > 255:
             do = "Scale them to 0..255, uint8; where they are no images, give float32."
             raise UserError(f"{what} do not fit bytes ({low} to {high})", found, do)
-        values = values.astype(PICTURE, copy=False)
+        values = values.astype(np.uint8, copy=False)
         values = values[..., None] if values.ndim == 3 else values
         if channels_first(values.shape[1:]):
             raise UserError(f"{what} have their channels first", found, "Give x.transpose(0, 2, 3, 1).")
     else:
-        values = values.astype(NUMBERS, copy=False)
+        values = values.astype(np.float32, copy=False)
         if not np.isfinite(values).all():
             raise UserError(f"{what} have numbers that are not finite", found, "Give finite ones.")
     if not len(values):

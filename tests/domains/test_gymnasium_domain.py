@@ -151,7 +151,7 @@ def test_a_policy_collects() -> None:
     ("name", "message"),
     [
         ("WORDY", "observations must be images, uint8 .* or numbers"),
-        ("MIXED", "observations mix pictures with others: cell, image. Wrap it in .*FilterObservation"),
+        ("MIXED", "observations mix pictures with others: image, cell. Wrap it in .*FilterObservation"),
         ("STEERED", "actions must be Discrete"),
         ("LYING", "another observation than its space says"),
         ("NEVER", "on-the-moon never holds"),

@@ -17,7 +17,7 @@ from hypogoal.learners.episodes import Episodes
 class EngineEnv(VecEnv):
     """All environments of an engine, with its primitive actions and images.
 
-    Observations are the engine's images, uint8 (C, H, W), or its numbers, float32, by its ``standard`` where it has one;
+    Observations are the engine's images, uint8 (C, H, W), or its numbers, float32, by its ``standard`` if there is one;
     where images are made of tiles, the cells' tile codes, uint8 (cells,), which say the same in 1/192 of the bytes (see
     ``networks.CellNetwork``). An episode cut at its step limit is marked as truncated: its last state is not a terminal
     one. ``episodes`` are those that ended.
