@@ -75,8 +75,8 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
             own.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
     initiation = None
     if INITIATION in artefact.manifest["files"]:
-        learned = load_tensors(artefact.path / INITIATION)
-        initiation = Narrowed(learned, source.config, len(goals) * members, config["initiation_threshold"])
+        learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
+        initiation = Narrowed(learned, shape, len(goals) * members, config["initiation_threshold"])
     masked = config["mask_reached"]
     if not isinstance(masked, bool):
         raise UserError("the manifest's setting 'mask_reached' is malformed", artefact.path / MANIFEST, AGAIN)

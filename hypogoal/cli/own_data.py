@@ -31,7 +31,7 @@ def import_(
         list[str] | None,
         typer.Option(metavar="NAME=MODULE:FUNCTION", help="Of a Minari dataset: a sub-goal and who labels it."),
     ] = None,
-    key: Annotated[str, typer.Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
+    key: Annotated[str, typer.Option(help="Of a Minari dataset of dictionaries: which part is meant.")] = "",
     heldout: Annotated[
         float, typer.Option(min=0.01, max=0.9, help="Share of the labelled states held out, where none are given.")
     ] = 0.2,

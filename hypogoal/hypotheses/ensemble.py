@@ -227,15 +227,18 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
     state = load_tensors(path)
     try:
         shape = tuple(config["observation_shape"])
-        return Ensemble.from_state(config["network"], shape, config["members"], state, _view(shape, config))
+        return Ensemble.from_state(config["network"], shape, config["members"], state, _view(shape, config, state))
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
 
 
-def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any]) -> View:
+def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]) -> View:
     """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
     if config.get("observation_dtype") == str(NUMBERS):
-        return StandardView(observation_shape)
+        mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
+        if mean.shape != observation_shape:  # a manifest may ask for terabytes
+            raise ValueError(observation_shape)
+        return StandardView(observation_shape, (mean, deviation))
     if config.get("view", "full") == "full":
         return FullView(observation_shape)
     localiser: Localiser = LearnedLocaliser(observation_shape)

@@ -8,7 +8,6 @@ all together.
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import gradient_norm
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.networks import LightQNetwork, apply_to_states, blank_standard
+from hypogoal.options.networks import LightQNetwork, apply_to_states, standard_in
 
 NAME, PREFIX = "initiation.safetensors", "network."
 KEPT = 8_192  # last executions; options change while they learn, so older ones are forgotten
@@ -48,14 +47,13 @@ class Narrowed:
     """What an artefact's initiation sets leave of the options offered in an observation; all, where that is none.
 
     ``state`` is the tensors of ``initiation.safetensors``, a ``UserError`` where they are not of so many options on
-    observations of their ensembles (``about``: the manifest's configuration); an option is held back where its chance
-    is below ``threshold``.
+    observations of this shape; an option is held back where its chance is below ``threshold``.
     """
 
-    def __init__(self, state: Mapping[str, Tensor], about: Mapping[str, Any], options: int, threshold: float):
-        shape = tuple(about["observation_shape"])
-        make = partial(LightQNetwork, shape, options, actions=1, standard=blank_standard(about))
-        self.network = load_fitting(make, below(PREFIX, state), NAME)
+    def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float):
+        weights = below(PREFIX, state)
+        make = partial(LightQNetwork, shape, options, 1, standard_in(weights))
+        self.network = load_fitting(make, weights, NAME)
         others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
         check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
         self.executions, self.threshold = state["executions"].numpy(), threshold

@@ -1,7 +1,6 @@
 """Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import DEVIATIONS, NUMBERS, Standard, standard_of
+from hypogoal.dataset import DEVIATIONS, Standard
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.views import StandardView
 from hypogoal.options.windows import AgentWindows
@@ -93,10 +92,10 @@ class NumberEmbedding(StandardView):
         return ((observations - self.mean) / self.deviation).clamp(-DEVIATIONS, DEVIATIONS).flatten(1)
 
 
-def blank_standard(about: Mapping[str, Any]) -> Standard | None:
-    """Of an ensemble manifest's configuration, a standard to load another into; None where it sees pictures."""
-    shape = tuple(about["observation_shape"])
-    return standard_of(shape) if about.get("observation_dtype") == str(NUMBERS) else None
+def standard_in(weights: Mapping[str, Tensor]) -> Standard | None:
+    """That of a light network's weights; None where it sees pictures."""
+    found = [weights[name].numpy() for name in ("cells.mean", "cells.deviation") if name in weights]
+    return (found[0], found[1]) if len(found) == 2 else None
 
 
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below, load_fitting
-from hypogoal.dataset import Observations, Standard
+from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.options.exploration import actions_of
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork, blank_standard
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork, standard_in
 from hypogoal.options.windows import SIDE, around_agent, localiser_of
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
@@ -37,7 +37,7 @@ def make_policies(
     if config["network"] == "planned":
         what = "planned options go by what follows in their domain's engine, which is not in the artefact"
         raise UserError(what, "network=planned", "Load options that were learned.")
-    shape, standard = tuple(about["observation_shape"]), blank_standard(about)
+    shape = tuple(about["observation_shape"])
     options = len(config["sub_goals"]) * config["members"]
     last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"
     outputs = len(weights[last]) // (options if config["network"] == "light" else 1) if last in weights else 0
@@ -47,7 +47,7 @@ def make_policies(
     if config["network"] != "light":
         return PaperPolicies(weights, shape, options, actions)
     around = localiser_of(ensemble) if ensemble and config.get("policy_view", "full") == "agent-crop" else None
-    return LightPolicies(weights, shape, options, actions, around, standard)
+    return LightPolicies(weights, shape, options, actions, around)
 
 
 class LightPolicies:
@@ -60,12 +60,12 @@ class LightPolicies:
         options: int,
         actions: NDArray[np.int64],
         localiser: Localiser | None = None,
-        standard: Standard | None = None,
     ):
         self.localiser = localiser
         shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
-        make = partial(LightQNetwork, shape, options, len(actions), standard=standard)
-        self.network = load_fitting(make, below("online.", weights), "options.safetensors")
+        weights = below("online.", weights)
+        make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights))
+        self.network = load_fitting(make, weights, "options.safetensors")
         self.actions = actions
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

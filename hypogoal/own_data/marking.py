@@ -328,9 +328,7 @@ class Played(Source):
     def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
         self._env = make_checked(make)
         self._look = look_of(self._env)
-        if self._look.dtype != PICTURE:
-            do = "Wrap it so that it gives images, or label states by functions: hypogoal collect."
-            raise UserError("observations must be images to be looked at", self._env.observation_space, do)
+        _require_images(self._look.dtype, self._env.observation_space)
         self._names = action_names(self._env)
         self._layout = layout_seed
         self.help = (*action_help(self._names), "r: begin again, l: next layout")
@@ -408,8 +406,10 @@ def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]]:
     if path.is_dir():
         return [read_image(file) for file in image_files(path)]
     states: Any = read_states(path) if path.suffix == ".npz" else open_dataset(path).unlabelled()
-    if states.dtype != PICTURE:
-        raise UserError(
-            "observations must be images to be looked at", f"{states.dtype} {states.shape[1:]}", "Give uint8."
-        )
+    _require_images(states.dtype, path)
     return states
+
+
+def _require_images(dtype: np.dtype[Any], where: object) -> None:
+    if dtype != PICTURE:
+        raise UserError("observations must be images to be looked at", where, "Label states by functions: collect.")

@@ -30,7 +30,7 @@ Label = Callable[[NDArray[Any]], bool]  # from an observation to whether the sub
 def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: int = 0) -> Parts:
     """The observations of a dataset's episodes, each episode's either labelled, unlabelled or held out, by ``seed``.
 
-    ``folder`` is the one with ``data/`` in it, ``key`` which part of observations that are dictionaries is the image.
+    ``folder`` is the one with ``data/`` in it, ``key`` which part of observations that are dictionaries is meant.
     No such dataset, another storage format, too few episodes, or a label function that fails is a ``UserError``.
     """
     if not labels:

@@ -41,9 +41,8 @@ def collected_of(
     warned: list[str] = []
     images = as_observations(parts.observations, "the labelled observations")
     if images.dtype == np.float32 and images.ndim == 4:
-        warned.append(
-            f"float32 {images.shape[1:]} are numbers, which no network takes for a picture; give uint8 for one"
-        )
+        do = "of pictures in 0..1 give (255 * x).round().astype('uint8')"
+        warned.append(f"float32 {images.shape[1:]} are taken for numbers, not for a picture: {do}")
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
         given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
         raise UserError("there are not as many names of features as numbers", given, "Give one for each.")

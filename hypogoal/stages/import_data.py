@@ -38,7 +38,7 @@ def import_data(
 
     ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
     ``sub_goals`` are names in the order of the labels' columns; of a Minari dataset ``labels`` has by sub-goal
-    ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is the image.
+    ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is meant.
     ``share`` of the labelled states, by ``seed``, is held out where no held-out ones are given. ``domain`` is what they
     are of, for later stages. Errors: see ``hypogoal.own_data``.
     """

@@ -69,9 +69,7 @@ def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int)
         artefact, episode = agents[index % len(agents)], index // len(agents)
         config, loop = artefact.config, agent_of(artefact, seed=episode)
         if loop.engine.observation_dtype != PICTURE:
-            raise UserError(
-                "videos are of pictures, which this agent does not see", artefact.path, "Leave --videos out."
-            )
+            raise UserError("videos need an agent that sees pictures", artefact.path, "Leave --videos out.")
         frames = play_episode(loop)
         name = artefact.path.relative_to(run).as_posix().replace("/", "-")
         gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])

@@ -67,11 +67,8 @@ def train_ensemble(
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
     out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
     about = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
-    about |= {
-        "observation_dtype": str(dataset.observation_dtype),
-        "domain": dataset.domain,
-        "domain_config": dataset.config,
-    }
+    about |= {"observation_dtype": str(dataset.observation_dtype)}
+    about |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, len(sub_goals), workers)
     preflight("train-ensemble", out, needs, resume=resume, quiet=quiet)

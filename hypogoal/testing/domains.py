@@ -157,9 +157,7 @@ class _Contract:
                 rows.setdefault(image.tobytes(), set()).add(label.tobytes())
         torn = sum(len(labels) > 1 for labels in rows.values())
         if torn:
-            text = (
-                f"{torn} of {len(rows)} observations were met with different labels: no classifier can tell those apart"
-            )
+            text = f"{torn} of {len(rows)} observations came with different labels: no classifier can tell those apart"
             warnings.warn(text, stacklevel=2)
         counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, met, strict=True))
         return f"held in random play, of {STEPS * COUNT} states: {counts}"
