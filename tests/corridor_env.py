@@ -83,7 +83,8 @@ class Sensed(CorridorEnv):
 
     def image(self) -> Any:
         way = self.cell / (LENGTH - 1)
-        return {"noise": 5.0, "place": np.array([way, -way]), "layout": self.layout}
+        place = np.array([way, -way], np.float32)
+        return {"noise": np.array(5, np.float32), "place": place, "layout": self.layout}
 
 
 class Wordy(CorridorEnv):

@@ -411,5 +411,5 @@ def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]]:
 
 
 def _require_images(dtype: np.dtype[Any], where: object) -> None:
-    if dtype != PICTURE:
+    if dtype != np.uint8:
         raise UserError("observations must be images to be looked at", where, "Label states by functions: collect.")

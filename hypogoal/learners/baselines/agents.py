@@ -114,7 +114,7 @@ def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int, dev
         what = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
         raise UserError(what, f"environments={env.num_envs}", f"Give --set environments={chosen.rollout} or fewer.")
     seen: dict[str, Any] = {"net_arch": [FEATURES, FEATURES]}  # of numbers
-    if env.engine.observation_dtype == PICTURE:
+    if env.observation_space.dtype == PICTURE:
         network = {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL}
         features = {"features_extractor_class": NETWORKS[chosen.network], "features_extractor_kwargs": network}
         seen = {**features, "net_arch": []}

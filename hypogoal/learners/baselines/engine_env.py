@@ -27,7 +27,7 @@ class EngineEnv(VecEnv):
         self.engine = engine
         self.tiles = engine.tiles
         first = self._observe(engine.ids[:1])
-        low, high = (0, 255) if engine.observation_dtype == PICTURE else (-math.inf, math.inf)
+        low, high = (0, 255) if first.dtype == PICTURE else (-math.inf, math.inf)
         space: Any = spaces.Box(low, high, first.shape[1:], first.dtype.type)
         super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
         self.episodes = Episodes(engine.count)
@@ -36,10 +36,10 @@ class EngineEnv(VecEnv):
     def _observe(self, ids: NDArray[np.int64]) -> Observations:
         if self.tiles is not None:
             return self.engine.codes(ids)
-        images, standard = self.engine.images(ids), self.engine.standard
+        images = self.engine.images(ids)
         if images.dtype == PICTURE:
             return images.transpose(0, 3, 1, 2)
-        return images if standard is None else standardised(images, standard)
+        return standardised(images, self.engine.standard) if self.engine.standard else images
 
     def reset(self) -> Observations:
         """Put every environment at the start of an episode."""
