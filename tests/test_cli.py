@@ -152,7 +152,7 @@ def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytes
         (["train-meta", ensemble, "--out", str(made / "options"), "--resume"], "not of kind 'meta': it is of kind"),
         (["collect", "montezuma", "--out", data, "--resume"], f"{made_with} domain=doorkey, not montezuma"),
         (["train-baseline", "montezuma", "--out", meta, "--resume"], "not of kind 'baseline'"),
-        ([*report, "--videos", "1"], f"{made_with} videos=0, not 1"),
+        ([*report, "--videos", "2"], f"{made_with} videos=1, not 2"),
     ]
     for arguments, words in cases:
         assert words in one_line(capsys, arguments)

@@ -233,8 +233,13 @@ def report(
         str | None, typer.Option("--format", help="Of --figures: svg (where it is not said), pdf or png.")
     ] = None,
     videos: Annotated[
-        int, typer.Option(min=0, help="Also so many episodes of the policy over options, as RUN/report/videos/*.gif.")
-    ] = 0,
+        int | None,
+        typer.Option(
+            min=0,
+            help="So many episodes of the policy over options, RUN/report/videos/*.gif; the page shows the first. "
+            "Where it is not said: one, if there is such an agent.",
+        ),
+    ] = None,
     force: Force = False,
     resume: Resume = False,
     quiet: Quiet = False,

@@ -242,6 +242,7 @@ class Domain(ABC):
         starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
         many_starts: it takes some of them, too, comma-separated.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
+        reading: a sentence on how to read its observations, for people.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
@@ -255,6 +256,7 @@ class Domain(ABC):
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
     many_starts: bool = False
+    reading = ""
     measures = pictures = sees_agent = False
     near = 0
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.evaluation import curves, distance, hypotheses, page, rooms
 from hypogoal.evaluation.numbers import Metrics, Rows, grouped
 from hypogoal.evaluation.page import Block, Column, Drawn, Entry, Material
-from hypogoal.evaluation.plots import PALETTE
+from hypogoal.evaluation.plots import PALETTE, STYLES
 from hypogoal.evaluation.provenance import domains_of
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
@@ -220,7 +220,7 @@ def _curve(
         place = [other["name"] for other in agents].index(agent)
         values = on_grid(arrays[run][f"curves/{place}/{quantity}"], arrays[run]["curves/grid"], grid)
         values = curves.values_of(agents[place], values)
-        lines.append(curves.Line(called, values, PALETTE[index], dashed=index % 2 == 1))
+        lines.append(curves.Line(called, values, PALETTE[index], STYLES[index % len(STYLES)]))
     about, axis = QUANTITIES[quantity]
     bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
     played = ((run, page.pick(runs[run]["agents"], "name", agent)) for run, agent, _ in drawn)

@@ -32,13 +32,26 @@ from hypogoal.evaluation.numbers import (
     rows_of,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, drawing
+from hypogoal.evaluation.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    NARROW,
+    ORANGE,
+    PURPLE,
+    SKY,
+    STYLES,
+    VERMILLION,
+    label_lines,
+    styled,
+)
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
+SEVERAL = 3  # runs of an agent from which on intervals and pairs say more than the runs
 SOLVED = 0.95  # share of the window's episodes
 GAMMA = 0.99  # per environment step, of the discounted return
 NEAR = 1.5  # times the shortest path
@@ -66,19 +79,20 @@ BANDS = (
 HIGHER = {"success": True, "length": False, "near": True, "discounted_return": True}  # compared; the higher is better
 Bounds = tuple[float | None, float | None]
 SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
-COLOURS = {
-    LEARNED: (BLUE, False),
-    RANDOM: (ORANGE, False),
-    PRETRAINING: (ORANGE, True),
-    ORACLE: (GREEN, False),
-    ORACLE_RANDOM: (GREEN, True),
-    "PPO tuned": (VERMILLION, False),
-    "PPO paper": (VERMILLION, True),
-    "DQN tuned": (PURPLE, False),
-    "DQN paper": (PURPLE, True),
+SOLID, DASHED, MIXED, LONG, SHORT = STYLES
+COLOURS = {  # lines differ in how they are drawn, too, for readers who do not see their colours
+    LEARNED: (BLUE, SOLID),
+    RANDOM: (ORANGE, DASHED),
+    PRETRAINING: (ORANGE, SHORT),
+    ORACLE: (GREEN, MIXED),
+    ORACLE_RANDOM: (GREEN, SHORT),
+    "PPO tuned": (VERMILLION, LONG),
+    "PPO paper": (VERMILLION, SHORT),
+    "DQN tuned": (PURPLE, MIXED),
+    "DQN paper": (PURPLE, DASHED),
 }
 # Of agents with other names; the last ones only where no agent of the figure has them by its name.
-OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True), (BLUE, True), *COLOURS.values())
+OTHERS = ((SKY, SOLID), (GREY, DASHED), (SKY, LONG), (GREY, SOLID), (BLUE, DASHED), *COLOURS.values())
 
 
 @dataclass(frozen=True)
@@ -287,15 +301,8 @@ def against(agents: Sequence[Entry]) -> Rows:
 
 
 def missing(work: Work) -> list[str]:
-    """Spec E6, E7: the comparisons that are not there, so that nothing is silently left out."""
-    names = [agent["name"] for agent in work.metrics["agents"]]
-    if not names:  # nor anything to compare: which ones Figure 6 has, the report says
-        return [] if work.metrics["rooms"] or work.contents.ladders else ["no agents"]
-    said = [name for name in names if name != ORACLE_RANDOM]
-    # Where one step solves a layout an option is a primitive action: baselines would choose among the same.
-    one_step = {layout.get("shortest_path") for layout in work.metrics.get("layouts", ())} == {1}
-    wanted = (LEARNED, RANDOM, ORACLE, *(() if one_step else BASELINES))
-    return [f"no agent '{name}'" for name in wanted if not any(f"{other}, ".startswith(f"{name}, ") for other in said)]
+    """That there are no agents, of a run that is about them; controls that nobody asked for are not missed."""
+    return [] if work.metrics["agents"] or work.metrics["rooms"] or work.contents.ladders else ["no agents"]
 
 
 def solved(steps: Mapping[str, Any]) -> str:
@@ -365,18 +372,19 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The summary and the curves, of a run with agents."""
-    return [summary_section(material), curves_section(material)] if material.of_agents() else []
+    """The summary with film and curves, and every run's numbers, of a run with agents."""
+    if not material.of_agents():
+        return []
+    return [summary_section(material), *([runs_section(material)] if material.metrics["agents"] else [])]
 
 
 def summary_section(material: Material) -> Block:
     """What was asked, what came out."""
     metrics = material.metrics
     asked = (
-        "Each sub-goal is known from one context only. An ensemble of classifiers holds several hypotheses about what "
-        "the sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by "
-        "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
-        "hypotheses that are true there?"
+        "Asked was: each sub-goal is known from one context. Each member of an ensemble of classifiers is a hypothesis "
+        "about it, and becomes an option. Does a policy that chooses among all options solve layouts that no data came "
+        "from, and does it choose the hypotheses that are true there?"
     )
     headline = page.table(
         (AGENT, *HEADLINE),
@@ -388,29 +396,37 @@ def summary_section(material: Material) -> Block:
         "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
         "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
-    blocks = [headline] if metrics["agents"] else []
-    return page.section("summary", "Summary", [*_answers(material), asked], blocks, metrics["missing"])
+    drawn = [page.shown(material, figure) for figure in figures(material)]
+    row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": asked}
+    blocks = [row, headline] if metrics["agents"] else drawn
+    return page.section("summary", "Summary", _answers(material), blocks, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
     """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
-    agents = material.metrics["agents"]
+    agents, window = material.metrics["agents"], material.metrics["settings"]["window"]
     shown = variants(agents)
     several = len(shown) > 1
     paragraphs = []
     for agent in shown:
         name = f"the agent '{agent['name']}'" if several else "the option agent"
-        text = _achieved(agent, name, material.metrics["settings"]["window"])
+        text = _achieved(agent, name, window)
         control = control_of(material, agent)
-        if agent["success"]["mean"] is not None and control is not None:
-            alike = not several or same_settings(agent, control)
-            text += f" {_by_chance(control, 'options of the same members' if alike else 'options of its ensemble')}"
+        alike = not several or control is None or same_settings(agent, control)
+        among = f"uniformly random choice among options of {'the same members' if alike else 'its ensemble'}"
+        against = [] if control is None else [(among, control)]
+        if not several:
+            against += [(other["name"], other) for other in agents if other not in (agent, control)]
+        if agent["success"]["mean"] is not None and against:
+            text += f" {_listed(against)}"
         frozen = [entry for entry in material.metrics.get("choosing", []) if entry["name"] == agent["name"]]
         for entry in frozen:
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
             text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
         if several and control is None and not frozen:
             text += " No random choice among options of the same members was run."
+        if len(agent["runs"]) < SEVERAL and not several:
+            text += " So few runs decide nothing: more seeds and layouts do."
         paragraphs.append(text)
     return paragraphs
 
@@ -422,18 +438,18 @@ def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
     against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
     return (
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
-        f"{_episodes(agent, window)}, which took {page.fixed(agent['length']['mean'], 0)} steps{against} "
-        f"({runs_of(agent)})."
+        f"{_episodes(agent, window)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
 
 
-def _by_chance(control: Mapping[str, Any], among: str) -> str:
-    if control["success"]["mean"] is None:
-        return f"Of uniformly random choice among {among} no episode came to its end."
-    return (
-        f"Uniformly random choice among {among}: {page.percent(control['success']['mean'])}, "
-        f"{page.fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
-    )
+def _listed(others: Sequence[tuple[str, Entry]]) -> str:
+    """The same of other agents in one sentence."""
+    told = []
+    for name, agent in others:
+        success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
+        told.append(f"{name}: {'no episode ended' if success is None else f'{page.percent(success)}, {steps} steps'}")
+    text = "; ".join(told)
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _episodes(agent: Mapping[str, Any], window: int) -> str:
@@ -454,20 +470,11 @@ def runs_of(agent: Entry) -> str:
     )
 
 
-def curves_section(material: Material) -> Block:
-    """Figure 6 with controls and baselines, and every run's numbers."""
+def runs_section(material: Material) -> Block:
+    """Every run's numbers; intervals and pairs from three runs on, since one run's are its numbers once more."""
     agents = material.metrics["agents"]
-    drawn = [page.shown(material, figure) for figure in figures(material)]
-    if not agents:
-        return page.section("curves", "Learning curves", [], drawn)
-    text = (
-        "Success at a cap of 500 steps cannot show by itself that choices are learned, so episode length stands "
-        "beside it. Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive "
-        "actions on the same observations and budget."
-    )
     digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
-    blocks = [
-        *drawn,
+    spread = [
         page.table(
             INTERVALS,
             agents,
@@ -475,11 +482,10 @@ def curves_section(material: Material) -> Block:
             caption=f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
         ),
         *page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits),
-        page.table(
-            EVERY_RUN,
-            [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]],
-            folded="Every run",
-        ),
+    ]
+    blocks = [
+        *(spread if max(len(agent["runs"]) for agent in agents) >= SEVERAL else ()),
+        page.table(EVERY_RUN, [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]]),
         page.table(
             LAYOUTS,
             material.metrics["layouts"],
@@ -487,7 +493,7 @@ def curves_section(material: Material) -> Block:
             caption="Random play: uniformly random primitive actions, the same cap.",
         ),
     ]
-    return page.section("curves", "Learning curves", [text], blocks)
+    return page.section("runs", "Run by run", [], blocks, folded=True)
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -521,10 +527,10 @@ def _curve(material: Material, quantity: str) -> Drawn:
     references = [(name, float(np.mean(values)))] if values else []
     drawn = learning_curves(arrays["curves/grid"], lines, axis, references, bounds)
     reference = f" Dotted: mean over layouts of {dotted}." if references else ""
+    several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
-        f"{which_figure}: {title.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
-        f"{BANDS} over runs. {agents[0]['name']}: {runs_of(agents[0])}; "
-        f"the other agents: {_others(agents)}.{reference}"
+        f"{which_figure}: {title.lower()}, mean of the last 100 at each step.{several} {agents[0]['name']}: "
+        f"{runs_of(agents[0])}; the other agents: {_others(agents)}.{reference}"
     )
     return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
 
@@ -545,7 +551,7 @@ class Line:
     name: str
     values: NDArray[np.float64]
     colour: str
-    dashed: bool = False
+    style: Any = SOLID
 
 
 def reward_bounds(lines: Sequence[Line]) -> Bounds:
@@ -567,15 +573,18 @@ def learning_curves(
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
     """
-    with drawing(3.1, 2, handlelength=2.4) as (figure, axes):
+    with styled():
+        figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
+        axes = figure.subplots()
         for line in lines:
             _draw_curve(axes, grid / 1000, line)
-        for (name, value), style in zip(references, (":", (0, (1, 3)), "-."), strict=False):
-            axes.axhline(value, color=GREY, linewidth=1.2, linestyle=style, label=name)
+        for name, value in references:
+            axes.axhline(value, color=GREY, linewidth=1.2, linestyle=":", label=name)
         axes.set_xlabel("environment steps, in thousands")
         axes.set_ylabel(quantity)
         axes.set_xlim(0, grid[-1] / 1000)
         axes.set_ylim(*bounds)
+        label_lines(figure, axes, 2, handlelength=2.4)
     return figure
 
 
@@ -587,7 +596,7 @@ def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
     known = np.ma.masked_invalid(line.values)
     mean = known.mean(0).filled(np.nan)
-    look: dict[str, Any] = {"color": line.colour, "linestyle": "--" if line.dashed else "-"}
+    look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
     axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
     if len(known) >= BOOTSTRAP_FROM:
         error = known.std(0, ddof=1) / np.sqrt(known.count(0))

@@ -1,5 +1,8 @@
 """What in a state a member goes by: DeepLift attributions and the check that they are complete (Spec F2, Figures 2, 9).
 
+Members with layers that DeepLift has no right rules for are explained by integrated gradients (Sundararajan et al.
+2017): means over ``STEPS`` states on the way from the baseline, and complete but for what so few miss.
+
 Attributed is the log-odds of "reached", the difference of a member's two logits: its sign is the verdict at a threshold
 of 0.5, so positive attributions speak for "reached" whatever the member says. The attributions of a state, summed over
 pixels and frames, must be the difference between its log-odds and the baseline's; how far they are off is reported.
@@ -21,19 +24,22 @@ from torch import Tensor, nn
 from hypogoal.dataset import PICTURE, Observations
 from hypogoal.hypotheses.networks import as_input
 
+DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
+STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together
+RULED = (nn.Conv2d, nn.Linear, nn.BatchNorm2d, nn.ReLU, nn.AvgPool2d, nn.AdaptiveAvgPool2d, nn.Flatten, nn.Dropout)
+
 if TYPE_CHECKING:
     from hypogoal.hypotheses.ensemble import Ensemble
 
 
 @dataclass(frozen=True)
 class Attributions:
-    """DeepLift of every member on n states."""
+    """Of every member on n states."""
 
-    values: NDArray[
-        np.float64
-    ]  # (n, K, H, W, C) or (n, K, *shape), in log-odds; they speak for "reached" where positive
+    values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), in log-odds; for "reached" where positive
     log_odds: NDArray[np.float64]  # (n, K), each member's of each state
     baseline_log_odds: NDArray[np.float64]  # (K,), of the baseline
+    method: str = DEEP_LIFT
 
     def completeness_error(self) -> NDArray[np.float64]:
         """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
@@ -73,7 +79,32 @@ def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -
         [{"member": member, **{name: float(of[state, member]) for name, of in columns.items()}} for member in every]
         for state in range(len(picked))
     ]
-    return [{"kind": kind, "members": rows} for (_, kind), rows in zip(picked, members, strict=True)]
+    method = attributions.method
+    return [{"kind": kind, "method": method, "members": rows} for (_, kind), rows in zip(picked, members, strict=True)]
+
+
+def method_of(member: nn.Module) -> str:
+    """How it is explained: by DeepLift where it is a chain of layers that its rules hold for, each used once."""
+    layers, example = list(member.children()), torch.zeros(1, 1, 1, 1)
+    ruled = all(type(layer) in RULED or _window_of(layer, example) is not None for layer in layers)
+    return DEEP_LIFT if ruled and len(layers) == len(member._modules) else INTEGRATED
+
+
+def attributed(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
+    """Spec F2: what every member goes by, by the method that is right for it; of what :func:`deep_lift` is given."""
+    if method_of(ensemble.members[0]) == DEEP_LIFT:
+        return deep_lift(ensemble, observations, baseline)
+    from captum.attr import IntegratedGradients
+
+    inputs, reference = as_input(torch.from_numpy(observations)), as_input(torch.from_numpy(baseline[None]))
+    found = []
+    for member in ensemble.members:
+        network = nn.Sequential(member, _LogOdds(), nn.Flatten(0))
+        values = IntegratedGradients(network).attribute(inputs, reference, n_steps=STEPS, internal_batch_size=AT_ONCE)
+        with torch.no_grad():
+            found.append((_as_seen(values), network(inputs), network(reference)))
+    values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*found, strict=True))
+    return Attributions(values, log_odds, baselines[0], INTEGRATED)
 
 
 def deep_lift(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
@@ -99,8 +130,12 @@ def _of_member(
         values = DeepLift(network).attribute(inputs, reference, target=0)
     with torch.no_grad():
         log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
-    values = values.detach().permute(0, 2, 3, 1) if values.ndim == 4 else values.detach()
-    return values.numpy(), log_odds.numpy(), baseline.numpy()
+    return _as_seen(values.detach()).numpy(), log_odds.numpy(), baseline.numpy()
+
+
+def _as_seen(values: Tensor) -> Tensor:
+    """In the order of observations what is in that of :func:`as_input`."""
+    return values.permute(0, 2, 3, 1) if values.ndim == 4 else values
 
 
 def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:

@@ -373,17 +373,7 @@ OVER_LADDERS = (
     *SHARED,
     SEEDS,
 )
-INTERVALS = (METHOD, LABELS, *(page.number(which, which, page.interval, 1) for which in ("best", "validated", "mean")))
 BY_LADDER = (page.label("ladder", "ladder", once=True), METHOD, LABELS, *STOPPED, *SHARED, SEEDS)
-OPTIONS = (
-    page.label("options", "path", once=lambda option: (option["path"], option["sub_goal"])),
-    page.label("member", "name"),
-    page.number("executions", "executions"),
-    page.number("distance", "distance", page.fixed, 1),
-    page.number("±", "executions_deviation", page.fixed, 1),
-    page.number("steps", "duration", page.fixed, 1),
-    *(page.number(title, share, page.percent) for share, title in SHARES.items()),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -453,13 +443,6 @@ def distance_section(material: Material) -> Block:
             f"{NEAR} of a true one and not begun inside; inside, begun in its own termination set; timed out; died. A "
             f"death or a time-out at a base counts as both.{left}",
         ),
-        page.table(
-            INTERVALS,
-            _ordered(rows),
-            tight=True,
-            folded="Distance with intervals",
-            caption=page.INTERVALS.format(units="seeds"),
-        ),
         *page.comparison_tables(
             material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
         ),
@@ -470,14 +453,6 @@ def distance_section(material: Material) -> Block:
             folded="Every ladder",
             caption="As above, ladder by ladder.",
         ),
-        page.table(
-            OPTIONS,
-            [line for entry in found["options"] for line in _options(entry)],
-            tight=True,
-            folded=f"Every option of {len(found['options'])} artefacts",
-            caption=f"The last {LAST} executions of each. An option without any was never offered: it would always "
-            f"have begun inside its own termination set, and counts {INSIDE}.",
-        ),
     ]
     return page.section("distance", title, [text], blocks)
 
@@ -485,12 +460,6 @@ def distance_section(material: Material) -> Block:
 def _ordered(rows: Sequence[Entry]) -> list[Entry]:
     """By N, then as they come; those without N last."""
     return sorted(rows, key=lambda entry: (entry["groups"] is None, entry["groups"] or 0))
-
-
-def _options(entry: Entry) -> Iterator[Entry]:
-    for index, option in enumerate(entry["options"]):
-        name = page.noted(index, {word: entry[word] for word in ("best", "validated")})
-        yield {**option, "path": entry["path"], "sub_goal": entry["sub_goal"], "name": name}
 
 
 def figures(material: Material) -> list[Drawn]:

@@ -19,7 +19,7 @@ from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
 from hypogoal.dataset import Observations, Split, open_dataset
-from hypogoal.domains.base import installed_domain
+from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.views import positions_of
@@ -67,10 +67,15 @@ class Judgement:
     case: Case  # the sub-goal's ensemble and its data
     split: Split  # N held-out states
     unlabelled: Unlabelled  # M states
-    kinds: Sequence[str]  # names of the values of the origin ``kind``
+    domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
     # Filled by the questions: what is said of this sub-goal's members in ``ensembles``.
     row: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def kinds(self) -> Sequence[str]:
+        """Names of the values of the origin ``kind``."""
+        return self.domain.kinds if self.domain else ()
 
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
         """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
@@ -171,7 +176,7 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
     for index, (number, case) in enumerate(cases):
         split, unlabelled = states_of(case.data, case.sub_goal)
         domain = installed_domain(open_dataset(case.data).domain)
-        yield Judgement(number, case, split, unlabelled, domain.kinds if domain else (), judged.pop(index))
+        yield Judgement(number, case, split, unlabelled, domain, judged.pop(index))
     states_of.cache_clear()
 
 

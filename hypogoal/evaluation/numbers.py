@@ -107,7 +107,7 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "died": ("fraction", "share of executions that ended in a terminal state of the episode"),
     "log_odds": ("log-odds", "a member's difference of logits, positive: reached more likely than not"),
     "baseline_log_odds": ("log-odds", "the same of the baseline that a state is compared with"),
-    "attributed": ("log-odds", "sum of a state's DeepLift attributions over pixels and frames"),
+    "attributed": ("log-odds", "sum of a state's attributions over pixels and frames"),
     "completeness_error": (
         "log-odds",
         "|attributed - (log_odds - baseline_log_odds)|; 0 but for rounding if attributions are complete",

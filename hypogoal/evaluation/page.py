@@ -58,6 +58,7 @@ class Material:
     # Filled while the page is made, to be written as files too.
     figures: dict[str, Figure] = field(default_factory=dict)
     drawings: dict[str, str] = field(default_factory=dict)  # the figures' SVG
+    films: Sequence[Block] = ()  # of episodes, see :func:`film`
 
     def comparisons(self, of: str) -> list[Entry]:
         """One method against the others; none in evaluations from before there were any."""
@@ -70,7 +71,7 @@ class Material:
 
     def of_numbers(self) -> bool:
         """Whether observations are no pictures."""
-        return bool(self.within("features"))
+        return any(name.startswith("saliency/") and name.endswith("/features") for name in self.arrays)
 
     def of_ladders(self) -> bool:
         """Whether the run has anything of labelled ladders."""
@@ -188,14 +189,17 @@ def section(
     paragraphs: Iterable[str],
     blocks: Iterable[Block],
     missing: Iterable[str] = (),
+    *,
+    folded: bool = False,
 ) -> Block:
-    """A section of the page."""
+    """A section of the page; until asked for only its title where ``folded``."""
     return {
         "id": identity,
         "title": title,
         "paragraphs": [text for text in paragraphs if text],
         "blocks": list(blocks),
         "missing": list(missing),
+        "folded": folded,
     }
 
 
@@ -227,8 +231,13 @@ def picture(image: NDArray[np.uint8]) -> str:
     return encoded(image_png(reduced(image)))
 
 
+def film(gif: bytes, caption: str) -> Block:
+    """A moving picture."""
+    return {"kind": "film", "gif": encoded(gif), "caption": caption}
+
+
 def encoded(png: bytes) -> str:
-    """A PNG as base64."""
+    """A picture's file as base64."""
     return base64.b64encode(png).decode("ascii")
 
 

@@ -1,6 +1,7 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
 
 from collections.abc import Iterator
+from operator import itemgetter
 
 from rich.console import Group
 from rich.table import Table
@@ -71,6 +72,7 @@ def render(material: Material, version: str) -> str:
     if metrics["quantities"].get("interval") != meanings()["interval"]:
         subtitle += OLDER
     sections = [section for question in QUESTIONS for section in question.sections(material)]
+    sections.sort(key=itemgetter("folded"))  # what is open comes first
     return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version)
 
 

@@ -133,7 +133,8 @@ def sections(material: Material) -> list[Block]:
     caption = (
         "On held-out states of layouts or rooms that no training set holds; mean over ensemble seeds ± standard error."
     )
-    return [page.section("ranking", TITLE, [text], [page.table(COLUMNS, material.metrics["ranking"], caption=caption)])]
+    blocks = [page.table(COLUMNS, material.metrics["ranking"], caption=caption)]
+    return [page.section("ranking", TITLE, [text], blocks, folded=True)]
 
 
 QUESTION = Question(

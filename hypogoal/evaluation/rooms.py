@@ -36,7 +36,7 @@ from hypogoal.evaluation.numbers import (
     ranked,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, legend_below, styled
+from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
 from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
 
 if TYPE_CHECKING:
@@ -58,14 +58,11 @@ WHICH = {
 SHARE = "share of states"
 SPREAD = ("mean", "standard_deviation")  # of the figures
 CELL = ("method", "groups", "sub_goal")  # what rows are over seeds of
-IN_ROOMS = {"balanced_accuracy": "bal. acc.", "accuracy": "accuracy"}
-SEEN = {0: "no", 1: "unlabelled", 2: "labelled"}
 PAPER = (
     "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
     "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
     "positive is not said, so look at the differences between methods and N rather than at the level."
 )
-STYLES = ("-", "--", "-.", ":", (0, (5, 1)))  # 5 beside 6 colours: both come again together after 30
 BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 
 
@@ -263,15 +260,6 @@ SUMMARY = (
     page.number("mean", "distance.mean", page.deviation, 1),
     page.number("at base: best", "distance.reached_base.mean", page.percent),
 )
-INTERVALS = (
-    METHOD,
-    N,
-    *(
-        page.number(f"{scope}: {which}", f"scores.{scope}.balanced_accuracy.{which}", page.interval, 3)
-        for scope in TABLED
-        for which in PICKED
-    ),
-)
 DIFFERENCES = (
     METHOD,
     N,
@@ -288,18 +276,6 @@ DIFFERENCES = (
         )
         for which in ("best", "mean", "worst")
     ),
-)
-SHORT = {"balanced_accuracy": "bal. acc.", "accuracy": "acc.", "precision": "prec.", "recall": "recall"}
-MEMBERS = (
-    page.label("ensemble", "path", once=lambda entry: (entry["path"], entry["sub_goal"])),
-    page.label("member", "name"),
-    *(
-        page.number(f"{scope}: {short}", f"{scope}.{score}", page.fixed, 3)
-        for scope in TABLED
-        for score, short in SHORT.items()
-    ),
-    page.number("validation: bal. acc.", "labelled.balanced_accuracy", page.fixed, 3),
-    page.number("yes, unlabelled", "says_yes_unlabelled", page.fixed, 3),
 )
 
 
@@ -377,7 +353,7 @@ def _stopped(rows: Sequence[Entry]) -> str:
 
 
 def rooms_section(material: Material) -> Block:
-    """Figure 3, its tables, every room and every kind of false positive."""
+    """Figure 3, its tables and every kind of false positive."""
     title = "Hypotheses against labelled ladders"
     if not material.metrics["rooms"]:
         lacking = ["Figure 3: it needs ensemble artefacts of data whose held-out states say which rooms training saw."]
@@ -392,10 +368,9 @@ def rooms_section(material: Material) -> Block:
     blocks = []
     for rows in _by_sub_goal(material):
         blocks += [page.shown(material, figure) for figure in _drawn(material, rows)]
-        blocks += [*(_table(rows, scope) for scope in TABLED), *_over_seeds(rows)]
-        blocks += kinds_tables(material, rows) + room_tables(material, rows)
+        blocks += [*(_table(rows, scope) for scope in TABLED), _differences(rows)]
+        blocks += kinds_tables(material, rows)
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
-    blocks.append(members_table(material))
     return page.section("rooms", title, [text], blocks)
 
 
@@ -424,15 +399,8 @@ def _table(rows: Sequence[Entry], scope: str) -> Block:
     )
 
 
-def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
-    intervals = page.table(
-        INTERVALS,
-        rows,
-        tight=True,
-        folded="Balanced accuracy with intervals",
-        caption=page.INTERVALS.format(units="ensemble seeds"),
-    )
-    differences = page.table(
+def _differences(rows: Sequence[Entry]) -> Block:
+    return page.table(
         DIFFERENCES,
         rows,
         tight=True,
@@ -443,7 +411,6 @@ def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
         "positive and a negative of unseen rooms in which a member gives the positive the higher probability (area "
         "under the ROC curve); what lies between that and balanced accuracy is where its threshold is.",
     )
-    return [intervals, differences]
 
 
 def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
@@ -567,7 +534,10 @@ def _draw_method(
     names: Sequence[str],
 ) -> None:
     index, count = names.index(name), len(names)
-    colour, line = METHOD_COLOURS[index % len(METHOD_COLOURS)], STYLES[index % len(STYLES)]
+    colour, line = (
+        METHOD_COLOURS[index % len(METHOD_COLOURS)],
+        STYLES[index % len(STYLES)],
+    )  # 5 and 6: both again after 30
     marker = MARKERS[index % len(MARKERS)]
     if len(groups) == 1:  # the others with one N lie at the same place
         groups = groups + (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
@@ -630,56 +600,6 @@ def _called_reached(judged: Sequence[Entry], which: str, negatives: Entry) -> st
     else:
         shares = [share[member] for share, member in alike if member is not None]
     return page.fixed(100 * float(np.mean(shares)) if shares else None, 1)
-
-
-def room_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
-    """A folded table for each N: accuracies in every room."""
-    blocks: list[Block] = []
-    for groups, methods in _at_each_n(material, rows):
-        lines = [room for rooms in methods[0][1][:1] for room in rooms["by_room"]]
-        columns = [
-            page.label("room", lambda line: str(line["room"])),
-            page.label("in training", lambda line: SEEN.get(line["seen"], str(line["seen"]))),
-            page.number("states", "states", "{:,}".format),
-            page.number("positives", "positives", "{:,}".format),
-            *(
-                page.number(f"{method}: {name}", partial(_in_room, judged, score), page.fixed, 2)
-                for (method, judged), (score, name) in product(methods, IN_ROOMS.items())
-            ),
-        ]
-        caption = (
-            "Mean over members and ensemble seeds, on the room's held-out states. Rooms without a "
-            "ladder base have no positives and so no balanced accuracy."
-        )
-        folded = f"Every room, N={groups}"
-        blocks += [page.table(columns, lines, tight=True, folded=folded, caption=caption)] if lines else []
-    return blocks
-
-
-def _in_room(judged: Sequence[Entry], score: str, room: Entry) -> float | None:
-    """Every seed's and member's score in a room, on average."""
-    alike = [of for rooms in judged for of in rooms["by_room"] if of["room"] == room["room"]]
-    values = [value for of in alike for value in of[score] if value is not None]
-    return float(np.mean(values)) if values else None
-
-
-def members_table(material: Material) -> Block:
-    """A folded table of every member of every ensemble."""
-    judged = of_rooms(material.metrics["ensembles"])
-    lines = []
-    for ensemble, goal in judged:
-        for index, member in enumerate(goal["members"]):
-            name = page.noted(index, {"validated": goal["rooms"]["validated"]["member"]})
-            scopes = {scope: of["members"][index] for scope, of in goal["rooms"]["scopes"].items()}
-            lines.append({**member, **scopes, "path": ensemble["path"], "sub_goal": goal["sub_goal"], "name": name})
-    return page.table(
-        MEMBERS,
-        lines,
-        tight=True,
-        folded=f"Every member of {len(judged)} ensembles",
-        caption="Validation: held-out states in rooms of labelled groups. The last column is the share of unlabelled "
-        "states that the member calls positive.",
-    )
 
 
 QUESTION = Question(

@@ -213,7 +213,7 @@ def terminations_section(material: Material) -> Block:
     agent, title = _agent(material), "Where options stop"
     if agent is None:
         lacking = ["Overlaid termination states: they need a meta artefact with learned terminations: train-meta."]
-        return page.section("terminations", title, [], [], lacking)
+        return page.section("terminations", title, [], [], lacking, folded=True)
     text = (
         "The states in which a member's classifier ended its option, laid over each other: what all of them share is "
         "sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
@@ -230,7 +230,7 @@ def terminations_section(material: Material) -> Block:
         }
         for index, run in enumerate(agent["runs"])
     ]
-    return page.section("terminations", title, [text, which(agent, material.metrics["selection"])], blocks)
+    return page.section("terminations", title, [text, which(agent, material.metrics["selection"])], blocks, folded=True)
 
 
 def _pair(material: Material, run: Entry, goal: Entry) -> dict[str, Any]:
@@ -260,16 +260,15 @@ def choices_section(material: Material) -> Block:
     agent, title = _agent(material), "Which hypotheses are chosen"
     if agent is None:
         lacking = ["How often each member was chosen: it needs a meta artefact with learned terminations: train-meta."]
-        return page.section("choices", title, [], [], lacking)
+        return page.section("choices", title, [], [], lacking, folded=True)
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
         "would have chosen it: 1 for a chooser that does not care; numbers.csv has the random chooser's too, if one "
         "was run. Match is the balanced accuracy of the member's classifier on the layout, not how good its option is. "
-        f"What that choosing is worth is the question below, '{choosing.TITLE}', for agents whose options can be asked "
-        "anywhere."
+        f"What that choosing is worth is asked in '{choosing.TITLE}', of agents whose options can be asked anywhere."
     )
     members = [_members(run, folded=index > 0) for index, run in enumerate(agent["runs"])]
-    return page.section("choices", title, [text, which(agent, material.metrics["selection"])], members)
+    return page.section("choices", title, [text, which(agent, material.metrics["selection"])], members, folded=True)
 
 
 def _members(run: Entry, *, folded: bool) -> Block:

@@ -32,6 +32,15 @@ class EnsembleConfig:
         "pictures, mlp for other observations",
         source="the paper's appendix",
     )
+    encoder: str = setting(
+        "separate",
+        "a network but its last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
+        source="the paper; shared: DivDis (arXiv:2202.03418)",
+        choices=("separate", "shared", "frozen"),
+    )
+    hidden_width: int = setting(
+        0, "units of a layer of each member's own behind the encoder; 0: none", low=0, high=65535
+    )
     steps: int = setting(
         150,
         "gradient steps (of each member, where sequential)",

@@ -58,16 +58,16 @@ def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
     """(kernel size, stride) of each convolution and pooling; None where a layer is of no supported kind."""
     windows = []
     for layer in network:
-        if isinstance(layer, (nn.Conv2d, nn.MaxPool2d)):
+        if type(layer) is nn.Conv2d or type(layer) is nn.MaxPool2d:  # no class that computes something else
             kernel, stride = _side(layer.kernel_size), _side(layer.stride)
             plain = min(kernel, stride) > 0 and _side(layer.padding) == 0 and _side(layer.dilation) == 1
             if not plain or getattr(layer, "groups", 1) != 1 or getattr(layer, "ceil_mode", False):
                 return None
             windows.append((kernel, stride))
-        elif isinstance(layer, nn.BatchNorm2d):
+        elif type(layer) is nn.BatchNorm2d:
             if not (layer.affine and layer.track_running_stats and layer.momentum):
                 return None
-        elif not isinstance(layer, (nn.ReLU, nn.Flatten, nn.Linear)):
+        elif type(layer) not in (nn.ReLU, nn.Flatten, nn.Linear):
             return None
     return windows or None
 

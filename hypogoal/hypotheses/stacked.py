@@ -27,8 +27,8 @@ class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
     The first convolution's filters stand side by side, later ones are grouped, dense layers are batched products.
-    Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Own networks with layers of other kinds
-    are not ``joined``: each ensemble predicts by itself.
+    Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Networks with layers of other kinds, or
+    an encoder that members share, are not ``joined``: each ensemble predicts by itself.
 
     The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
     ``repeats``: states are of a grid world, so what convolutions make of windows is kept, see :mod:`.windows`; where
@@ -42,7 +42,7 @@ class StackedMembers:
         self._one_view = all(isinstance(ensemble.view, FullView) for ensemble in ensembles)
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
         self.count = len(networks)
-        self.joined = _can_be_joined(networks[0])
+        self.joined = ensembles[0].trunk is None and _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
         self._known: KnownWindows | None = None
         if not self.joined:
@@ -102,12 +102,12 @@ class StackedMembers:
 def _can_be_joined(network: nn.Sequential) -> bool:
     flat = False
     for layer in network:
-        if isinstance(layer, nn.Flatten):
+        if type(layer) is nn.Flatten:
             fits, flat = (layer.start_dim, layer.end_dim) == (1, -1) and not flat, True
-        elif isinstance(layer, nn.Conv2d):
+        elif type(layer) is nn.Conv2d:
             fits = not flat and layer.groups == 1 and layer.padding_mode == "zeros"
         else:
-            fits = (isinstance(layer, nn.Linear) and flat) or isinstance(layer, WITHOUT_WEIGHTS)
+            fits = (type(layer) is nn.Linear and flat) or type(layer) in WITHOUT_WEIGHTS
         if not fits:
             return False
     return flat

@@ -90,6 +90,9 @@ def fit(
             raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
         if config.threshold in NEED_UNLABELLED:
             raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
+    if config.schedule == "sequential" and config.encoder == "shared":
+        what = "members one after the other cannot share an encoder that learns"
+        raise UserError(what, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
     view = view_of(
@@ -103,13 +106,14 @@ def fit(
         fitted=not saved,
     )
     generator = torch_generator(seed, "weights")
-    ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)
-    ensemble.to(device)
+    ensemble = Ensemble(
+        config.network, observations.shape[1:], config.members, generator, view, config.encoder, config.hidden_width
+    ).to(device)
     if saved:
         ensemble.load_state_dict(saved["ensemble"])
         if isinstance(on_step, Report):
             on_step.restore(saved["told"])
-    networks = ensemble.networks()
+    trunk, networks = ensemble.parts
     by_ladder = config.batch_kind == "per-ladder"
     ladders = needed(origins, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
     states = TrainingStates(
@@ -122,6 +126,8 @@ def fit(
         grey=config.augment != "none",
         context=config.augment == "grey-context",
         jitter=config.jitter,
+        trunk=trunk,
+        frozen=ensemble.frozen,
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
@@ -176,7 +182,7 @@ class _Round:
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
         self.optimiser = torch.optim.Adam(
-            [weight for network in self.networks for weight in network.parameters()],
+            [*states.shared, *(weight for network in self.networks for weight in network.parameters())],
             lr=config.learning_rate,
             weight_decay=config.l2_weight,
             fused=True,

@@ -273,7 +273,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(run, page):
     titles = re.findall(r"<h2>(.*?)</h2>", page)
     assert titles == [
         "Summary", "Hypotheses against labelled ladders", "Options on ladders", "Where options stop on the ladders",
-        "Ranking, whatever the threshold", "Explore the hypotheses", "Example states", "What members look at",
+        "Explore the hypotheses", "Ranking, whatever the threshold", "What members look at",
         "Data, settings, provenance",
     ]  # fmt: skip
     assert page.count("<figure") == 5

@@ -6,14 +6,17 @@ import ast
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 from test_docs import blocks, commands
 
-from hypogoal import OptionEnv, load_options
+from hypogoal import OptionEnv, load_ensemble, load_options
 from hypogoal.cli import main
 from hypogoal.dataset import open_dataset
+from hypogoal.evaluation import explorer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
@@ -160,6 +163,37 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     assert main(["export", data, "--out", str(again)]) == 0
     assert main(["import", str(again), "--out", str(tmp_path / "again.h5"), "-q"]) == 0
     assert open_dataset(tmp_path / "again.h5").features() == open_dataset(run / "data.h5").features()
+
+
+def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A1-A8, B6, C5, F2: the example's own commands; the page's lines rebuild a member without hypogoal."""
+    example = EXAMPLES / "frozen_backbone.py"
+    text = example.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 40
+    (tmp_path / example.name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    lines = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", "").splitlines()
+    monkeypatch.setattr(explorer, "MOST_INTEGRATED", 2)
+    two = settings("sub_goals=collect-red-key,open-red-door")
+    few = {**SHORT, "collect": settings("unlabelled_seeds=1", "heldout_layouts=1")}
+    few["train-ensemble"] = [*SHORT["train-ensemble"], *two]
+    for words in (line.split() for line in lines):
+        if words[:1] == ["export"]:
+            monkeypatch.setenv(*words[1].split("="))
+        elif words[:1] == ["hypogoal"]:
+            assert main([*words[1:], *few.get(words[1], ())]) == 0, words
+    run = tmp_path / "runs" / "backbone"
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    states = [state for goal in metrics["saliency"]["sub_goals"] for state in goal["states"]]
+    assert states and all(state["method"] == "integrated gradients" for state in states)
+    worst = max(member["completeness_error"] for state in states for member in state["members"])
+    assert worst < 1e-3
+    assert "Attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    found: dict[str, Any] = {}
+    exec(compile(blocks(EXAMPLES.parent / "docs" / "formats.md", "python")[4], "formats.md", "exec"), found)
+    logits = load_ensemble(run / "ensemble", "collect-red-key").logits(found["images"].numpy())[:, 0]
+    np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-5)
 
 
 @pytest.mark.atari

@@ -179,14 +179,6 @@ def test_batchnorm_folds_into_the_convolutions(name: str) -> None:
     assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
 
 
-def test_batchnorm_hidden_in_a_layer_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec C5, G2: labelled and unlabelled states pass together, and BatchNorm has to see them apart."""
-    hidden = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4))
-    monkeypatch.setitem(NETWORKS, "hidden", lambda _: ([hidden], (5,)))
-    with pytest.raises(UserError, match=r"BatchNorm inside another layer: hidden\. Make it a layer of its own"):
-        network_of("hidden", (8, 8, 3))
-
-
 def test_as_input_scales_and_turns() -> None:
     """Spec B1: uint8 (N, H, W, C) -> float (N, C, H, W) in 0..1."""
     observations = torch.zeros(2, 4, 5, 3, dtype=torch.uint8)
