@@ -92,10 +92,9 @@ def standard_of(shape: tuple[int, ...], *observations: Observations) -> Standard
     return mean.astype(NUMBERS), deviation.astype(NUMBERS)
 
 
-def standardised(observations: Observations, standard: Standard) -> NDArray[np.float32]:
-    """Numbers (N, *shape) in deviations from their mean."""
-    mean, deviation = standard
-    return np.asarray(((observations - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS))
+def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
+    """Numbers (N, *shape) in deviations from their mean (*shape), arrays or tensors."""
+    return ((observations - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS)
 
 
 def leave_out(states: States, *known: Observations) -> States:
@@ -253,13 +252,12 @@ class Dataset:
 
     def features(self) -> list[str]:
         """Names of the numbers of an observation that is no picture, in their order; ``x0``, ... where it has none."""
-        with self._file() as file:
-            named = hdf5.find(file, "features") is not None
-            text = hdf5.read_array(file, "features", "S").tobytes().rstrip(b"\0") if named else b""
         count = prod(self.observation_shape)
-        if not text:
-            return [f"x{number}" for number in range(count)]
-        names = parse_json(text.decode(errors="replace"), self.path, "names of features are", AGAIN)
+        with self._file() as file:
+            if hdf5.find(file, "features") is None:
+                return [f"x{number}" for number in range(count)]
+            text = hdf5.read_array(file, "features", "S").tobytes().rstrip(b"\0").decode(errors="replace")
+        names = parse_json(text, self.path, "names of features are", AGAIN)
         if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
             raise UserError("the data file has other names than features", self.path, AGAIN)
         return names

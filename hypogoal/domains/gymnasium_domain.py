@@ -64,6 +64,7 @@ class GymnasiumDomain(Domain):
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: distinct states that training keeps observations of, see ``GymnasiumEngine``.
         features: names of the numbers in observations that are no pictures; None, those of a ``Dict``, else x0, x1, ...
+        resize: pixels of a side to which pictures are resized; 0, not at all.
         name: for messages; artefacts name the domain as the user named it to ``collect``.
         config_class: a frozen dataclass that adds settings of its own to ``GymnasiumConfig``: ``make`` gets them, in
             collection, training, baselines and evaluation alike.
@@ -84,11 +85,12 @@ class GymnasiumDomain(Domain):
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = engines.MEMORY,
         features: Sequence[str] | None = None,
+        resize: int = 0,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
         self.make, self.policy, self.memory, self.name = make, policy, memory, name
-        self.success, self._named = success, tuple(features or ())
+        self.success, self._named, self.resize = success, tuple(features or ()), resize
         self.config_class = config_class
         generic = {field.name for field in fields(GymnasiumConfig)}
         self._own_settings = {field.name: field.default for field in fields(config_class) if field.name not in generic}
@@ -122,7 +124,8 @@ class GymnasiumDomain(Domain):
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: settings of its own, the defaults of those that are not there."""
-        return engines.made(self.make, **{**self._own_settings, **arguments})
+        env = engines.made(self.make, **{**self._own_settings, **arguments})
+        return engines.resized(env, self.resize) if self.resize else env
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> engines.GymnasiumEngine:
         """An engine of ``count`` environments of one layout; ``arguments``: ``memory``, and settings of its own."""

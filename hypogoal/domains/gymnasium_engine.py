@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from PIL import Image
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
@@ -66,15 +67,16 @@ class Look(NamedTuple):
     def read(self, env: gymnasium.Env, observation: Any) -> Any:
         """An observation (*shape), in memory of its own; a ``UserError`` where its space says other."""
         code = UsersCode("the environment", env, "step")
-        plain = isinstance(self.space, spaces.Box) and not self.key
-        if not (plain and isinstance(observation, np.ndarray)):
-            with code:
-                flat = observation[self.key] if self.key else observation
-                observation = np.asarray(flat if plain or self.key else spaces.flatten(self.space, flat))
-        kind = NUMBERS if self.dtype == NUMBERS and observation.dtype.kind in "iufb" else observation.dtype
-        values = np.array(observation, kind, order="C")
+        with code:
+            if self.key:
+                observation = observation[self.key]
+            elif not isinstance(self.space, spaces.Box):
+                observation = spaces.flatten(self.space, observation)
+            values = np.array(observation, order="C")
+        given = f"{values.dtype} {values.shape}"
+        if self.dtype == NUMBERS and values.dtype.kind in "iufb":
+            values = values.astype(NUMBERS)
         if values.dtype != self.dtype or values.shape not in (self.shape, self.space.shape):
-            given = f"{observation.dtype} {observation.shape}"
             do = f"Make the observation space and the observations agree; the former says {self.dtype} {self.shape}."
             code.refuse(f"gave another observation than its space says: {given}", do)
         if self.dtype == NUMBERS and not np.isfinite(values).all():
@@ -106,12 +108,24 @@ def look_of(env: gymnasium.Env) -> Look:
         do = "Wrap it so that it gives those, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
         what = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
         raise UserError(what, whole, do) from None
-    features: list[str] = []
-    for name, size in sizes:
-        several = [f"{name}[{place}]" if name else f"x{place}" for place in range(size)]
-        features += [name] if name and size == 1 else several
-    shape = tuple(space.shape) if isinstance(space, spaces.Box) and space.shape else (len(features),)
+    names = [(name, size, place) for name, size in sizes for place in range(size)]
+    features = [(name if size == 1 else f"{name}[{place}]") if name else f"x{place}" for name, size, place in names]
+    shape = (isinstance(space, spaces.Box) and space.shape) or (len(features),)
     return Look(space, shape, NUMBERS, tuple(features))
+
+
+def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
+    """The same with pictures of side x side pixels, means over areas; without pictures a ``UserError``."""
+    look = look_of(env)
+    if look.dtype != PICTURE:
+        raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
+
+    def small(observation: Any) -> NDArray[np.uint8]:
+        channels = map(Image.fromarray, np.moveaxis(look.read(env, observation), -1, 0))
+        return np.stack([np.asarray(one.resize((side, side), Image.Resampling.BOX)) for one in channels], -1)
+
+    space = spaces.Box(0, 255, (side, side, look.shape[-1]), np.uint8)
+    return gymnasium.wrappers.TransformObservation(env, small, space)
 
 
 def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:

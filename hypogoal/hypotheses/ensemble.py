@@ -19,7 +19,7 @@ from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
 from hypogoal.hypotheses.networks import NETWORKS, another, as_input, build_network, folded, network_for, reordered
-from hypogoal.hypotheses.views import AgentView, FullView, StandardView, View
+from hypogoal.hypotheses.views import AgentView, FullView
 
 THRESHOLD = 0.5  # of the probability, where none was chosen
 CHUNK = 64  # images at once in a plain forward pass: what fits a CPU's cache; on a GPU 16 times as many
@@ -61,7 +61,7 @@ class Ensemble(nn.Module):
         observation_shape: tuple[int, ...],
         members: int,
         generator: torch.Generator,
-        view: View | None = None,
+        view: FullView | AgentView | None = None,
         encoder: str = "separate",
         hidden_width: int = 0,
     ):
@@ -214,7 +214,7 @@ class Ensemble(nn.Module):
         observation_shape: tuple[int, ...],
         members: int,
         state: Mapping[str, Tensor],
-        view: View | None = None,
+        view: FullView | AgentView | None = None,
         **settings: Any,
     ) -> Ensemble:
         """The ensemble that ``state()`` was taken from, in evaluation mode; a ``UserError`` where it is no such state.
@@ -278,13 +278,15 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
 
 
-def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]) -> View:
+def _view(
+    observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
+) -> FullView | AgentView:
     """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
     if config.get("observation_dtype") == str(NUMBERS):
         mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
         if mean.shape != observation_shape:  # a manifest may ask for terabytes
             raise ValueError(observation_shape)
-        return StandardView(observation_shape, (mean, deviation))
+        return FullView(observation_shape, (mean, deviation))
     if config.get("view", "full") == "full":
         return FullView(observation_shape)
     localiser: Localiser = LearnedLocaliser(observation_shape)

@@ -21,44 +21,29 @@ CHUNK = 1024  # states at once: so many crops are gathered from whole images at 
 
 
 class FullView(nn.Module):
-    """All of a picture, as it is: the paper's view."""
+    """All of an observation: a picture as it is, the paper's view; of no picture each number by its ``standard``."""
 
-    needs_positions, dtype = False, PICTURE
-
-    def __init__(self, observation_shape: tuple[int, ...]):
-        super().__init__()
-        self.shape = observation_shape
-
-    def see(
-        self, observations: Any, positions: NDArray[np.int64] | None = None, *, margin: int = 0
-    ) -> NDArray[np.uint8]:
-        """The observations."""
-        assert not margin, "all of it has nothing around it"
-        return observations
-
-
-class StandardView(nn.Module):
-    """All of an observation that is no picture: each number's deviations from its mean in the training data."""
-
-    needs_positions, dtype = False, NUMBERS
+    needs_positions = False
     mean: Tensor
     deviation: Tensor
 
     def __init__(self, observation_shape: tuple[int, ...], standard: Standard | None = None):
         super().__init__()
-        self.shape = observation_shape
-        for name, values in zip(("mean", "deviation"), standard or standard_of(observation_shape), strict=True):
+        self.shape, self.dtype = observation_shape, NUMBERS if standard else PICTURE
+        for name, values in zip(("mean", "deviation"), standard or (), strict=False):
             self.register_buffer(name, torch.from_numpy(values.copy()))
 
-    def standard(self) -> Standard:
-        """Mean and deviation, (*shape)."""
-        return self.mean.cpu().numpy(), self.deviation.cpu().numpy()
+    @property
+    def standard(self) -> Standard | None:
+        """Mean and deviation, (*shape), of numbers."""
+        return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if self.dtype == NUMBERS else None
 
     def see(
         self, observations: Observations, positions: NDArray[np.int64] | None = None, *, margin: int = 0
-    ) -> NDArray[np.float32]:
-        """float32 (N, *shape) of as many."""
-        return standardised(observations, self.standard())
+    ) -> Observations:
+        """The observations (N, *shape)."""
+        assert not margin, "all of it has nothing around it"
+        return standardised(observations, *self.standard) if self.standard else observations
 
 
 class AgentView(nn.Module):
@@ -69,7 +54,7 @@ class AgentView(nn.Module):
     policy may see: an oracle.
     """
 
-    dtype = PICTURE
+    dtype, standard = PICTURE, None
 
     def __init__(self, observation_shape: tuple[int, ...], height: int, width: int, localiser: Localiser):
         super().__init__()
@@ -131,9 +116,6 @@ def needed(origins: Origins | None, names: tuple[str, ...], why: str) -> Origins
     return origins
 
 
-View = FullView | StandardView | AgentView
-
-
 def view_of(
     observations: Any,
     unlabelled: Any,
@@ -144,14 +126,14 @@ def view_of(
     agent_pixels: Pixels | None,
     *,
     fitted: bool,
-) -> View:
+) -> FullView | AgentView:
     """What the members are to see; what learns of it is trained here, or where not ``fitted`` to be loaded."""
     shape = observations.shape[1:]
     if observations.dtype == NUMBERS:
         for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
             if (given := getattr(config, name)) != value:
                 raise UserError("these observations are no pictures", f"{name}={given}", f"Set {name}={value}.")
-        return StandardView(shape, standard_of(shape, observations, unlabelled) if fitted else None)
+        return FullView(shape, standard_of(shape, *([observations, unlabelled] if fitted else [])))
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")

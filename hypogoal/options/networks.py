@@ -1,6 +1,7 @@
 """Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,9 +10,9 @@ from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import DEVIATIONS, Standard
+from hypogoal.dataset import Standard, standardised
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.views import StandardView
+from hypogoal.hypotheses.views import FullView
 from hypogoal.options.windows import AgentWindows
 
 CELL = 8  # pixels
@@ -79,17 +80,17 @@ class PictureEmbedding(nn.Module):
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
-class NumberEmbedding(StandardView):
-    """Observations that are no pictures, float32 (N, *shape): each number's deviations from a mean."""
+class NumberEmbedding(FullView):
+    """Observations that are no pictures: each number's deviations from a mean."""
 
     @property
     def features(self) -> int:
-        """How many numbers."""
+        """How many."""
         return self.mean.numel()
 
-    def forward(self, observations: Tensor) -> Tensor:
+    def forward(self, observations: Tensor) -> Any:
         """float32 (N, *shape) -> float32 (N, features)."""
-        return ((observations - self.mean) / self.deviation).clamp(-DEVIATIONS, DEVIATIONS).flatten(1)
+        return standardised(observations, self.mean, self.deviation).flatten(1)
 
 
 def standard_in(weights: Mapping[str, Tensor]) -> Standard | None:

@@ -21,7 +21,6 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.run import read_table
 from hypogoal.hypotheses.ensemble import THRESHOLD, read_ensemble
 from hypogoal.hypotheses.thresholds import log_odds_of
-from hypogoal.hypotheses.views import StandardView
 from hypogoal.meta.config import AuditConfig
 from hypogoal.meta.training import assemble, columns_of, description, start_arguments, train, write_trained
 from hypogoal.needs import play_needs
@@ -57,7 +56,7 @@ def audit(
         source = open_artefact(Path(classifier), "ensemble").whole()
         ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
         classify, inputs = member_of(ensemble, member), [source.path]
-        standard = ensemble.view.standard() if isinstance(ensemble.view, StandardView) else None
+        standard = ensemble.view.standard
         threshold = config.threshold or float(ensemble.thresholds[member])
         lived = source.config["domain_config"] if source.config["domain"] == domain else lived
     edges = np.array([threshold, config.mend] if config.mend else [threshold])
@@ -76,10 +75,11 @@ def audit(
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
             return np.repeat(classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
 
+        engine.standard = standard or engine.standard
         rule, length = rule_of(config.termination)
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 
-    loop = assemble(world, Path(), about, config, seed, device, ends, standard)
+    loop = assemble(world, Path(), about, config, seed, device, ends)
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
     settings = description(loop, world, about, config, classifier=classifier, member=member, steps=steps)
     with create_artefact(

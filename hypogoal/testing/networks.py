@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import NUMBERS, PICTURE
+from hypogoal.dataset import NUMBERS, PICTURE, standard_of
 from hypogoal.evaluation.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, build_network
 from hypogoal.hypotheses.stacked import StackedMembers
-from hypogoal.hypotheses.views import FullView, StandardView
+from hypogoal.hypotheses.views import FullView
 from hypogoal.testing.verdict import Test, Verdict, promise, run
 
 CLOSE = 1e-4
@@ -24,12 +24,12 @@ def check_network(
     name: str, observation_shape: tuple[int, ...] = (64, 64, 3), observation_dtype: np.dtype[Any] = PICTURE
 ) -> Iterator[Verdict]:
     """Whether a member network, a name as of ``--set network``, can be trained, stored, predicted with, explained."""
-    view = (FullView if observation_dtype == PICTURE else StandardView)(observation_shape)
+    view = FullView(observation_shape, standard_of(observation_shape) if observation_dtype == NUMBERS else None)
     return run(_Network(name, view).tests())
 
 
 class _Network:
-    def __init__(self, name: str, view: FullView | StandardView):
+    def __init__(self, name: str, view: FullView):
         self.name, self.shape, self.view = name, view.shape, view
 
     def tests(self) -> Iterator[Test]:

@@ -138,7 +138,7 @@ def test_numbers_are_standardised_and_cut() -> None:
     mean, deviation = standard_of((2,), data[:1000], data[1000:])
     np.testing.assert_allclose(mean, [data[:, 0].mean(), 7], rtol=1e-5)
     np.testing.assert_allclose(deviation, [data[:, 0].std(), 1], rtol=1e-5)
-    seen = standardised(np.array([[5.0, 7.5], [500.0, 7.0]], np.float32), (mean, deviation))
+    seen = standardised(np.array([[5.0, 7.5], [500.0, 7.0]], np.float32), mean, deviation)
     assert seen.dtype == NUMBERS and seen[1].tolist() == [DEVIATIONS, 0.0]
     np.testing.assert_allclose(seen[0], [(5 - mean[0]) / deviation[0], 0.5], rtol=1e-5)
     assert [part.tolist() for part in standard_of((2,))] == [[0, 0], [1, 1]]

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.deep_lift import deep_lift, mean_state
+from hypogoal.evaluation.deep_lift import DEEP_LIFT, INTEGRATED, attributed, deep_lift, mean_state
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
@@ -52,7 +53,7 @@ def test_members_learn_numbers_of_any_size_and_shape(shape: tuple[int, ...], tmp
 def test_all_members_at_once_say_the_same(shape: tuple[int, ...]) -> None:
     """Spec D1: of ensembles that standardise otherwise, too; of one, and of pictures that a plain network sees."""
     ensembles = [trained(shape, steps=5, seed=seed) for seed in (0, 1)]
-    ensembles[1].view.mean += 1.0  # type: ignore[union-attr]
+    ensembles[1].view.mean += 1.0
     seen, _ = states(20, 4, shape)
     stacked = StackedMembers(ensembles)
     assert stacked.joined
@@ -88,3 +89,40 @@ def test_a_network_for_pictures_is_refused() -> None:
     """Spec G2."""
     with pytest.raises(UserError, match=r"'montezuma' takes images \(H, W, C\): .* Give --set network=mlp"):
         trained(network="montezuma")
+
+
+class Reader(nn.Module):
+    """Of four numbers, in an order of their own, what is above their mean."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mix = nn.Linear(4, 16)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.mix(x.flatten(1)))
+
+
+def reader(channels: int) -> nn.Module:
+    return Reader()
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 1, 2)])
+@pytest.mark.parametrize(("network", "encoder"), [("test_standard_view:reader", "separate"), ("mlp", "shared")])
+@pytest.mark.parametrize("frozen", [False, True])
+def test_numbers_may_have_an_encoder(
+    network: str, encoder: str, frozen: bool, shape: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec C5, F2: any module, of each member, of all, or frozen; stored, read, asked at once, and explained."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", network)
+    settings = {"network": network, "encoder": "frozen" if frozen else encoder}
+    ensemble, (seen, labels) = trained(shape, learning_rate=0.01, **settings), states(200, 3, shape)
+    assert ((ensemble.verdicts(seen) == labels[:, None]).mean(0) > 0.8).all()
+    write_ensemble(tmp_path, "up", ensemble)
+    about = {"sub_goals": ["up"], "members": 2, "observation_shape": list(shape), "observation_dtype": "float32"}
+    log_odds = ensemble.log_odds(seen)
+    np.testing.assert_array_equal(read_ensemble(tmp_path, about | settings, "up").log_odds(seen), log_odds)
+    np.testing.assert_allclose(StackedMembers([ensemble]).log_odds(seen), log_odds, atol=1e-5)
+    found = attributed(ensemble, ensemble.see(seen[:20]), mean_state(ensemble.see(seen)))
+    assert found.method == (DEEP_LIFT if network == "mlp" else INTEGRATED)
+    assert found.values.shape == (20, 2, *shape) and found.completeness_error().max() < 0.05
+    assert (np.abs(found.values).mean(0).reshape(2, 4).argmax(1) == 2).all()

@@ -39,7 +39,7 @@ class EngineEnv(VecEnv):
         images = self.engine.images(ids)
         if images.dtype == PICTURE:
             return images.transpose(0, 3, 1, 2)
-        return standardised(images, self.engine.standard) if self.engine.standard else images
+        return standardised(images, *self.engine.standard) if self.engine.standard else images
 
     def reset(self) -> Observations:
         """Put every environment at the start of an episode."""
