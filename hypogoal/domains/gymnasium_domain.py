@@ -63,7 +63,7 @@ class GymnasiumDomain(Domain):
         policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: distinct states that training keeps observations of, see ``GymnasiumEngine``.
-        features: names of the numbers in observations that are no pictures; None, those of a ``Dict``, else x0, x1, ...
+        features: names of the numbers in observations that are no pictures; else those of a ``Dict``, or x0, x1, ...
         resize: pixels of a side to which pictures are resized; 0, not at all.
         name: for messages; artefacts name the domain as the user named it to ``collect``.
         config_class: a frozen dataclass that adds settings of its own to ``GymnasiumConfig``: ``make`` gets them, in
@@ -84,13 +84,13 @@ class GymnasiumDomain(Domain):
         policy: Policy | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = engines.MEMORY,
-        features: Sequence[str] | None = None,
+        features: Sequence[str] = (),
         resize: int = 0,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
         self.make, self.policy, self.memory, self.name = make, policy, memory, name
-        self.success, self._named, self.resize = success, tuple(features or ()), resize
+        self.success, self._named, self.resize = success, tuple(features), resize
         self.config_class = config_class
         generic = {field.name for field in fields(GymnasiumConfig)}
         self._own_settings = {field.name: field.default for field in fields(config_class) if field.name not in generic}

@@ -130,9 +130,8 @@ def saliency_section(material: Material) -> Block:
     )
     if bars := [page.shown(material, drawn) for drawn in feature_figures(material)]:
         text = (
-            f"Attributions by {method} of each member of {found['ensemble']} (seed {found['seed']}) to the features of "
-            f"held-out states, against {found['baseline']}. A member that goes by what means something else elsewhere "
-            "cannot transfer."
+            f"Attributions by {method} of each member of {found['ensemble']} (seed {found['seed']}), against "
+            f"{found['baseline']}. A member that goes by what means something else elsewhere cannot transfer."
         )
     check = (
         f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "

@@ -1,7 +1,6 @@
 """Actor and critic over options (Spec E2), and the two ways an option is drawn from the actor's output."""
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +13,8 @@ class LightMetaNetwork(LightNetwork):
     """Cells, or numbers where there is a ``standard`` of them, two dense layers, actor and critic."""
 
     def __init__(self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None):
-        kind = CellEmbedding if standard is None else partial(NumberEmbedding, standard=standard)
-        super().__init__(kind(observation_shape))
+        cells = NumberEmbedding(observation_shape, standard) if standard else CellEmbedding(observation_shape)
+        super().__init__(cells)
         self.outputs = nn.Linear(WIDTH, options + 1)
         _quiet_start(self.outputs)
 

@@ -52,7 +52,7 @@ class Narrowed:
 
     def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float):
         weights = below(PREFIX, state)
-        make = partial(LightQNetwork, shape, options, 1, standard_in(weights))
+        make = partial(LightQNetwork, shape, options, 1, standard_in(weights, shape))
         self.network = load_fitting(make, weights, NAME)
         others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
         check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
@@ -81,8 +81,7 @@ class Initiation(Resumable):
         self.rng = rng_for(seed, "initiation")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "initiation-weights"))
-            network = LightQNetwork(engine.observation_shape, options, actions=1, standard=engine.standard)
-            self.network = network.to(self.device)
+            self.network = LightQNetwork(engine.observation_shape, options, 1, engine.standard).to(self.device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=LEARNING_RATE, fused=True)
         self.states, self.option = np.zeros((2, KEPT), dtype=np.int64)
         self.reached = np.zeros(KEPT, dtype=np.bool_)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import Standard, standardised
+from hypogoal.dataset import Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.views import FullView
 from hypogoal.options.windows import AgentWindows
@@ -93,10 +93,9 @@ class NumberEmbedding(FullView):
         return standardised(observations, self.mean, self.deviation).flatten(1)
 
 
-def standard_in(weights: Mapping[str, Tensor]) -> Standard | None:
-    """That of a light network's weights; None where it sees pictures."""
-    found = [weights[name].numpy() for name in ("cells.mean", "cells.deviation") if name in weights]
-    return (found[0], found[1]) if len(found) == 2 else None
+def standard_in(weights: Mapping[str, Tensor], shape: tuple[int, ...]) -> Standard | None:
+    """One that a light network's weights are to replace; None where they are of one that sees pictures."""
+    return standard_of(shape) if "cells.mean" in weights else None
 
 
 Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding
@@ -220,7 +219,7 @@ class Pixels:
 
     def __init__(self, engine: Pictures, most: int, device: torch.device):
         self.engine, self.device = engine, device
-        self._images: NDArray[np.uint8] = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
+        self._images = np.zeros((most, *engine.observation_shape), dtype=np.uint8)
         self._pixels = torch.zeros(self._images.shape) if device.type == "cpu" else None
 
     def of(self, ids: NDArray[np.int64]) -> Tensor:

@@ -64,7 +64,7 @@ class LightPolicies:
         self.localiser = localiser
         shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
         weights = below("online.", weights)
-        make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights))
+        make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape))
         self.network = load_fitting(make, weights, "options.safetensors")
         self.actions = actions
 
