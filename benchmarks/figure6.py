@@ -62,8 +62,8 @@ def collect(run: Path, path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        for key in sorted(there, key=lambda key: (order.index(key[0]), int(key[1]))):
-            writer.writerows(there[key])
+        for place in sorted(there, key=lambda key: (order.index(key[0]), int(key[1]))):
+            writer.writerows(there[place])
 
 
 def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:

@@ -343,25 +343,6 @@ INTERVALS = (
     page.number("discounted return", "discounted_return", page.interval, 2),
     page.number("runs", "success.n"),
 )
-EVERY_RUN = (
-    page.label("agent", "name", once=True),
-    page.number("layout", "layout_seed"),
-    page.number("seed", "seed"),
-    page.number("budget", "steps", page.thousands),
-    page.number("episodes", "episodes"),
-    page.number("success", "success", page.percent),
-    page.number("steps", "length", page.fixed, 1),
-    page.number("× shortest", "length_over_shortest", page.fixed, 2),
-    page.number(*NEARLY, page.fixed, 2),
-    page.number("return", "discounted_return", page.fixed, 2),
-    page.number("95 % at", "steps_to_95", lambda steps: "never" if steps is None else page.thousands(steps)),
-)
-LAYOUTS = (
-    page.label("layout seed", lambda layout: str(layout["layout_seed"])),
-    page.number("shortest path, steps", "shortest_path", page.fixed, 0),
-    page.number("random play succeeds", "random_success", page.percent),
-    page.number("episodes of random play", "random_episodes"),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -372,10 +353,11 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The summary with film and curves, and every run's numbers, of a run with agents."""
+    """The summary with film and curves, of a run with agents; intervals of three runs or more, one run's are none."""
     if not material.of_agents():
         return []
-    return [summary_section(material), *([runs_section(material)] if material.metrics["agents"] else [])]
+    several = max((len(agent["runs"]) for agent in material.metrics["agents"]), default=0) >= SEVERAL
+    return [summary_section(material), *([runs_section(material)] if several else [])]
 
 
 def summary_section(material: Material) -> Block:
@@ -404,13 +386,13 @@ def summary_section(material: Material) -> Block:
 
 def _answers(material: Material) -> list[str]:
     """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
-    agents, window = material.metrics["agents"], material.metrics["settings"]["window"]
+    agents = material.metrics["agents"]
     shown = variants(agents)
     several = len(shown) > 1
     paragraphs = []
     for agent in shown:
         name = f"the agent '{agent['name']}'" if several else "the option agent"
-        text = _achieved(agent, name, window)
+        text = _achieved(agent, name)
         control = control_of(material, agent)
         alike = not several or control is None or same_settings(agent, control)
         among = f"uniformly random choice among options of {'the same members' if alike else 'its ensemble'}"
@@ -431,14 +413,14 @@ def _answers(material: Material) -> list[str]:
     return paragraphs
 
 
-def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
+def _achieved(agent: Mapping[str, Any], name: str) -> str:
     success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
     if success is None:
         return f"No episode of {name} came to its end ({runs_of(agent)}): it needs more steps."
     against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
     return (
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
-        f"{_episodes(agent, window)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
+        f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
 
 
@@ -452,12 +434,11 @@ def _listed(others: Sequence[tuple[str, Entry]]) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _episodes(agent: Mapping[str, Any], window: int) -> str:
+def _episodes(agent: Mapping[str, Any]) -> str:
     """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
-    counts = [min(window, run["episodes"]) for run in agent["runs"] if run["episodes"]]
-    fewest, most = min(counts), max(counts)
-    count = str(most) if fewest == most else f"{fewest} to {most}"
-    return f"{count} training episode{'s' if most > 1 else ''}"
+    windows = sorted({run["window"] for run in agent["runs"] if run["window"]})
+    count = f"{windows[0]} to {windows[-1]}" if len(windows) > 1 else str(windows[0])
+    return f"{count} training episode{'s' if windows[-1] > 1 else ''}"
 
 
 def runs_of(agent: Entry) -> str:
@@ -471,29 +452,18 @@ def runs_of(agent: Entry) -> str:
 
 
 def runs_section(material: Material) -> Block:
-    """Every run's numbers; intervals and pairs from three runs on, since one run's are its numbers once more."""
+    """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
     digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
-    spread = [
+    blocks = [
         page.table(
             INTERVALS,
             agents,
-            heading="Intervals",
             caption=f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
         ),
         *page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits),
     ]
-    blocks = [
-        *(spread if max(len(agent["runs"]) for agent in agents) >= SEVERAL else ()),
-        page.table(EVERY_RUN, [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]]),
-        page.table(
-            LAYOUTS,
-            material.metrics["layouts"],
-            heading="How hard the layouts are",
-            caption="Random play: uniformly random primitive actions, the same cap.",
-        ),
-    ]
-    return page.section("runs", "Run by run", [], blocks, folded=True)
+    return page.section("runs", "Intervals and pairs", [], blocks, folded=True)
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -510,7 +480,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
     others = cycle(look for look in OTHERS if look not in used)
     looks = [COLOURS.get(agent["name"]) or next(others) for agent in agents]
     lines = [
-        Line(agent["name"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
+        Line(agent["name"], arrays["curves/grid"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
         for index, (agent, look) in enumerate(zip(agents, looks, strict=True))
     ]
     bounds: Bounds
@@ -525,7 +495,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
         which_figure, name, dotted = "Beside Figure 6 of the paper", "shortest path", "the shortest path"
     values = [value for value in values if value is not None]
     references = [(name, float(np.mean(values)))] if values else []
-    drawn = learning_curves(arrays["curves/grid"], lines, axis, references, bounds)
+    drawn = learning_curves(lines, axis, references, bounds)
     reference = f" Dotted: mean over layouts of {dotted}." if references else ""
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
@@ -541,14 +511,15 @@ def _others(agents: Sequence[Mapping[str, Any]]) -> str:
     alike = [{(run["layout_seed"], run["seed"]) for run in agent["runs"]} for agent in agents]
     if all(runs == alike[0] for runs in alike):
         return "the same layouts and seeds"
-    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see the table of runs"
+    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see numbers.csv"
 
 
 @dataclass(frozen=True)
 class Line:
-    """One agent's curve: values float (R, G), a row per layout or run, NaN where it has no value."""
+    """One agent's curve: values float (R, G) at ``steps`` (G,), a row per layout or run, NaN where it has no value."""
 
     name: str
+    steps: NDArray[np.int64]
     values: NDArray[np.float64]
     colour: str
     style: Any = SOLID
@@ -561,14 +532,13 @@ def reward_bounds(lines: Sequence[Line]) -> Bounds:
 
 
 def learning_curves(
-    grid: NDArray[np.int64],
     lines: Sequence[Line],
     quantity: str,
     references: Sequence[tuple[str, float]] = (),
     bounds: Bounds = (0.0, None),
 ) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps, ``grid`` (G,), a line per agent; the mean, and of few
-    layouts or runs each, of more a band of one standard error.
+    """Figure 6: a quantity of episodes against environment steps, a line per agent; the mean, and of few layouts or
+    runs each, of more a band of one standard error.
 
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
@@ -577,12 +547,12 @@ def learning_curves(
         figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
         axes = figure.subplots()
         for line in lines:
-            _draw_curve(axes, grid / 1000, line)
+            _draw_curve(axes, line)
         for name, value in references:
             axes.axhline(value, color=GREY, linewidth=1.2, linestyle=":", label=name)
         axes.set_xlabel("environment steps, in thousands")
         axes.set_ylabel(quantity)
-        axes.set_xlim(0, grid[-1] / 1000)
+        axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
         label_lines(figure, axes, 2, handlelength=2.4)
     return figure
@@ -593,8 +563,8 @@ def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return by_layout(values, [run["layout_seed"] for run in agent["runs"]])[0]
 
 
-def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
-    known = np.ma.masked_invalid(line.values)
+def _draw_curve(axes: Axes, line: Line) -> None:
+    steps, known = line.steps / 1000, np.ma.masked_invalid(line.values)
     mean = known.mean(0).filled(np.nan)
     look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
     axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
@@ -656,12 +626,5 @@ QUESTION = Question(
     summary=summary,
     sections=sections,
     figures=figures,
-    meanings={
-        "near": (
-            "fraction",
-            "share of the last 100 training episodes (scope frozen: of those played after training) that succeeded "
-            f"within {NEAR} times the layout's shortest path",
-        )
-    },
     needed={"figure6": "options, meta or baseline artefacts: train-meta, train-baseline"},
 )

@@ -160,7 +160,7 @@ def summary(metrics: Metrics) -> list[Table]:
     """Balanced accuracy of the best, mean and worst member on held-out states."""
     columns = (ENSEMBLE._replace(title="method"), page.label("sub-goal", "sub_goal"), *SCORES, DISAGREE)
     title = "Balanced accuracy on held-out states: best, mean and worst member"
-    return [page.terminal(title, columns, metrics["hypotheses"], sections=True)] if metrics["hypotheses"] else []
+    return [page.terminal(title, columns, metrics["hypotheses"])] if metrics["hypotheses"] else []
 
 
 def sections(material: Material) -> list[Block]:

@@ -167,13 +167,17 @@ def slug(text: str) -> str:
     return text if plain == text else f"{plain}-{blake2b(text.encode(), digest_size=4).hexdigest()}"
 
 
+def _saved(figure: Figure, settings: Mapping[str, Any], **how: Any) -> bytes:
+    buffer = io.BytesIO()
+    with styled(settings):
+        figure.savefig(buffer, **how)
+    return buffer.getvalue()
+
+
 def to_svg(figure: Figure, name: str) -> str:
     """The figure as SVG, the same bytes each time, its ids unique on a page by the :func:`slug` of ``name``."""
     name = slug(name)
-    buffer = io.StringIO()
-    with styled({"svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
+    text = _saved(figure, {"svg.hashsalt": name}, format="svg", metadata={"Date": None, "Creator": None}).decode()
     text = text[text.index("<svg") :]
     text = re.sub(r' id="image[0-9a-f]+"', "", text)  # a hash of the picture: the same where it is drawn twice
     text = re.sub(r'\bid="', f'id="{name}-', text)
@@ -183,17 +187,12 @@ def to_svg(figure: Figure, name: str) -> str:
 
 def to_png(figure: Figure) -> bytes:
     """The figure as a PNG on white, for READMEs and slides."""
-    buffer = io.BytesIO()
-    with styled():
-        figure.savefig(buffer, format="png", dpi=160, facecolor="white", metadata={"Software": None})
-    return buffer.getvalue()
+    return _saved(figure, {}, format="png", dpi=160, facecolor="white", metadata={"Software": None})
 
 
 def to_file(figure: Figure, name: str, kind: str) -> bytes:
     """The figure as ``svg``, ``png``, or ``pdf`` with its fonts in it as fonts; the same bytes each time."""
     if kind != "pdf":
         return to_svg(figure, name).encode() if kind == "svg" else to_png(figure)
-    buffer = io.BytesIO()
-    with styled({"pdf.fonttype": 42}):
-        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
-    return buffer.getvalue()
+    undated = {"CreationDate": None, "Producer": None, "Creator": None}
+    return _saved(figure, {"pdf.fonttype": 42}, format="pdf", metadata=undated)

@@ -1,6 +1,8 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
 
+import tomllib
 from collections.abc import Iterator
+from importlib import resources
 from operator import itemgetter
 
 from rich.console import Group
@@ -18,7 +20,7 @@ from hypogoal.evaluation import (
     saliency,
     selection,
 )
-from hypogoal.evaluation.numbers import QUANTITIES, Metrics
+from hypogoal.evaluation.numbers import Metrics
 from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
 from hypogoal.evaluation.provenance import domains_of, provenance_section
 
@@ -45,7 +47,8 @@ def agents_last() -> list[Question]:
 
 def meanings() -> dict[str, dict[str, str]]:
     """What each quantity is."""
-    quantities = dict(QUANTITIES)
+    told = resources.files("hypogoal.evaluation").joinpath("quantities.toml").read_text(encoding="utf-8")
+    quantities: dict[str, tuple[str, str]] = tomllib.loads(told)
     for question in QUESTIONS:
         quantities |= question.meanings
     return {name: {"unit": unit, "meaning": meaning} for name, (unit, meaning) in quantities.items()}

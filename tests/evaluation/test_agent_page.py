@@ -18,7 +18,7 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import meanings, paper_figures
 from hypogoal.evaluation.run import Choices, Episodes
-from hypogoal.evaluation.selection import choices_section, over_training, selection_of_run, terminations_section
+from hypogoal.evaluation.selection import choices_section, over_training, selection_of_run
 
 SUB_GOALS = ["open-red-door"]
 
@@ -112,13 +112,12 @@ def tables_of(material):
 
 
 def test_every_table_of_agents_says_how_many_came_near_the_shortest_path():
-    """Spec F5: its mean with its error, its interval, each run's; dashes where nobody knows the path, or said it."""
+    """Spec F5: its mean with its error, its interval; dashes where nobody knows the path, or said it."""
     known = [made(seed, length=length, steps=2_000) for seed, length in enumerate((15, 16, 15, 16))]
     material = material_of(*known)
-    spread, interval, every = tables_of(material)
+    spread, interval = tables_of(material)
     assert (spread["text"], spread["small"]) == ("0.50", "± 0.29")
     assert interval.startswith("0.50 [")
-    assert every == "1.00"
     near = [row.value for row in rows(material.metrics, {}) if row.quantity == "near"]
     assert near == [1, 0, 1, 0]
     assert "1.5 times the layout's shortest path" in meanings()["near"]["meaning"]
@@ -128,8 +127,8 @@ def test_every_table_of_agents_says_how_many_came_near_the_shortest_path():
         for numbers in (agent, *agent["runs"]):
             del numbers["near"]
     for material in (unknown, older):
-        spread, *others = tables_of(material)
-        assert [spread["text"], *others] == ["–"] * 3
+        spread, interval = tables_of(material)
+        assert [spread["text"], interval] == ["–"] * 2
         assert not [row for row in rows(material.metrics, {}) if row.quantity == "near"]
 
 
@@ -204,7 +203,7 @@ def test_of_one_variant_nothing_is_said_of_variants():
     (text,) = summary_section(material)["paragraphs"]
     assert text.startswith("The option agent reached the goal")
     assert "Uniformly random choice among options of the same members: 0 %" in text
-    said = str([terminations_section(material), choices_section(material)])
+    said = str(choices_section(material))
     assert "variant" not in said
     drawn, _ = paper_figures(material)
     assert "variant" not in str([one.caption for one in drawn])
@@ -212,10 +211,9 @@ def test_of_one_variant_nothing_is_said_of_variants():
 
 
 def test_sections_that_show_one_variant_say_which():
-    """Spec F6: where options stop, preferences, and Figures 7 and 8."""
+    """Spec F6: preferences, and Figures 7 and 8."""
     shown = "Shown is options (learned members), ensemble=dbat, one of 2 variants of the option agent."
     material = material_of(*two(), *two("random")[2:])
-    assert shown in terminations_section(material)["paragraphs"]
     assert shown in choices_section(material)["paragraphs"]
     captions = {one.name: one.caption for one in paper_figures(material)[0]}
     assert captions["figure7"].endswith(shown)

@@ -19,8 +19,8 @@ def curves():
     several = np.linspace(0, 1, 11) * np.array([[1.0], [0.8], [0.6]])
     several[1, 7:] = np.nan
     several[:, 0] = np.nan
-    lines = [Line("options", several, BLUE), Line("PPO", several[:1], VERMILLION, STYLES[1])]
-    return learning_curves(GRID, lines, "reward per episode", [("random play", 0.1)], (0, 1))
+    lines = [Line("options", GRID, several, BLUE), Line("PPO", GRID, several[:1], VERMILLION, STYLES[1])]
+    return learning_curves(lines, "reward per episode", [("random play", 0.1)], (0, 1))
 
 
 def of_members(name, sub_goal, best, mean, worst):
@@ -76,7 +76,7 @@ LONG = [
 
 def long_curves():
     values = np.linspace(0, 1, 11)[None]
-    return learning_curves(GRID, [Line(name, values, BLUE) for name in LONG], "reward per episode")
+    return learning_curves([Line(name, GRID, values, BLUE) for name in LONG], "reward per episode")
 
 
 def long_members():
@@ -98,8 +98,10 @@ def test_every_entry_of_a_legend_is_on_the_picture(draw):
 
 def test_names_beside_lines_do_not_lie_on_each_other():
     """Spec F: lines that end alike have their names one above the other, none above or below the picture."""
-    lines = [Line(name, np.full((1, 11), end), BLUE) for name, end in (("a", 1.0), ("b", 1.0), ("c", 1.0), ("d", 0.0))]
-    figure = learning_curves(GRID, lines, "reward", [("random play", 0.0)], (0, 1))
+    lines = [
+        Line(name, GRID, np.full((1, 11), end), BLUE) for name, end in (("a", 1.0), ("b", 1.0), ("c", 1.0), ("d", 0.0))
+    ]
+    figure = learning_curves(lines, "reward", [("random play", 0.0)], (0, 1))
     FigureCanvasAgg(figure).draw()  # lays it out
     assert not figure.legends
     texts = {text.get_text(): text.get_window_extent() for text in figure.axes[0].texts}
@@ -126,7 +128,7 @@ def test_a_name_that_begins_with_an_underscore_is_in_the_legend():
     values = np.linspace(0, 1, 11)[None]
     for figure in (
         best_mean_worst_members([of_members(name, "red", 0.8, 0.8, 0.8) for name in ("_x", "red")]),
-        learning_curves(GRID, [Line("_x", values, BLUE), Line("red", values, VERMILLION)], "reward"),
+        learning_curves([Line("_x", GRID, values, BLUE), Line("red", GRID, values, VERMILLION)], "reward"),
         distance_bars([(name, "N=1", 4.0, 1.0, (3.0, 5.0)) for name in ("_x", "red")], ["_x", "red"], 300),
     ):
         named = figure.legends[0].get_texts() if figure.legends else figure.axes[0].texts

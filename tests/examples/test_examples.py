@@ -139,7 +139,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
     assert [config[key] for key in ("network", "observation_shape", "observation_dtype")] == ["mlp", [6], "float32"]
     page = (run / "report" / "index.html").read_text(encoding="utf-8")
     assert all(text in page for text in ("position[0]", "held[1]", "What members go by: at-exit"))
-    assert not any(text in page for text in ("Explore the hypotheses", "Example states", "Where options stop"))
+    assert not any(text in page for text in ("Explore the hypotheses", "laid over each other"))
     assert open_dataset(run / "options" / "visited.h5").unlabelled().dtype == "float32"
     policies = load_options(options)
     env = OptionEnv(policies.make_env(), policies)
