@@ -234,7 +234,7 @@ class Domain(ABC):
         sub_goals: their names (G).
         config_class: what ``collect`` can be told, a frozen dataclass of ``core.config.setting`` fields.
         engine_settings: the names of those that are the world's own: who plays in it later is told them too.
-        defaults: settings of stages that suit it, by stage.
+        defaults: settings of stages that suit it, by stage; sources: where these are from, where that can be told.
         env_id: its Gymnasium environment, where it has a registered one.
         resumes: ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which the part of
             that name is kept until all are there.
@@ -251,6 +251,7 @@ class Domain(ABC):
     config_class: type
     engine_settings: tuple[str, ...] = ()
     defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+    sources: Mapping[str, str] = MappingProxyType({})
     env_id: str = ""
     resumes = False
     kinds: Sequence[str] = ()

@@ -125,6 +125,21 @@ def compare_runs(runs: Runs) -> Rows:
     return rows
 
 
+def winners(comparisons: Rows) -> list[str]:
+    """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
+    told = []
+    for row in (row for row in comparisons if row["n"]):
+        (low, high), first, second = row["difference_interval"], row["first"], row["second"]
+        clear = low is not None and (low > 0 or high < 0)
+        order = (first, second) if (row["difference"] > 0) == row["higher"] else (second, first)
+        who = "{} beats {}".format(*order) if clear else f"no clear winner of {first} and {second}"
+        between = f", 95 % [{low:.3g}, {high:.3g}], n = {row['units']}" if low is not None else ""
+        won = f"{first} wins {row['wins']} of {row['n']}, {row['ties']} tied"
+        what = ": ".join(filter(None, [row["where"], row["quantity"].replace("_", " ")]))
+        told.append(f"{what}: {who} ({first} {row['difference']:+.3g}{between}; {won})")
+    return told or ["no pairs: no two runs share a seed of the same agent or method"]
+
+
 def common_names(tables: Sequence[Sequence[Mapping[str, Any]]], key: str = "name") -> list[str]:
     """The names that every table has, in the first one's order."""
     first, *others = tables

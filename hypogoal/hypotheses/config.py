@@ -11,7 +11,7 @@ BEYOND = "own: beyond the paper"
 
 @dataclass(frozen=True)
 class EnsembleConfig:
-    """Spec C6: DoorKey's values (Table 3) are the defaults; Montezuma's are those of Table 1."""
+    """What the members are, and how they learn. Spec C6: the defaults are DoorKey's values (Table 3)."""
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(
@@ -119,7 +119,7 @@ class EnsembleConfig:
 
 @dataclass(frozen=True)
 class TrainEnsembleConfig(EnsembleConfig):
-    """An ensemble's settings, and which sub-goals to train it for."""
+    """Which sub-goals to train an ensemble for."""
 
     sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
     score_every: int = setting(

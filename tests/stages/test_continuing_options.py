@@ -89,7 +89,7 @@ def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(
     for name, changes in (("early", ("--set", "steps=4000")), ("late", ("--set", "steps=40"))):
         command = ["train-options", str(run / "ensemble"), "--out", str(tmp_path / name), *few, *changes]
         assert main(command) == 0
-        said[name] = capsys.readouterr().out.splitlines()[-2]
+        said[name] = capsys.readouterr().out.splitlines()[-3]
         assert main([*command, "--resume"]) == 0, "it is complete"
         capsys.readouterr()
     assert said["early"].endswith("ended by until=0.3") and said["late"].endswith(

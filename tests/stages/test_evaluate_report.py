@@ -219,8 +219,9 @@ def test_hypotheses_alone_are_told_in_the_terminal(run, tmp_path, capsys, monkey
     (line,) = (line for line in told.splitlines() if "open-red-door" in line)
     assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
     assert "dbat, K=2" in told and "no diversity, K=2" in told
-    *lines, where = told.splitlines()
+    *lines, then, where = told.splitlines()
     assert max(map(len, lines)) <= 80 and where == str(tmp_path / "evaluation")
+    assert then == f"next: hypogoal report {tmp_path}"
     assert metrics["missing"] == ["no agents"] and "PPO" not in told and "last 100" not in told
     for path in (tmp_path, tmp_path / "evaluation"):
         assert main(["show", str(path)]) == 0
