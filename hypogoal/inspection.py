@@ -20,7 +20,7 @@ from hypogoal.core.files import read_end, read_json, read_text
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
-from hypogoal.dataset import SPLITS, open_dataset
+from hypogoal.dataset import PICTURE, SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
 # Numbers of logs, in the order in which they are told: what they are called.
@@ -40,6 +40,7 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
+        about |= {"observation_dtype": str(dataset.observation_dtype)}
         return {"kind": "data", "path": str(path), "counts": dataset.counts(), **about, "config": dataset.config}
     artefact = open_artefact(path)
     keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
@@ -113,8 +114,9 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     if not path.is_file():
         raise UserError("contact sheets are of data files", path, "Give the .h5 file that 'hypogoal collect' wrote.")
     dataset = open_dataset(path)
-    if len(dataset.observation_shape) != 3:
-        raise UserError("the states are no pictures", f"observation shape {dataset.observation_shape}")
+    if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
+        given = f"{dataset.observation_dtype} {dataset.observation_shape}"
+        raise UserError("the states are no pictures", given, f"Read them with 'hypogoal export {path} --out X.npz'.")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []

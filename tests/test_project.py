@@ -304,7 +304,7 @@ def test_formats_are_readable_without_hypogoal(
     np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-6)
     printed = capsys.readouterr().out
     positives = int(collected.labelled.labels[:, 1].sum())
-    assert f"open-red-door: 7 states, {positives} positives, images (8, 8, 3)" in printed
+    assert f"open-red-door: 7 states, {positives} positives, uint8 (8, 8, 3)" in printed
     assert "5 unlabelled states" in printed
     assert "members.0.13.weight float32 (2, 100)" in printed
 

@@ -27,7 +27,7 @@ def import_(
     out: cli.Out,
     sub_goal: Annotated[list[str] | None, Option(help="In the order of the labels' columns; repeatable.")] = None,
     label: Annotated[list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Of Minari: who labels.")] = None,
-    key: Annotated[str, Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
+    key: Annotated[str, Option(help="Of a Minari dataset of dictionaries: which part is meant.")] = "",
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
     domain: Annotated[str, Option(help="What the states are of, for train-options.")] = "imported",
     seed: cli.Seed = 0,
@@ -155,17 +155,17 @@ def _verdicts(
     from hypogoal.core.config import resolve
     from hypogoal.testing import check_domain, check_network, check_objective
 
-    shape: tuple[int, ...] = (64, 64, 3)
+    seen: tuple[Any, ...] = ()
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
         found = load_domain(domain, given=True)
         config: object = resolve(found.config_class, stage="collect", assignments=assignments)
         yield from check_domain(found, config, layout_seed=layout_seed, seed=seed)
-        shape = tuple(found.observation_shape)
+        seen = tuple(found.observation_shape), found.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective
 
         yield from check_objective(load_objective(diversity))
     if network is not None:
-        yield from check_network(network, shape)
+        yield from check_network(network, *seen)

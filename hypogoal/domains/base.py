@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from math import prod
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +15,7 @@ from hypogoal.core import own_code
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import Collected
+from hypogoal.dataset import PICTURE, Collected, Observations, Standard
 
 if TYPE_CHECKING:
     import gymnasium
@@ -66,7 +67,8 @@ class Engine(ABC):
     Attributes:
         n_actions: primitive actions are 0 .. n_actions - 1.
         count: environments (E).
-        observation_shape: (H, W, C).
+        observation_shape, observation_dtype: uint8 (H, W, C), pictures, or float32 of any shape.
+        standard: of the latter, what agents standardise them by; set by who trains some.
         max_steps: steps after which an episode is truncated.
         ids: int64 (E,), the current state of each environment.
         elapsed: int64 (E,), steps since its episode began.
@@ -81,6 +83,8 @@ class Engine(ABC):
     n_actions: int
     count: int
     observation_shape: tuple[int, ...]
+    observation_dtype: np.dtype[Any] = PICTURE
+    standard: Standard | None = None
     max_steps: int
     ids: NDArray[np.int64]
     elapsed: NDArray[np.int64]
@@ -104,8 +108,8 @@ class Engine(ABC):
         """Step every environment, actions (E,); where an episode ends, ``ids`` is a start state again afterwards."""
 
     @abstractmethod
-    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, *observation_shape) of known states, into ``out`` where given."""
+    def images(self, ids: NDArray[np.int64], out: Any = None) -> Observations:
+        """Observations (n, *observation_shape), ``observation_dtype``, of known states, into ``out`` where given."""
 
     @abstractmethod
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -115,13 +119,13 @@ class Engine(ABC):
         """The labels of the environments' current states, bool (E, G), asked anew where they are kept by id."""
         return self.labels(self.ids)
 
-    def room_for(self, count: int, out: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    def room_for(self, count: int, out: Observations | None) -> Observations:
         """Where to draw ``count`` observations: ``out``, a ``ValueError`` where it does not fit, or a new array."""
         shape = (count, *self.observation_shape)
         if out is None:
-            return np.empty(shape, np.uint8)
-        if out.dtype != np.uint8 or out.shape != shape or not out.flags.c_contiguous:
-            raise ValueError(f"out must be contiguous uint8 {shape}, not {out.dtype} {out.shape}")
+            return np.empty(shape, self.observation_dtype)
+        if out.dtype != self.observation_dtype or out.shape != shape or not out.flags.c_contiguous:
+            raise ValueError(f"out must be contiguous {self.observation_dtype} {shape}, not {out.dtype} {out.shape}")
         return out
 
     def restart(self, where: NDArray[np.bool_]) -> None:
@@ -260,7 +264,17 @@ class Domain(ABC):
     @property
     @abstractmethod
     def observation_shape(self) -> tuple[int, ...]:
-        """(H, W, C)."""
+        """(H, W, C) of pictures; of other observations any."""
+
+    @property
+    def observation_dtype(self) -> np.dtype[Any]:
+        """uint8 of pictures, float32 of other observations."""
+        return PICTURE
+
+    @property
+    def observation_bytes(self) -> int:
+        """Of one observation."""
+        return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     @abstractmethod
     def collect(self, config: Any, seed: int, progress: Any) -> Collected:

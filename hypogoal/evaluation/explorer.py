@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import settings_of, variants
 from hypogoal.evaluation.page import Block, Entry, Material, Question
@@ -32,7 +33,7 @@ TITLE = "Explore the hypotheses"
 
 def look(work: Work, judgement: Judgement) -> None:
     """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
-    if judgement.number != work.browsed:
+    if judgement.number != work.browsed or judgement.split.observations.dtype != PICTURE:
         return
     from hypogoal.evaluation.deep_lift import DEEP_LIFT, attributed, method_of
 
@@ -236,5 +237,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=lambda material: [explorer_section(material)],
+    sections=lambda material: [] if material.of_numbers() else [explorer_section(material)],
 )

@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +18,7 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.dataset import Split, open_dataset
+from hypogoal.dataset import Observations, Split, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
@@ -33,9 +32,9 @@ WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"} 
 
 @dataclass(frozen=True)
 class Unlabelled:
-    """Unlabelled states: observations uint8 (M, H, W, C), positions int64 (M, 3) where they are known."""
+    """Unlabelled states: observations (M, *obs), positions int64 (M, 3) where they are known."""
 
-    observations: NDArray[np.uint8]
+    observations: Observations
     positions: NDArray[np.int64] | None
 
 
@@ -78,8 +77,8 @@ class Judgement:
         """Names of the values of the origin ``kind``."""
         return self.domain.kinds if self.domain else ()
 
-    def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, NDArray[np.uint8], NDArray[np.uint8]]:
-        """The ensemble, what it sees of some held-out states (n, h, w, C), and of the unlabelled ones on average."""
+    def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
+        """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
         from hypogoal.evaluation.deep_lift import mean_state
 
         ensemble, positions = self.case.read(), positions_of(self.split.origins)
@@ -156,7 +155,7 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
         dataset = open_dataset(case.data)
         counts = dataset.counts()
         states = counts["heldout"][case.sub_goal]["states"] + counts["unlabelled"]
-        work += case.config["members"] * states * prod(dataset.observation_shape)
+        work += case.config["members"] * states * dataset.observation_bytes
     return min(cores, len(cases)) if work >= SPREAD_FROM else 1
 
 

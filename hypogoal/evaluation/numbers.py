@@ -32,7 +32,7 @@ PICKED = ("best", "validated", "mean")  # members that methods are compared by
 NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
-        *("world", "members"),  # which the domain's settings and the ensemble's name say
+        *("world", "members", "observation_dtype"),  # which the domain's settings and the ensemble's name say
         *("ended_at", "until_reached", "options_ended_at"),  # which came out
     }
 )

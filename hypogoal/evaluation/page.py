@@ -69,6 +69,10 @@ class Material:
         start = f"{folder}/"
         return {name.removeprefix(start): of for name, of in self.arrays.items() if name.startswith(start)}
 
+    def of_numbers(self) -> bool:
+        """Whether observations are no pictures."""
+        return any(name.startswith("saliency/") and name.endswith("/features") for name in self.arrays)
+
     def of_ladders(self) -> bool:
         """Whether the run has anything of labelled ladders."""
         return bool(self.metrics["rooms"] or self.metrics["distance"]["options"])

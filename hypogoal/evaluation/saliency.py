@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,22 +13,27 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hypogoal.core.hdf5 import fixed
+from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
-from hypogoal.evaluation.plots import BLUE, VERMILLION, grid_of_pictures, show_picture, styled
+from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
 
+SPREAD = "spread"  # a state as any other
 KINDS = {
     "true positive": "a true positive",
     "disagree": "members disagree",
     "false positive": "a false positive",
 }
-NEEDED = "an ensemble artefact with a member that calls a held-out state reached: train-ensemble"
+NEEDED = "an ensemble artefact on pictures with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
 EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
+AVERAGED = 64  # states over which attributions to features are averaged
+MOST_BARS = 15  # features
 KEY = 0.75  # inches below all pictures
 
 
@@ -35,7 +41,8 @@ def look(work: Work, judgement: Judgement) -> None:
     """Attributions of the ensemble that is shown; on states of unseen rooms where positives are in them.
 
     ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
-    what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``.
+    what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``. Where they are no pictures, of states spread
+    over the held-out ones, each of ``features`` having a name.
     """
     if judgement.number != work.shown:
         return
@@ -43,7 +50,9 @@ def look(work: Work, judgement: Judgement) -> None:
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
     labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
-    explained = pick_to_explain(probabilities, verdicts, labels)
+    pictures = split.observations.dtype == PICTURE
+    spread = np.linspace(0, len(among) - 1, min(len(among), AVERAGED)).astype(np.int64).tolist()
+    explained = pick_to_explain(probabilities, verdicts, labels) if pictures else [(at, SPREAD) for at in spread]
     picked = [(int(among[index]), kind) for index, kind in explained]
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
@@ -56,6 +65,8 @@ def look(work: Work, judgement: Judgement) -> None:
         values = found.values.astype(np.float32)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
         group["seen"], group["baseline"] = seen, baseline
+        if not pictures:
+            group["features"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
         states = explanation(found, explained)
     work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
 
@@ -117,11 +128,16 @@ def saliency_section(material: Material) -> Block:
         "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
         "that goes by what will not be there elsewhere cannot transfer."
     )
+    if bars := [page.shown(material, drawn) for drawn in feature_figures(material)]:
+        text = (
+            f"Attributions by {method} of each member of {found['ensemble']} (seed {found['seed']}), against "
+            f"{found['baseline']}. A member that goes by what means something else elsewhere cannot transfer."
+        )
     check = (
         f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
         f"{max(errors, default=0.0):.0e} (log-odds)."
     )
-    blocks = [
+    blocks = bars or [
         _cards(material, goal["sub_goal"], index, state)
         for goal in found["sub_goals"]
         for index, state in enumerate(goal["states"])
@@ -148,8 +164,36 @@ def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block
     return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
 
 
+def feature_figures(material: Material) -> Iterator[Drawn]:
+    """Of observations that are no pictures: which features each member goes by, a plot for each sub-goal."""
+    found = material.metrics["saliency"]
+    for goal in (goal["sub_goal"] for goal in (found["sub_goals"] if found and material.of_numbers() else ())):
+        arrays = material.within(f"saliency/{goal}")
+        caption = f"Mean absolute attribution on held-out states of {goal}, the {MOST_BARS} largest at most."
+        values = np.abs(arrays["attributions"]).mean(0)
+        plot = bars_of_features(values.reshape(len(values), -1), page.texts(arrays["features"]))
+        yield Drawn(f"features-{goal}", f"What members go by: {goal}", plot, caption, heading=goal)
+
+
+def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:
+    """Bars side by side, those of features that members (K, numbers) go by most."""
+    order = np.argsort(-values.mean(0), kind="stable")[:MOST_BARS]
+    high, places = 0.8 / len(values), np.arange(len(order))
+    with drawing(0.7 + 0.35 * len(order), 4) as (figure, axes):
+        for member, of_member in enumerate(values):
+            colour = PALETTE[member % len(PALETTE)]
+            axes.barh(places + high * member, of_member[order], high, color=colour, label=f"member {member}")
+        axes.set_yticks(places + (0.8 - high) / 2, [names[feature] for feature in order])
+        axes.invert_yaxis()
+        axes.set_xlabel("mean absolute attribution, log-odds")
+    return figure
+
+
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 2 and 9: of each sub-goal the first state that is explained, a true positive where there is one."""
+    if material.of_numbers():
+        yield from feature_figures(material)
+        return
     found = material.metrics["saliency"]
     goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
     for goal in goals:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine, load_domain, step_of
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import BANDITS, LEARNED, PRETRAINING, RANDOM, base_name, variants, which
@@ -110,6 +111,8 @@ def numbers(work: Work) -> dict[str, Any]:
             ensemble = artefact.input("ensemble")
             match, choices = match_of(ensemble, about["layout_seed"]), read_choices(folder / "choices.csv")
             for option, states in read_terminations(folder / "terminations.h5").items():
+                if states.dtype != PICTURE:
+                    break
                 place = f"terminations/{about['path']}/{option}"
                 work.arrays[place] = overlay(states)
                 work.arrays[place].attrs["states"] = len(states)
@@ -242,15 +245,16 @@ def choices_section(material: Material) -> Block:
         caption=f"{run['path']}, {_name(run)}: decisions at which the option was offered and chosen; expected under "
         "uniform choice; preference over all and over the last quarter of training; mean steps of an execution; match.",
     )
-    drawn = {"kind": "row", "blocks": [page.shown(material, figure) for figure in figures(material)], "caption": stops}
+    drawn = [page.shown(material, figure) for figure in figures(material)]  # none of numbers
+    rows = [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
     texts = [text, which(agent, material.metrics["selection"])]
-    return page.section("choices", title, texts, [members, drawn], folded=True)
+    return page.section("choices", title, texts, [members, *rows], folded=True)
 
 
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 7 and 8 and the other sub-goals', of the agent's first run."""
     agent, selection = _agent(material), material.metrics["selection"]
-    run = agent["runs"][0] if agent else {"sub_goals": []}
+    run = agent["runs"][0] if agent and not material.of_numbers() else {"sub_goals": []}
     for goal in run["sub_goals"]:
         sides = [_side(material, run["path"], goal, word) for word in MOST if goal[word] is not None]
         if not sides:

@@ -14,6 +14,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import Observations
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -36,8 +37,8 @@ class TrainingStates:
     """Labelled states followed by unlabelled ones, one numbering for both.
 
     Args:
-        observations, labels: (N, H, W, C) and (N,).
-        unlabelled: (M, H, W, C).
+        observations, labels: what members see of them, (N, h, w, C) or (N, *shape), and (N,).
+        unlabelled: of as many.
         network: any of the networks that will see them (their layers decide how images are stored).
         trunk: what the networks share and see states by. Of a ``frozen`` one the features of all states are computed
             here, once, and kept in memory; where states are changed at random, those of each batch are.
@@ -52,9 +53,9 @@ class TrainingStates:
 
     def __init__(
         self,
-        observations: NDArray[np.uint8],
+        observations: Observations,
         labels: NDArray[np.bool_],
-        unlabelled: NDArray[np.uint8],
+        unlabelled: Observations,
         network: nn.Sequential,
         device: torch.device,
         *,
@@ -122,7 +123,7 @@ class TrainingStates:
         return self._inputs(np.concatenate(groups), None)
 
     def input_gradients(self, networks: Sequence[nn.Sequential], states: NDArray[np.int64]) -> Tensor:
-        """Gradients float (K, B, C * H * W) of each network's logit gap (yes minus no) by labelled states' pixels.
+        """Gradients float (K, B, numbers) of each network's logit gap (yes minus no) by what it sees of states.
 
         They can be differentiated. In training mode BatchNorm uses the batch's statistics and its running ones stay as
         they are, so a gradient includes what a state does to the others of its batch.

@@ -27,8 +27,9 @@ class EnsembleConfig:
         choices=("simultaneous", "sequential"),
     )
     network: str = setting(
-        "doorkey",
-        "member network: doorkey, montezuma, montezuma-crop, tiles, or module:function",
+        "auto",
+        "member network: doorkey, montezuma, montezuma-crop, tiles, mlp, or module:function; auto: doorkey for "
+        "pictures, mlp for other observations",
         source="the paper's appendix",
     )
     encoder: str = setting(

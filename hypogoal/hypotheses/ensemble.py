@@ -14,10 +14,11 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
+from hypogoal.dataset import NUMBERS, Observations
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
-from hypogoal.hypotheses.networks import NETWORKS, another, as_input, build_network, folded, reordered
+from hypogoal.hypotheses.networks import NETWORKS, another, as_input, build_network, folded, network_for, reordered
 from hypogoal.hypotheses.views import AgentView, FullView
 
 THRESHOLD = 0.5  # of the probability, where none was chosen
@@ -33,17 +34,17 @@ class Ensemble(nn.Module):
 
     Args:
         network: a name in ``networks.NETWORKS``.
-        observation_shape: (H, W, C) of the uint8 observations.
+        observation_shape: of the observations, (H, W, C) of pictures.
         members: K, at least 1.
         generator: draws the initial weights.
-        view: what members see of an observation; all of it where None.
+        view: what members see of an observation; all of a picture where None.
         encoder: as of ``TrainEnsembleConfig``.
         hidden_width: the same.
 
     Attributes:
-        members: K ``nn.Sequential``, float (N, C, h, w) in 0..1 (``networks.as_input``) -> logits (N,
-            2), of what ``view`` shows, uint8 (N, h, w, C).
-        trunk: the encoder (N, C, h, w) -> (N, F) that members share; None where each has its own.
+        members: K ``nn.Sequential``, float (N, C, h, w) in 0..1, or what else ``networks.as_input`` makes of what
+            ``view`` shows -> logits (N, 2).
+        trunk: the encoder, from the same to (N, F), that members share; None where each has its own.
         frozen: whether it is, and so always in evaluation mode.
         parts: the trunk, to be run once, and the K networks behind it: :meth:`networks` where there is no trunk.
         thresholds: float32 (K,), the probabilities above which the members' verdicts are yes.
@@ -65,8 +66,9 @@ class Ensemble(nn.Module):
         hidden_width: int = 0,
     ):
         super().__init__()
-        self.network, self.observation_shape = network, tuple(int(size) for size in observation_shape)
+        self.observation_shape = tuple(int(size) for size in observation_shape)
         self.view = view or FullView(self.observation_shape)
+        self.network = network = network_for(network, self.view.dtype)
         self.trunk: nn.Sequential | None = None
         self.frozen = encoder == "frozen"
         count = members if encoder == "separate" else 1
@@ -89,7 +91,8 @@ class Ensemble(nn.Module):
         self.train()
 
     def __repr__(self) -> str:
-        return f"Ensemble({len(self)} members, network {self.network!r}, observations uint8 {self.observation_shape})"
+        seen = f"observations {self.view.dtype} {self.observation_shape}"
+        return f"Ensemble({len(self)} members, network {self.network!r}, {seen})"
 
     def __len__(self) -> int:
         """K, the number of members."""
@@ -121,18 +124,21 @@ class Ensemble(nn.Module):
         """The probabilities (K,) above which the members' verdicts are yes."""
         self.thresholds.copy_(torch.from_numpy(thresholds))
 
-    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
-        """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`."""
+    def see(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> Any:
+        """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`.
+
+        Of observations that are no pictures float32 (N, *shape), standardised.
+        """
         try:
             observations = np.asarray(observations)
         except ValueError:  # of different shapes
-            raise UserError(NO_OBSERVATIONS, "they differ in shape", "Give uint8 (N, H, W, C).") from None
+            raise UserError(NO_OBSERVATIONS, "they differ in shape", f"Give {self.view.dtype} (N, ...).") from None
+        if self.view.dtype == NUMBERS and observations.dtype == np.float64:
+            observations = observations.astype(NUMBERS)
         self._check(observations, positions)
         return np.ascontiguousarray(self.view.see(observations, positions))  # flipped pictures are no tensors
 
-    def verdicts(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.bool_]:
+    def verdicts(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
         """Whether each member says that the sub-goal is reached: bool (N, K); see :meth:`predict`.
 
         Within rounding of its threshold, some 1e-6, a member's verdict may depend on the states judged with it.
@@ -140,13 +146,11 @@ class Ensemble(nn.Module):
         says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
         return says_yes
 
-    def predict(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def predict(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Every member's probability that the sub-goal is reached.
 
         Args:
-            observations: uint8 (N, H, W, C), or a list of N (H, W, C).
+            observations: uint8 (N, H, W, C), or float32 of any shape as it was trained; or a list of N.
             positions: int64 (N, 3) of room, x, y; only where ``needs_positions``.
 
         Returns:
@@ -159,17 +163,13 @@ class Ensemble(nn.Module):
         probabilities: NDArray[np.float32] = both.softmax(dim=-1)[..., 1].numpy()
         return probabilities
 
-    def log_odds(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """How much each member's logit of yes is above that of no: float32 (N, K); see :meth:`predict`."""
         both = self.logits(observations, positions)
         gaps: NDArray[np.float32] = both[..., 1] - both[..., 0]
         return gaps
 
-    def logits(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def logits(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Every member's logits of no and of yes: float32 (N, K, 2); see :meth:`predict`."""
         observations = self.see(observations, positions)
         was_training = self.training
@@ -185,7 +185,7 @@ class Ensemble(nn.Module):
             self.train()
         return logits
 
-    def _logits(self, observations: NDArray[np.uint8]) -> Tensor:
+    def _logits(self, observations: Observations) -> Tensor:
         """(K, N, 2), each image's distinct patches computed once where that pays."""
         trunk, heads = self.parts
         device = self.thresholds.device
@@ -233,10 +233,10 @@ class Ensemble(nn.Module):
 
         return load_fitting(make, state, where, own=network not in NETWORKS).eval()
 
-    def _check(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None) -> None:
-        if observations.dtype != np.uint8 or observations.shape[1:] != self.observation_shape:
+    def _check(self, observations: Observations, positions: NDArray[np.int64] | None) -> None:
+        if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
             given = f"{observations.dtype} {observations.shape}"
-            wanted = f"uint8 (N, {', '.join(map(str, self.observation_shape))})"
+            wanted = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
             raise UserError(NO_OBSERVATIONS, given, f"Give {wanted}.")
         if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
             given = "none" if positions is None else f"{positions.dtype} {positions.shape}"
@@ -272,13 +272,21 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
     try:
         shape = tuple(config["observation_shape"])
         settings = {name: config[name] for name in ("encoder", "hidden_width") if name in config}
-        return Ensemble.from_state(config["network"], shape, config["members"], state, _view(shape, config), **settings)
+        view = _view(shape, config, state)
+        return Ensemble.from_state(config["network"], shape, config["members"], state, view, **settings)
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
 
 
-def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any]) -> FullView | AgentView:
+def _view(
+    observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
+) -> FullView | AgentView:
     """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
+    if config.get("observation_dtype") == str(NUMBERS):
+        mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
+        if mean.shape != observation_shape:  # a manifest may ask for terabytes
+            raise ValueError(observation_shape)
+        return FullView(observation_shape, (mean, deviation))
     if config.get("view", "full") == "full":
         return FullView(observation_shape)
     localiser: Localiser = LearnedLocaliser(observation_shape)

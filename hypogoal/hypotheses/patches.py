@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -78,13 +79,13 @@ def _side(size: object) -> int:
     return size[0] if isinstance(size, tuple) and size[0] == size[1] else -1
 
 
-def make_tables(observations: NDArray[np.uint8], network: nn.Sequential) -> Tables | None:
+def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | None:
     """The distinct patches of images uint8 (N, H, W, C) as ``network`` looks at them.
 
     None where too few repeat to be worthwhile, or where the network has layers that tables do not know.
     """
     windows = windows_of(network)
-    if windows is None or len(observations) == 0:
+    if windows is None or len(observations) == 0 or observations.dtype != np.uint8:
         return None
     spread = np.linspace(0, len(observations) - 1, min(SAMPLE, len(observations))).astype(np.int64)
     sample = _tables(observations[spread], windows)

@@ -16,6 +16,7 @@ from torch.nn import functional
 from hypogoal.core.checkpoints import Checkpoints, State, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
+from hypogoal.dataset import Observations
 from hypogoal.diversity import Context, load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -46,9 +47,9 @@ class Report(ABC):
 
 
 def fit(
-    observations: NDArray[np.uint8],
+    observations: Observations,
     labels: NDArray[np.bool_],
-    unlabelled: NDArray[np.uint8],
+    unlabelled: Observations,
     config: EnsembleConfig,
     seed: int,
     on_step: OnStep | None = None,
@@ -64,8 +65,8 @@ def fit(
     """Eq. (1): the trained members of one sub-goal. On one CPU in one thread the same arguments give the same bytes.
 
     Args:
-        observations, labels: the labelled states (N, H, W, C), and whether the sub-goal is reached (N,).
-        unlabelled: (M, H, W, C); may be empty where nothing makes members differ.
+        observations, labels: the labelled states (N, *obs), and whether the sub-goal is reached (N,).
+        unlabelled: (M, *obs); may be empty where nothing makes members differ.
         on_step: called every ``REPORT_EVERY`` steps and at the last one (of each member, where sequential) with the
             number of steps done and with that step's ``loss``, ``labelled`` (mean over the members in training) and
             ``diversity`` (the inner sums of Eq. (1), before their weight).

@@ -17,6 +17,7 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
+from hypogoal.dataset import PICTURE, standard_of
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig
@@ -61,6 +62,12 @@ def assemble(
     arguments = world | start_arguments(domain, config, options, seed)
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
     cut(engine, config.cap)
+    if engine.observation_dtype != PICTURE:
+        for name in ("network", "meta_network"):
+            if getattr(config, name, "") == "paper":
+                raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
+        view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
+        engine.standard = view.standard if view else standard_of(engine.observation_shape)
     if ends:
         terminations = ends(engine)
     elif oracle:

@@ -16,6 +16,7 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import AGAIN
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
@@ -236,7 +237,7 @@ def learned_terminations(
     members = len(ensembles[0])
     shared = ensembles[0].trunk is not None  # all members cost little more than one
 
-    def seen(ids: NDArray[np.int64], needs_positions: bool) -> tuple[NDArray[np.uint8], NDArray[np.int64] | None]:
+    def seen(ids: NDArray[np.int64], needs_positions: bool) -> tuple[Observations, NDArray[np.int64] | None]:
         if needs_positions and not engine.position_names:
             what = "the ensemble needs the agent's positions (localiser=ram)"
             raise UserError(what, None, "Train it with localiser=learned.")

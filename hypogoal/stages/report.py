@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
@@ -95,8 +96,10 @@ def play_films(agents: Sequence[Artefact], run: Path, count: int) -> list[Film]:
     films = []
     for index in range(count):
         artefact, episode = agents[index % len(agents)], index // len(agents)
-        config, frames = artefact.config, play_episode(agent_of(artefact, seed=episode))
-        path = artefact.path.relative_to(run).as_posix()
+        loop, path = agent_of(artefact, seed=episode), artefact.path.relative_to(run).as_posix()
+        if loop.engine.observation_dtype != PICTURE:
+            raise NoAgent("videos need an agent that sees pictures", artefact.path, "Leave --videos out.")
+        config, frames = artefact.config, play_episode(loop)
         gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
         steps, options = frames[-1].step, sum(bool(frame.ended) for frame in frames)
         caption = (

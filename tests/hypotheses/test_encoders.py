@@ -233,7 +233,7 @@ def broken(observation_shape: tuple[int, ...]) -> nn.Module:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("grid", r"is an encoder that makes torch.float32 \(1, 4, 2, 2\) of an image.*Make features, float32 \(N, F\)"),
+        ("grid", r"is an encoder that makes torch.float32 \(1, 4, 2, 2\) of a state.*Make features, float32 \(N, F\)"),
         ("broken", r"is an encoder that makes torch.float32 \(144,\)"),
         ("Whole", r"raised TypeError: .*not a Module"),
     ],

@@ -322,7 +322,13 @@ def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, caps
     assert main(["check", "corridor_env:RESTLESS", *small]) == 2
     told = capsys.readouterr().out.splitlines()
     assert told[-1].startswith("FAIL determinism") and "np_random" in told[-1]
-    assert main(["check", "corridor_env:FLOATS"]) == 2
+    assert main(["check", "corridor_env:SENSED", *small, "--network", "mlp"]) == 0
+    told = capsys.readouterr().out
+    assert "ok   images: float32 (11,)" in told and "FAIL" not in told and told.count("ok   builds") == 1
+    assert main(["check", "corridor_env:SENSED", *small, "--network", "doorkey"]) == 2
+    told = capsys.readouterr().out
+    assert "'doorkey' takes images (H, W, C): observation shape (11,). Give --set network=mlp" in told
+    assert main(["check", "corridor_env:WORDY"]) == 2
     assert "observations must be images" in capsys.readouterr().err
     assert main(["check"]) == 2
     assert "nothing to check" in capsys.readouterr().err
