@@ -4,6 +4,8 @@ hypogoal run doorkey --preset choosing --out runs/choosing
 python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run which-feature --out runs/which-feature
 python -m benchmarks.choosing runs/which-feature docs/results/which-feature-rooms.csv
+hypogoal sweep examples/preference.toml --out runs/preference
+python -m benchmarks.choosing runs/preference docs/results/preference-doorkey.csv
 python -m benchmarks.choosing --tables docs/results/choosing-doorkey.csv
 """
 
@@ -36,6 +38,8 @@ METHODS = {  # by what the names of artefacts have in them, the longest first
     "divdis-truth-place": "place: DivDis, K = 3",
     "none-truth-place": "place: no diversity, K = 3",
     "one-truth-place": "place: one classifier, K = 1",
+    "dbat-k3": "D-BAT, K = 3",
+    "none-k3": "no diversity, K = 3",
     "dbat": "D-BAT, K = 6",
     "none": "no diversity, K = 6",
     "one": "one classifier, K = 1",

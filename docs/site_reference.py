@@ -29,9 +29,8 @@ def command_line() -> str:
 
 def settings() -> str:
     """What ``hypogoal config`` says of every stage, on each domain that comes with hypogoal."""
-    from hypogoal.core.config import describe
-    from hypogoal.domains.base import BUILT_IN, defaults_of
-    from hypogoal.settings import TABLES
+    from hypogoal.domains.base import BUILT_IN
+    from hypogoal.settings import TABLES, described
     from hypogoal.stages.sweep import config_class_of
 
     lines = [
@@ -43,7 +42,7 @@ def settings() -> str:
     ]
     for domain in BUILT_IN:
         for stage in TABLES:
-            rows = describe(config_class_of(stage, domain), defaults_of(domain, stage, given=True))
+            rows = described(config_class_of(stage, domain), stage, domain)
             lines += [f"## {stage}, {domain}", "", "| setting | default | meaning | source |", "|---|---|---|---|"]
             lines += [_row(row) for row in rows]
             lines.append("")

@@ -5,11 +5,11 @@ first use, so that ``import hypogoal`` and the command line's ``--help`` stay fa
 """
 
 import importlib
+import sys
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
-
-__version__ = "0.8.0"
+__version__ = "0.9.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import OptionEnv, load_ensemble, load_options
@@ -40,7 +40,29 @@ def __dir__() -> list[str]:
     return __all__
 
 
-# As packages with environments do: Gymnasium finds them once this one is imported. Their modules are loaded when one
-# is made.
-gymnasium.register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
-gymnasium.register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
+def _register(_imported: object = None) -> None:
+    """Have Gymnasium find the environments; their modules are loaded when one is made."""
+    from gymnasium import register
+
+    register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
+    register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
+
+
+class _Registration:
+    """Waits until someone imports Gymnasium, which takes longer than all that is imported here, and few need it."""
+
+    def find_spec(self, name: str, *_: object) -> Any:
+        if name != "gymnasium" or self not in sys.meta_path:
+            return None
+        sys.meta_path.remove(self)
+        loader: Any = getattr(spec := find_spec(name), "loader", None)
+        if loader is not None:
+            load = loader.exec_module
+            loader.exec_module = lambda module: _register(load(module))
+        return spec
+
+
+if "gymnasium" in sys.modules:
+    _register()
+else:
+    sys.meta_path.insert(0, _Registration())

@@ -27,7 +27,8 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
         sub_goal: for example ``open-red-door``.
 
     Returns:
-        An ensemble; ``ensemble.predict(observations)`` gives float32 (N, K) from uint8 (N, *obs_shape).
+        An ensemble; ``ensemble.predict(observations)`` gives float32 (N, K) from (N, *obs_shape), uint8 or
+        float32 as it was trained.
 
     Raises:
         UserError: not an ensemble artefact, or no such sub-goal.

@@ -11,8 +11,9 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, pl
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 ATTRIBUTES = (
-    "format", "domain", "sub_goals", "observation_shape", "config", "seed", "versions", "complete",
+    "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "versions", "complete",
 )  # fmt: skip
 AGAIN = "Collect it again."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
@@ -33,6 +34,12 @@ FEW = 10  # labelled states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
+# What an observation is: a picture, bytes (H, W, C), or numbers of any shape, which networks see standardised.
+PICTURE, NUMBERS = np.dtype(np.uint8), np.dtype(np.float32)
+Observations: TypeAlias = NDArray[Any]  # of one of the two
+Standard: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]  # mean and deviation of such numbers
+DEVIATIONS = 10.0  # from their mean, at which they are cut: such are far from all that was learned of
+MOST_ROWS = 20_000  # of which mean and deviation are
 
 
 @dataclass(frozen=True)
@@ -40,43 +47,58 @@ class States:
     """States with their true labels.
 
     Attributes:
-        observations: uint8 (N, *observation_shape).
+        observations: uint8 or float32 (N, *observation_shape).
         labels: bool (N, G), one column per sub-goal.
         origins: int (N,) arrays that say where each state comes from (layout_seed, agent_x, ...).
     """
 
-    observations: NDArray[np.uint8]
+    observations: Observations
     labels: NDArray[np.bool_]
     origins: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Collected:
-    """What a domain's ``collect`` returns: three sets of states and the sub-goals' names (G of them)."""
+    """What a domain's ``collect`` returns: three sets of states, the sub-goals' names (G), those of features if any."""
 
     observation_shape: tuple[int, ...]
     sub_goals: tuple[str, ...]
     labelled: States
     unlabelled: States
     heldout: States
+    features: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Split:
-    """States of one sub-goal: observations uint8 (N, *obs), labels bool (N,), origins int (N,) each."""
+    """States of one sub-goal: observations uint8 or float32 (N, *obs), labels bool (N,), origins int (N,) each."""
 
-    observations: NDArray[np.uint8]
+    observations: Observations
     labels: NDArray[np.bool_]
     origins: Mapping[str, NDArray[np.int64]]
 
 
-def digest(picture: NDArray[np.uint8], labels: bytes | bytearray = b"") -> bytes:
-    """What tells pictures of one shape, with these labels, apart: 16 bytes."""
-    return blake2b(picture.tobytes() + labels, digest_size=16).digest()
+def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
+    """What tells observations of one shape and type, with these labels, apart: 16 bytes."""
+    return blake2b(observation.tobytes() + labels, digest_size=16).digest()
 
 
-def leave_out(states: States, *known: NDArray[np.uint8]) -> States:
-    """Spec B3: the states whose pictures are none of ``known``, uint8 (M, ...) each, which members learn from."""
+def standard_of(shape: tuple[int, ...], *observations: Observations) -> Standard:
+    """Mean and deviation (*shape) of numbers (N, *shape) each; the latter is 1 where they hardly differ or are none."""
+    rows = [some[:: 1 + len(some) // MOST_ROWS] for some in observations]
+    every = np.concatenate([np.zeros((int(not any(map(len, rows))), *shape), NUMBERS), *rows])
+    mean, deviation = every.mean(0, dtype=np.float64), every.std(0, dtype=np.float64)
+    deviation = np.where(deviation > 1e-6 * np.abs(mean), deviation, 1.0)
+    return mean.astype(NUMBERS), deviation.astype(NUMBERS)
+
+
+def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
+    """Numbers (N, *shape) in deviations from their mean (*shape), arrays or tensors."""
+    return ((observations - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS)
+
+
+def leave_out(states: States, *known: Observations) -> States:
+    """Spec B3: the states whose observations are none of ``known``, (M, ...) each, which members learn from."""
     seen = {digest(picture) for pictures in known for picture in pictures}
     kept = np.array([digest(picture) not in seen for picture in states.observations], np.bool_)
     origins = {name: values[kept] for name, values in states.origins.items()}
@@ -139,6 +161,7 @@ def write_dataset(
         hdf5.set_attribute(file, "domain", domain)
         hdf5.set_attribute(file, "sub_goals", json.dumps(list(collected.sub_goals)))
         hdf5.set_attribute(file, "observation_shape", json.dumps(list(collected.observation_shape)))
+        hdf5.set_attribute(file, "observation_dtype", str(collected.unlabelled.observations.dtype))
         hdf5.set_attribute(file, "config", json.dumps(dict(config)))
         hdf5.set_attribute(file, "seed", seed)
         hdf5.set_attribute(file, "versions", json.dumps(versions()))
@@ -148,6 +171,8 @@ def write_dataset(
         group = file.create_group("unlabelled")
         write_observations(group, collected.unlabelled.observations)
         _write_origins(group, collected.unlabelled.origins)
+        if collected.features:  # of which there may be more than an attribute holds
+            file["features"] = hdf5.fixed(json.dumps(list(collected.features)))
         file.attrs.modify("complete", True)
 
 
@@ -168,7 +193,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
         _write_column(group, "labels", labels[:, index])
 
 
-def write_observations(group: Any, observations: NDArray[np.uint8]) -> None:
+def write_observations(group: Any, observations: Observations) -> None:
     """``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
     _store(group, "observations", observations, 64, compression="gzip", compression_opts=1)
 
@@ -210,12 +235,32 @@ class Dataset:
             raise UserError("the data file is not complete", path, AGAIN)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
         self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
+        dtype = self.attributes["observation_dtype"] or str(PICTURE)  # files from before there was another
+        self.observation_dtype = NUMBERS if dtype == str(NUMBERS) else PICTURE
         self.config: dict[str, Any] = self._json("config", dict)
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
         names = plain_names(self.sub_goals)
-        if not (sizes and names and self.observation_shape and isinstance(self.domain, str)):
+        known = dtype == str(self.observation_dtype)
+        if not (sizes and names and known and self.observation_shape and isinstance(self.domain, str)):
             raise foreign
+
+    @property
+    def observation_bytes(self) -> int:
+        """Of one observation."""
+        return prod(self.observation_shape) * self.observation_dtype.itemsize
+
+    def features(self) -> list[str]:
+        """Names of the numbers of an observation that is no picture, in their order; ``x0``, ... where it has none."""
+        count = prod(self.observation_shape)
+        with self._file() as file:
+            if hdf5.find(file, "features") is None:
+                return [f"x{number}" for number in range(count)]
+            text = hdf5.read_array(file, "features", "S").tobytes().rstrip(b"\0").decode(errors="replace")
+        names = parse_json(text, self.path, "names of features are", AGAIN)
+        if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
+            raise UserError("the data file has other names than features", self.path, AGAIN)
+        return names
 
     def labelled(self, sub_goal: str) -> Split:
         """The labelled states of one sub-goal."""
@@ -225,8 +270,8 @@ class Dataset:
         """The held-out states of one sub-goal, with their true labels: for evaluation only."""
         return self._split("heldout", sub_goal)
 
-    def unlabelled(self) -> NDArray[np.uint8]:
-        """The unlabelled states: uint8 (M, *obs)."""
+    def unlabelled(self) -> Observations:
+        """The unlabelled states: uint8 or float32 (M, *obs)."""
         with self._file() as file:
             return self._observations(file, "unlabelled")
 
@@ -264,16 +309,20 @@ class Dataset:
             raise hdf5.Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
         return labels.astype(np.bool_)
 
-    def _observations(self, file: Any, base: str) -> NDArray[np.uint8]:
+    def _observations(self, file: Any, base: str) -> Observations:
         name = f"{base}/observations"
         found = self._found(file, name)
-        if found.shape[1:] != self.observation_shape or found.dtype != np.uint8:
-            raise hdf5.Foreign(f"{name!r} is {found.dtype} {found.shape}, not uint8 (N, {self.observation_shape})")
-        return hdf5.read_array(file, name, "u")
+        dtype = self.observation_dtype
+        if found.shape[1:] != self.observation_shape or found.dtype != dtype:
+            raise hdf5.Foreign(f"{name!r} is {found.dtype} {found.shape}, not {dtype} (N, {self.observation_shape})")
+        values = hdf5.read_array(file, name, "uf")
+        if dtype == NUMBERS and not np.isfinite(values).all():
+            raise hdf5.Foreign(f"{name!r} has numbers that are not finite")
+        return values
 
     @staticmethod
     def _found(file: Any, name: str) -> Any:
-        hdf5.size_of(file, name, "u")
+        hdf5.size_of(file, name, "uf")
         found = file[name]
         if not found.shape:
             raise hdf5.Foreign(f"{name!r} is a single number")

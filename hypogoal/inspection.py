@@ -16,13 +16,16 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_text
+from hypogoal.core.files import read_end, read_json, read_text
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, NUMBERS, UNSEALED
+from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
-from hypogoal.dataset import SPLITS, open_dataset
+from hypogoal.dataset import PICTURE, SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
+# Numbers of logs, in the order in which they are told: what they are called.
+RESULTS = {"balanced_accuracy": "best member's balanced accuracy", "labelled": "labelled loss"}
+RESULTS |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
 
 
@@ -37,10 +40,28 @@ def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
         about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        return {"kind": "data", "path": str(path), **about, "config": dataset.config, "counts": dataset.counts()}
+        about |= {"observation_dtype": str(dataset.observation_dtype)}
+        return {"kind": "data", "path": str(path), "counts": dataset.counts(), **about, "config": dataset.config}
     artefact = open_artefact(path)
-    keys = ("kind", "format", "seed", "config", "inputs", "files", "versions", "command")
-    return {"path": str(path), **{key: artefact.manifest.get(key) for key in keys}}
+    keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
+    about = {"path": str(path), **artefact.manifest, "result": result_of(path)}
+    return {key: about.get(key) for key in ("path", *keys)}
+
+
+def result_of(path: Path) -> dict[str, float]:
+    """The last numbers of an artefact's logs, if any: means over sub-goals, of scores the best member's."""
+    last: dict[tuple[str, str], dict[str, Any]] = {}
+    for text in (text for log in (LOG, SCORES) for text in read_end(path / log)):
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(line := json.loads(text), dict) and line.get("scope", "all") == "all":
+                last[str(line.get("sub_goal")), str(line.get("member"))] = line
+    found: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
+    for (goal, _), line in last.items():
+        for name in RESULTS:
+            value: Any = line.get(name)
+            if type(value) in (int, float) and abs(value) < 1e300:
+                found[name][goal] = max(value, found[name].get(goal, value))
+    return {told: sum(found[name].values()) / len(found[name]) for name, told in RESULTS.items() if found[name]}
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
@@ -65,18 +86,17 @@ def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
 
 
 def lines(about: dict[str, Any]) -> list[str]:
-    """A description as text, a line a fact."""
+    """A description as text, a line a fact, what it came to first."""
     if about["kind"] == "run":
-        return [f"{part['path']}: {part['kind']}" for part in about["artefacts"]]
-    text = [f"{about['path']}: {about['kind']}"]
+        return [line for part in about["artefacts"] for line in lines(part)[:1]]
+    result = ", ".join(f"{name} {value:.4g}" for name, value in (about.get("result") or {}).items())
+    text = [f"{about['path']}: {about['kind']}" + (f"; {result}" if result else "")]
     for key, value in about.items():
-        if key in ("path", "kind") or value is None:
-            continue
-        if isinstance(value, dict):
+        if isinstance(value, dict) and key != "result":
             text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
         elif key == "inputs" and value:
             text += [f"{key}:", *(f"  {item['kind']} {item['path']}" for item in value)]
-        else:
+        elif key not in ("path", "kind", "result") and value is not None:
             text.append(f"{key}: {value}")
     return text
 
@@ -94,8 +114,9 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     if not path.is_file():
         raise UserError("contact sheets are of data files", path, "Give the .h5 file that 'hypogoal collect' wrote.")
     dataset = open_dataset(path)
-    if len(dataset.observation_shape) != 3:
-        raise UserError("the states are no pictures", f"observation shape {dataset.observation_shape}")
+    if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
+        given = f"{dataset.observation_dtype} {dataset.observation_shape}"
+        raise UserError("the states are no pictures", given, f"Read them with 'hypogoal export {path} --out X.npz'.")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []

@@ -5,7 +5,6 @@ process with torch has before any of it (450 MB were measured while ``train-meta
 """
 
 from collections.abc import Sequence
-from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +38,7 @@ def ensemble_needs(
     dataset = open_dataset(data)
     labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
     others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
-    states = (labelled + others) * prod(dataset.observation_shape)
+    states = (labelled + others) * dataset.observation_bytes
     return Needs(workers * ensemble_process(states, config.members), ensemble_disk(sub_goals, config.members))
 
 
@@ -60,7 +59,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
 
     oracle = config.termination == "oracle"
     options = len(about["sub_goals"]) * (1 if oracle else about["members"])
-    picture = prod(domain.observation_shape)
+    picture = domain.observation_bytes
     paper = config.network == "paper"
     replays = options if paper else 1
     weights = options * PAPER_POLICY if paper else 8e6
@@ -84,6 +83,6 @@ def evaluation_needs(data: list[Path], workers: int = 1) -> Needs:
     for dataset in map(open_dataset, data):
         counts = dataset.counts()
         heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
-        largest = max(largest, (heldout + counts["unlabelled"]) * prod(dataset.observation_shape))
+        largest = max(largest, (heldout + counts["unlabelled"]) * dataset.observation_bytes)
     processes = workers + (workers > 1)  # the one that asks holds the states too
     return Needs(300e6 + processes * (BASE + 2.0 * largest), 2 * LOGS)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from hypogoal.core.config import resolve
+from hypogoal.core.config import DOMAIN, as_dict, describe, from_values, load_preset, resolve
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import AuditConfig, TrainMetaConfig, TrainOptionsConfig
@@ -15,8 +15,36 @@ CONFIGS: Mapping[str, type] = {
     "train-baseline": BaselineConfig,
     "audit": AuditConfig,
 }
+OFTEN: Mapping[str, tuple[str, ...]] = {  # what people change most: options of the stage's command
+    "train-ensemble": ("members", "diversity", "diversity_weight", "network", "steps"),
+    "train-options": ("steps", "layout_seed", "network", "termination", "option_timeout"),
+    "train-meta": ("steps", "layout_seed", "network", "termination", "chooser"),
+    "train-baseline": ("agent", "steps", "layout_seed", "setting"),
+    "audit": ("steps", "layout_seed", "option_timeout", "mend"),
+}
 STAGES = ("collect", *CONFIGS)  # whose settings are its domain's
 TABLES = (*STAGES, "run")  # of presets
+
+
+def options_of(stage: str) -> dict[str, dict[str, Any]]:
+    """What is known of the settings in ``OFTEN``, by the option of the stage's command that is short for ``--set``."""
+    rows = {row["name"]: row for row in describe(CONFIGS[stage])} if stage in CONFIGS else {}
+    return {f"--{name.replace('_', '-')}": rows[name] for name in OFTEN.get(stage, ())}
+
+
+def described(config_class: type, stage: str, domain: str, preset: str | None = None) -> list[dict[str, Any]]:
+    """Every setting of a stage, see :func:`hypogoal.core.config.describe`, as a domain and a preset have them."""
+    instead: list[tuple[Mapping[str, Any], str]] = []
+    if domain != DOMAIN:  # whose defaults are the classes' own: quicker than to load it
+        from hypogoal.domains.base import load_domain
+
+        found = load_domain(domain, given=True)
+        instead.append((found.defaults.get(stage, {}), found.sources.get(stage, f"{domain}'s own")))
+    if preset is not None:
+        values = load_preset(preset, stage, domain, TABLES)
+        checked = as_dict(from_values(config_class, values, stage))
+        instead.append(({key: checked[key] for key in values}, f"preset {preset}"))
+    return describe(config_class, *instead)
 
 
 def configuration(

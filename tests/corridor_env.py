@@ -74,10 +74,38 @@ def swift(env: gymnasium.Env, info: dict[str, Any], earned: float, terminated: b
 SWIFT = GymnasiumDomain(Paid, SUB_GOALS, success=swift)
 
 
-class Floats(CorridorEnv):
-    """Its observations are no images of bytes."""
+class Sensed(CorridorEnv):
+    """Its observations are numbers, in a dictionary: where the agent is, and of which layout this is."""
 
-    observation_space = spaces.Box(0, 1, SHAPE, np.float32)  # type: ignore[assignment]
+    observation_space = spaces.Dict(  # type: ignore[assignment]
+        {"place": spaces.Box(-1, 1, (2,), np.float32), "layout": spaces.Discrete(8), "noise": spaces.Box(0, 9, ())}
+    )
+
+    def image(self) -> Any:
+        way = self.cell / (LENGTH - 1)
+        place = np.array([way, -way], np.float32)
+        return {"noise": np.array(5, np.float32), "place": place, "layout": self.layout}
+
+
+class Wordy(CorridorEnv):
+    """Its observations are neither images nor numbers."""
+
+    observation_space = spaces.Sequence(spaces.Discrete(2))  # type: ignore[assignment]
+
+
+class Framed(CorridorEnv):
+    """Its image is in a dictionary."""
+
+    observation_space = spaces.Dict(image=spaces.Box(0, 255, SHAPE, np.uint8))  # type: ignore[assignment]
+
+    def image(self) -> Any:
+        return {"image": super().image()}
+
+
+class Mixed(CorridorEnv):
+    """Its image has company."""
+
+    observation_space = spaces.Dict(image=spaces.Box(0, 255, SHAPE, np.uint8), cell=spaces.Discrete(LENGTH))  # type: ignore[assignment]
 
 
 class Steered(CorridorEnv):
@@ -138,7 +166,8 @@ GREY, STACKED, TURNED = (GymnasiumDomain(env, SUB_GOALS) for env in (Grey, Stack
 RAISING = GymnasiumDomain(CorridorEnv, {"key": carries})
 NAMELESS = GymnasiumDomain(CorridorEnv, {"rooms/low": at_left})
 TWICE = GymnasiumDomain(CorridorEnv, {"End": at_left, "end": at_right})
-FLOATS, STEERED, RESTLESS, LYING = (GymnasiumDomain(env, SUB_GOALS) for env in (Floats, Steered, Restless, Lying))
+WORDY, STEERED, RESTLESS, LYING = (GymnasiumDomain(env, SUB_GOALS) for env in (Wordy, Steered, Restless, Lying))
+SENSED, FRAMED, MIXED = (GymnasiumDomain(env, SUB_GOALS) for env in (Sensed, Framed, Mixed))
 NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: False})
 ALWAYS = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "somewhere": lambda env: True})
 

@@ -152,7 +152,7 @@ def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytes
         (["train-meta", ensemble, "--out", str(made / "options"), "--resume"], "not of kind 'meta': it is of kind"),
         (["collect", "montezuma", "--out", data, "--resume"], f"{made_with} domain=doorkey, not montezuma"),
         (["train-baseline", "montezuma", "--out", meta, "--resume"], "not of kind 'baseline'"),
-        ([*report, "--videos", "1"], f"{made_with} videos=0, not 1"),
+        ([*report, "--videos", "2"], f"{made_with} videos=1, not 2"),
     ]
     for arguments, words in cases:
         assert words in one_line(capsys, arguments)
@@ -202,7 +202,7 @@ def places(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
         ("train-ensemble {data} --out {out} --set sub_goals=go-to-goal,go-to-goal", "a sub-goal twice"),
         ("train-ensemble {data} --out {out} --seed 9007199254740992", "--seed"),
         ("collect doorkey --out {out} --seed 36893488147419103232", "--seed"),
-        ("train-meta {ensemble} --out {out} --layout-seed 9007199254740993", "--layout-seed"),
+        ("train-meta {ensemble} --out {out} --layout-seed 9007199254740993", "out of range: layout_seed"),
         ("train-meta {ensemble} --out {out} --set layout_seed=9007199254740993", "out of range"),
         ("run doorkey --out {out} --set seeds=1,9007199254740992", "out of range"),
         ("collect chess --out {out}", "unknown domain: chess"),

@@ -22,7 +22,15 @@ SHORT = {
     "train-meta": ("steps=400", "warm_up=100", "max_episode_steps=60", "random_episodes=2"),
     "train-baseline": ("steps=640", "max_episode_steps=60", "random_episodes=2"),
 }
-NOT_OURS = ("python3", ".venv/bin/pip", "pip", "make", "export", "source")  # set-up: the Makefile's tests and CI do it
+NOT_OURS = (
+    "python3",
+    ".venv/bin/pip",
+    "pip",
+    "make",
+    "export",
+    "source",
+    "uv",
+)  # set-up: the Makefile's tests and CI do it
 
 
 def blocks(page: Path, language: str) -> list[str]:

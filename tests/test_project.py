@@ -13,17 +13,19 @@ import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import NormalizedName, canonicalize_name
 from packaging.version import Version
-from safetensors.numpy import save_file
 
 import hypogoal
 from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.seeding import torch_generator
 from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hypogoal"
@@ -289,18 +291,22 @@ def test_formats_are_readable_without_hypogoal(
     write_dataset(data, collected, domain="doorkey", config={}, seed=0)
     config = {"sub_goals": list(goals)}
     with create_artefact(ensemble, kind="ensemble", config=config, seed=0, inputs=[data]) as folder:
-        save_file({"0.weight": np.ones((2, 3), np.float32)}, folder / "open-red-door.safetensors")
+        member = Ensemble("doorkey", (64, 64, 3), 1, torch_generator(0, "weights")).eval()
+        write_ensemble(folder, "open-red-door", member)
 
     snippets = code_of("docs/formats.md")
-    assert len(snippets) == 3
+    assert len(snippets) == 5
     assert not any("hypogoal" in snippet for snippet in snippets)
-    for snippet in snippets:
-        exec(compile(snippet, "docs/formats.md", "exec"), {})
+    found: dict[str, Any] = {}
+    for snippet in snippets[:4]:  # the last in tests/examples, with the example that it is of
+        exec(compile(snippet, "docs/formats.md", "exec"), found)
+    logits = member.logits(np.zeros((1, 64, 64, 3), np.uint8))[0]
+    np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-6)
     printed = capsys.readouterr().out
     positives = int(collected.labelled.labels[:, 1].sum())
-    assert f"open-red-door: 7 states, {positives} positives, images (8, 8, 3)" in printed
+    assert f"open-red-door: 7 states, {positives} positives, uint8 (8, 8, 3)" in printed
     assert "5 unlabelled states" in printed
-    assert "0.weight float32 (2, 3)" in printed
+    assert "members.0.13.weight float32 (2, 100)" in printed
 
     (ensemble / "open-red-door.safetensors").write_bytes(b"changed")
     with pytest.raises(AssertionError, match="open-red-door"):

@@ -12,14 +12,17 @@ import re
 import signal
 import sys
 import time
+from dataclasses import fields
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
-from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has the stages first
+from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
+from hypogoal.settings import CONFIGS, TABLES
 
 NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller settings."
 # What torch, and whoever loads a library, raises in place of a MemoryError.
@@ -38,15 +41,10 @@ def _version(value: bool) -> None:
 
 @app.callback()
 def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show it and exit.")] = False,
+    debug: Annotated[bool, Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """Stages: collect, train-ensemble, train-options, train-meta, evaluate, report.
-
-    'run' chains them, 'sweep' runs them over seeds, layouts, ladders and methods.
-    """
+    """What stands before a command."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -76,11 +74,21 @@ def main(arguments: list[str] | None = None) -> int:
         ended = getattr(error, "exit_code", None)
         if ended is not None:
             message = getattr(error, "format_message", lambda: "")()
-            return _fail(f"{message} See 'hypogoal --help'.", 2) if message else int(ended)
+            return _fail(f"{message.rstrip('.')}. {_advice(error)}", 2) if message else int(ended)
         message, code = _told(error)
         if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a pipe that nobody reads any more
             raise
         return _fail(message, code)
+
+
+def _advice(error: Any) -> str:
+    """What to do about words that a command does not take; settings are often taken for options."""
+    context, key = getattr(error, "ctx", None), getattr(error, "option_name", "").lstrip("-").replace("-", "_")
+    stage = getattr(context, "info_name", "")
+    if not hasattr(error, "possibilities") or stage not in TABLES:
+        return f"See '{context.command_path if context else 'hypogoal'} --help'."
+    known = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
+    return f"Settings are given as --set {key if known else 'key'}=VALUE; 'hypogoal config {stage}' lists them."
 
 
 def _told(error: BaseException) -> tuple[str, int]:

@@ -4,12 +4,17 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
-from hypogoal.cli.common import Quiet, Set, app, values_of
+from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give
 
-benchmark = typer.Typer(help="Score diversity objectives where the answer is known.", no_args_is_help=True)
-app.add_typer(benchmark, name="benchmark")
+ENTRIES = (
+    "With commas between: dbat, none, another objective (docs/concepts.md) or module:function, each also with a weight "
+    "(dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
+)
+benchmark = typer.Typer(cls=cli.Commands, no_args_is_help=True)
+cli.app.add_typer(benchmark, name="benchmark", rich_help_panel=cli.MANY)
 
 
 @benchmark.callback()
@@ -17,30 +22,20 @@ def _group() -> None:
     """Score diversity objectives where the answer is known."""
 
 
-@benchmark.command("which-feature")
+@cli.command(cli.MANY, "benchmark which-feature --out runs/which", "which-feature", benchmark)
 def which_feature(
-    out: Annotated[Path, typer.Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
-    diversity: Annotated[
-        str,
-        typer.Option(
-            help="Entries, with commas between: dbat, none, another objective (docs/concepts.md) or module:function, "
-            "each also with a weight (dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
-        ),
-    ] = "dbat,none,oracle",
-    mix: Annotated[
-        str, typer.Option(help="Shares of unlabelled states whose features are drawn each for itself: 0.1,0.5.")
-    ] = "0.5",
-    members: Annotated[int, typer.Option(help="Hypotheses (K) of an entry.")] = 4,
-    seeds: Annotated[str, typer.Option(help="0-4, or 0,3,7.")] = "0-4",
-    factors: Annotated[
-        str, typer.Option(help="Features that are planted; also moved, which takes two frames. The others vary freely.")
-    ] = "colour,shape,place,count",
-    high: Annotated[float, typer.Option(help="Ranking of a feature from which on a member owns it.")] = 0.95,
-    low: Annotated[float, typer.Option(help="Its ranking of every other feature is at most this.")] = 0.6,
-    set_: Set = None,
-    quiet: Quiet = False,
+    out: Annotated[Path, Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
+    diversity: Annotated[str, Option(help=ENTRIES)] = "dbat,none,oracle",
+    mix: Annotated[str, Option(help="Shares of unlabelled states whose features are drawn apart: 0.1,0.5.")] = "0.5",
+    members: Annotated[int, Option(help="Hypotheses (K) of an entry.")] = 4,
+    seeds: Annotated[str, Option(help="0-4, or 0,3,7.")] = "0-4",
+    factors: Annotated[str, Option(help="Features planted; also moved, of two frames.")] = "colour,shape,place,count",
+    high: Annotated[float, Option(help="Ranking of a feature from which on a member owns it.")] = 0.95,
+    low: Annotated[float, Option(help="Its ranking of every other feature is at most this.")] = 0.6,
+    set_: cli.Set = None,
+    quiet: cli.Quiet = False,
 ) -> None:
-    """Which features do members find, of several that fit the labels equally well?
+    """Which features do members find, of several that fit?
 
     Small scenes have planted features (--factors): colour, shape and place of
     an object, and how many boxes there are. In the labelled ones all say the
@@ -50,13 +45,9 @@ def which_feature(
 
     - coverage: the share of features that some member ranks by (area under the
     ROC curve of at least --high) while it ranks by no other (at most --low)
-
     - best: the highest ranking of a feature by a member, mean over features
-
     - same: the share of pairs of members with the same best feature
-
     - gap: what the threshold of 0.5 costs in balanced accuracy
-
     - labels: how many it takes until the right member is known, for those
     features that are covered
 
@@ -70,7 +61,7 @@ def which_feature(
     prepare()
     options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds}
     config = run.resolved({**options, "factors": factors, "high": high, "low": low}, set_ or ())
-    with own_code.given(*run.objectives_in(diversity), *values_of(set_)):
+    with own_code.given(*run.objectives_in(diversity), *cli.values_of(set_)):
         cells = run.run(config, out, quiet)
     draw(page.table_of(cells, config), 79)
     page.write(out / "page.html", cells, config)

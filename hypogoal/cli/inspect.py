@@ -1,90 +1,108 @@
 """The commands that only look: ``show``, ``verify``, ``watch``, ``config``."""
 
+import itertools
+import json
+import shutil
+import textwrap
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from hypogoal.cli.common import AsJson, app, echo
+from hypogoal.cli import common as cli
+from hypogoal.core.config import DOMAIN
 from hypogoal.core.errors import UserError
 from hypogoal.core.terminal import draw, give, say
+from hypogoal.settings import CONFIGS, OFTEN, TABLES, described
+
+Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
 
 
-@app.command()
+@cli.command(cli.LOOK, "show runs/mine")
 def show(
-    path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")],
-    as_json: AsJson = False,
-    pictures: Annotated[
-        Path | None, typer.Option(help="Of a data file: draw its states with their labels into this folder.")
-    ] = None,
+    path: Made,
+    as_json: cli.AsJson = False,
+    pictures: Annotated[Path | None, Option(help="Of a data file: draw labelled states into this folder.")] = None,
 ) -> None:
-    """What is this: kind, configuration, inputs; of data the counts, of an evaluation or its run the numbers."""
+    """What is this: its result, configuration and inputs."""
     from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
 
     about, numbers = describe_path(path), None
-    if not as_json:
-        echo(about, False, lines(about))
     try:
         numbers = numbers_of(path)
     except UserError as error:  # what it is can be told all the same
         say(f"hypogoal: {error}", err=True)
-    if as_json:
-        echo(about if numbers is None else {**about, "metrics": numbers}, True, [])
-    elif numbers is not None:
+    if numbers is not None and not as_json:
         draw(summary_of(numbers, path), 100)
+    cli.print_counts(about.get("counts", {}), as_json)
+    told = about if numbers is None else {**about, "metrics": numbers}
+    cli.echo(told, as_json, lines({key: value for key, value in about.items() if key != "counts"}))
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
             give(sheet, err=as_json)
 
 
-@app.command()
-def verify(
-    path: Annotated[Path, typer.Argument(help="A data file, an artefact or a run.")],
-    as_json: AsJson = False,
-) -> None:
-    """Check schema, hashes, numbers and the inputs within PATH; exit code 2 when something is wrong."""
+@cli.command(cli.LOOK, "verify runs/mine")
+def verify(path: Made, as_json: cli.AsJson = False) -> None:
+    """Is it whole? Exit code 2 when something is wrong.
+
+    Checks schema, hashes, numbers, and the inputs within PATH.
+    """
     from hypogoal.inspection import faults_of, notes_of
 
     faults, notes = faults_of(path), notes_of(path)
-    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [f"{path}: whole"]), *notes])
+    cli.echo({"path": str(path), "faults": faults, "notes": notes}, as_json, [*(faults or [f"{path}: whole"]), *notes])
     if faults:
         raise typer.Exit(2)
 
 
-@app.command()
+@cli.command(cli.LOOK, "watch runs/mine")
 def watch(
-    run: Annotated[Path, typer.Argument(help="A run, finished or not.")],
-    once: Annotated[bool, typer.Option("--once", help="Print it once instead of following it.")] = False,
-    tensorboard: Annotated[
-        Path | None, typer.Option(help="Write the logs into this new folder too, for TensorBoard (an extra).")
-    ] = None,
+    run: Annotated[Path, Argument(help="A run, finished or not.")],
+    once: Annotated[bool, Option("--once", help="Print it once instead of following it.")] = False,
+    tensorboard: Annotated[Path | None, Option(help="Logs for TensorBoard (an extra), into this new folder.")] = None,
 ) -> None:
-    """Follow a run in the terminal: each artefact's steps and success or loss so far. Ctrl-C ends it."""
+    """Follow a run: steps, success or loss so far. Ctrl-C ends it."""
     from hypogoal.live_view import Boards
     from hypogoal.live_view import watch as look
 
     look(run, once=once, boards=Boards(tensorboard) if tensorboard else None)
 
 
-@app.command()
+@cli.command(cli.LOOK, "config train-ensemble --domain montezuma")
 def config(
-    stage: Annotated[str, typer.Argument(help="For example train-meta.")],
-    domain: Annotated[
-        str, typer.Option(help="Whose settings: doorkey, montezuma, which-feature, or module:object.")
-    ] = "doorkey",
-    as_json: AsJson = False,
+    context: typer.Context,
+    stage: Annotated[
+        str | None, Argument(help="train-meta, say; if none, all are told.", autocompletion=cli.offer("stage"))
+    ] = None,
+    domain: Annotated[str, Option(help=f"Whose: {cli.DOMAINS}", autocompletion=cli.offer("domain"))] = DOMAIN,
+    preset: cli.Preset = None,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Every setting of a stage: default, unit, meaning, source."""
-    from hypogoal.core.config import describe
-    from hypogoal.domains.base import defaults_of
-    from hypogoal.stages.sweep import config_class_of
-
-    rows = describe(config_class_of(stage, domain), defaults_of(domain, stage, given=True))
-    if as_json:
-        echo(rows, True, [])
+    if stage is None:
+        known: Any = context.parent and context.parent.command
+        cli.echo(list(TABLES), as_json, [f"{name:15}{known.commands[name].get_short_help_str(64)}" for name in TABLES])
         return
-    for row in rows:
-        default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple) else row["default"]
-        unit = f" {row['unit']}" if row["unit"] else ""
-        say(f"{row['name']} = {default}{unit}" + (f"   ({row['allowed']})" if row["allowed"] else ""))
-        say(f"    {row['meaning']}" + (f" [{row['source']}]" if row["source"] else ""))
+    config_class = CONFIGS.get(stage)
+    if config_class is None:  # slower: a domain's or an experiment's
+        from hypogoal.stages.sweep import config_class_of
+
+        config_class = config_class_of(stage, domain)
+    rows = described(config_class, stage, domain, preset)
+    if as_json:
+        give(json.dumps(rows, indent=1))
+        return
+    width, often = min(shutil.get_terminal_size().columns, 100), OFTEN.get(stage, ())
+    parts = [(part.__doc__ or "").partition(".")[0] for part in config_class.__mro__]
+    rows.sort(key=lambda row: -1 if row["name"] in often else parts.index(row["part"]))
+    for title, settings in itertools.groupby(rows, lambda row: "Most changed" if row["name"] in often else row["part"]):
+        say(f"{title}:")
+        for row in settings:
+            default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple | list) else row["default"]
+            allowed = f"   ({row['allowed']})" if row["allowed"] else ""
+            say(f"  {row['name']} = {default} {row['unit']}".rstrip() + allowed)
+            told = row["meaning"] + (f" [{row['source']}]" if row["source"] else "")
+            for line in textwrap.wrap(told, width, initial_indent=" " * 6, subsequent_indent=" " * 6):
+                say(line)

@@ -8,39 +8,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from hypogoal.cli.common import Force, Out, Quiet, Seed, Set, app, print_counts
+from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import give, say
+
+PLAYED = "a domain, a Gymnasium environment's id, or module:object."
 
 if TYPE_CHECKING:
     from hypogoal.testing import Verdict
 
 
-@app.command("import")
+@cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
-    source: Annotated[
-        Path, typer.Argument(help="A .npz file, a folder of .npy files or of images, or a Minari dataset's folder.")
-    ],
-    out: Out,
-    sub_goal: Annotated[
-        list[str] | None, typer.Option(help="A sub-goal's name, in the order of the labels' columns; repeatable.")
-    ] = None,
-    label: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=MODULE:FUNCTION", help="Of a Minari dataset: a sub-goal and who labels it."),
-    ] = None,
-    key: Annotated[str, typer.Option(help="Of a Minari dataset of dictionaries: which part is the image.")] = "",
-    heldout: Annotated[
-        float, typer.Option(min=0.01, max=0.9, help="Share of the labelled states held out, where none are given.")
-    ] = 0.2,
-    domain: Annotated[str, typer.Option(help="What the states are of, for train-options.")] = "imported",
-    seed: Seed = 0,
-    force: Force = False,
-    quiet: Quiet = False,
+    source: Annotated[Path, Argument(help="A .npz file, or a folder: of .npy files, of images, a Minari dataset's.")],
+    out: cli.Out,
+    sub_goal: Annotated[list[str] | None, Option(help="In the order of the labels' columns; repeatable.")] = None,
+    label: Annotated[list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Of Minari: who labels.")] = None,
+    key: Annotated[str, Option(help="Of a Minari dataset of dictionaries: which part is meant.")] = "",
+    heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
+    domain: Annotated[str, Option(help="What the states are of, for train-options.")] = "imported",
+    seed: cli.Seed = 0,
+    force: cli.Force = False,
+    quiet: cli.Quiet = False,
 ) -> None:
-    """Make a data file of own states: arrays, images, or a Minari dataset with label functions."""
+    """Make a data file of own arrays, images or Minari data."""
     from hypogoal.core import own_code
     from hypogoal.stages.import_data import import_data as stage
 
@@ -53,22 +47,23 @@ def import_(
             source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,
             force=force,
         )  # fmt: skip
-    print_counts(counts, quiet)
+    cli.print_counts(counts, quiet)
+    cli.print_next(quiet, "train-ensemble", out, "--out", Path("runs", out.stem, "ensemble"))
     give(out)
 
 
-@app.command()
+@cli.command(cli.OWN, "export data/doorkey.h5 --out states.npz")
 def export(
-    source: Annotated[Path, typer.Argument(help="A data file, or the folder of a meta artefact.")],
-    out: Annotated[Path, typer.Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Of the agent, where it is one.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="Of the agent's draws of options.")] = 0,
-    force: Force = False,
-    quiet: Quiet = False,
+    source: Annotated[Path, Argument(help="A data file, or the folder of a meta artefact.")],
+    out: Annotated[Path, Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
+    episodes: Annotated[int, Option(min=1, help="Of the agent, where it is one.")] = 20,
+    seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Of the agent's draws of options.")] = 0,
+    force: cli.Force = False,
+    quiet: cli.Quiet = False,
 ) -> None:
-    """Write states as NumPy arrays, or an agent's episodes as a Minari dataset, for other software.
+    """Write states or an agent's episodes for other software.
 
-    'import' takes both again.
+    States as NumPy arrays, episodes as a Minari dataset. 'import' takes both again.
     """
     if source.is_dir():
         from hypogoal.stages.export_episodes import export_episodes
@@ -83,29 +78,20 @@ def export(
     give(out)
 
 
-@app.command()
+@cli.command(cli.OWN, "label doorkey --out marks/door-open")
 def label(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="States to look at: a data file, a .npz file or a folder of images. Or what to play: a domain, a "
-            "Gymnasium environment's id, or module:object."
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
-    layout_seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="The layout that is played first.")] = 0,
-    arg: Annotated[
-        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Of the environment, such as --arg start=2-6.")
-    ] = None,
-    heldout: Annotated[bool, typer.Option("--heldout", help="The states are for evaluation.")] = False,
-    fps: Annotated[
-        int, typer.Option(min=0, max=60, help="Play in real time, so many steps a second; 0: a step for each key.")
-    ] = 0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a folder that there is.")] = False,
+    source: Annotated[str, Argument(help=f"To look at: a data file, .npz file or folder of images; to play: {PLAYED}")],
+    out: Annotated[Path, Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
+    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played first.")] = 0,
+    arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Of the environment: start=2-6.")] = None,
+    heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
+    fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps a second; 0: a step for each key.")] = 0,
+    resume: Annotated[bool, Option("--resume", help="Go on with a folder that there is.")] = False,
 ) -> None:
-    """Mark states by hand, in a window: p positive, n negative, u unlabelled; 'import' takes the folder.
+    """Mark states by hand, in a window; 'import' takes them.
 
-    Every mark is on the disk at once. --heldout adds states of other layouts to a folder, to judge members by.
+    Keys: p positive, n negative, u unlabelled. Every mark is on the disk at
+    once. --heldout adds states of other layouts to a folder, to judge members.
     """
     from hypogoal.core import own_code
     from hypogoal.stages.label import label as stage
@@ -117,7 +103,7 @@ def label(
         )  # fmt: skip
     say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
     if all(counts.values()):
-        say(f"next: hypogoal import {out} --out {out.with_suffix('.h5')}")
+        cli.print_next(False, "import", out, "--out", out.with_suffix(".h5"))
     give(out)
 
 
@@ -135,18 +121,19 @@ def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-@app.command()
+@cli.command(cli.OWN, "check mine:DOMAIN")
 def check(
-    domain: Annotated[str | None, typer.Argument(help="A domain: a name or module:object.")] = None,
-    diversity: Annotated[str | None, typer.Option(help="A diversity objective: a name or module:function.")] = None,
-    network: Annotated[str | None, typer.Option(help="A member network: a name or module:function.")] = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    layout_seed: Annotated[int, typer.Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
+    domain: Annotated[str | None, Argument(help=cli.DOMAINS, autocompletion=cli.offer("domain"))] = None,
+    diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
+    network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
+    set_: cli.Set = None,
+    seed: cli.Seed = 0,
+    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
 ) -> None:
-    """Check that an own domain, diversity objective or network keeps to its contract; exit code 2 when not.
+    """Does an own domain, objective or network keep its contract?
 
-    --set changes how states of the domain are collected, as for 'collect'; they are collected twice.
+    Exit code 2 when not. --set changes how states of the domain are collected,
+    as for 'collect'; they are collected twice.
     """
     from hypogoal.core import own_code
 
@@ -168,17 +155,17 @@ def _verdicts(
     from hypogoal.core.config import resolve
     from hypogoal.testing import check_domain, check_network, check_objective
 
-    shape: tuple[int, ...] = (64, 64, 3)
+    seen: tuple[Any, ...] = ()
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
         found = load_domain(domain, given=True)
         config: object = resolve(found.config_class, stage="collect", assignments=assignments)
         yield from check_domain(found, config, layout_seed=layout_seed, seed=seed)
-        shape = tuple(found.observation_shape)
+        seen = tuple(found.observation_shape), found.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective
 
         yield from check_objective(load_objective(diversity))
     if network is not None:
-        yield from check_network(network, shape)
+        yield from check_network(network, *seen)

@@ -3,250 +3,159 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-from hypogoal.cli.common import (
-    Device,
-    Force,
-    LayoutSeed,
-    Out,
-    Preset,
-    Quiet,
-    Resume,
-    Seed,
-    Set,
-    app,
-    domain_of,
-    print_counts,
-    print_outcome,
-    values_of,
-)
+from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
+from hypogoal.settings import configuration
+
+ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
+VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
+FILMS = "RUN/report/videos/*.gif; the page shows the first. If not said: one, where it can be."
 
 
-@app.command()
-def collect(
-    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, which-feature, or module:object.")],
-    out: Out,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
-) -> None:
-    """Collect labelled, unlabelled and held-out states into an HDF5 file."""
+@cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
+def collect(given: cli.Given, domain: cli.DomainName) -> None:
+    """Collect labelled, unlabelled and held-out states."""
     from hypogoal.domains.base import load_domain
-    from hypogoal.settings import configuration
-    from hypogoal.stages.collect import collect as stage
+    from hypogoal.stages.collect import collect as collected
 
     found = load_domain(domain, given=True)
-    config = configuration("collect", domain, preset, set_, given=True)
-    counts = stage(found, config, out, name=domain, seed=seed, force=force, resume=resume, quiet=quiet)
-    print_counts(counts, quiet)
-    give(out)
+    config = given.config(domain, given=True)
+    cli.print_counts(collected(found, config, given.out, name=domain, **given.how), given.how["quiet"])
+    given.end({}, "train-ensemble", given.out, "--out", Path("runs", given.out.stem, "ensemble"))
 
 
-@app.command("train-ensemble")
+@cli.stage(cli.MAKE, "train-ensemble", "train-ensemble data/doorkey.h5 --out runs/mine/ensemble")
 def train_ensemble(
-    data: Annotated[Path, typer.Argument(help="The HDF5 file that 'collect' wrote.")],
-    out: Out,
-    diversity: Annotated[
-        str | None, typer.Option(help="dbat, none, another (docs/concepts.md), or module:function.")
-    ] = None,
-    members: Annotated[int | None, typer.Option(help="Hypotheses per sub-goal (K).")] = None,
-    unlabelled: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Take the unlabelled states of this data file, or those visited by these options or this "
-            "meta-policy, instead of DATA's; repeatable."
-        ),
-    ] = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    given: cli.Given,
+    data: Annotated[Path, Argument(help="The HDF5 file that 'collect' wrote.")],
+    unlabelled: Annotated[list[Path] | None, Option(help=f"Take unlabelled states from elsewhere: {VISITED}")] = None,
 ) -> None:
-    """Train an ensemble of diverse classifiers for each sub-goal."""
+    """Train diverse classifiers (members) of each sub-goal."""
     from hypogoal.core import own_code
-    from hypogoal.domains.base import defaults_of
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_ensemble import train_ensemble as stage
+    from hypogoal.domains.base import installed_domain
+    from hypogoal.inspection import result_of
+    from hypogoal.stages.train_ensemble import train_ensemble as trained
 
-    given = {"diversity": diversity, "members": members}
-    domain = domain_of(data, "data")
-    config = configuration("train-ensemble", domain, preset, set_, given)
-    own = [value for value in defaults_of(domain, "train-ensemble").values() if isinstance(value, str)]
-    others = tuple(unlabelled or ())
-    with own_code.given(diversity or "", *values_of(set_)), own_code.vouched(*own):  # and not what a preset says
-        stage(data, config, out, unlabelled=others, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
-    give(out)
+    domain = cli.domain_of(data, "data")
+    config = given.config(domain)
+    installed = installed_domain(domain)
+    defaults = installed.defaults if installed else {}
+    own = [value for value in defaults.get("train-ensemble", {}).values() if isinstance(value, str)]
+    typed = [*filter(None, given.settings.values()), *cli.values_of(given.assignments)]
+    with own_code.given(*typed), own_code.vouched(*own):  # and not what a preset says
+        trained(data, config, given.out, unlabelled=tuple(unlabelled or ()), **given.how)
+    run, practised = given.out.parent, "train-options" in defaults or "train-meta" not in defaults
+    then = ("train-options", given.out, "--out", run / "options")
+    then = then if practised else ("train-meta", given.out, "--out", run / "meta")
+    given.end(result_of(given.out), *(then if installed else ("evaluate", run)))
 
 
-@app.command("train-options")
+@cli.stage(cli.MAKE, "train-options", "train-options runs/mine/ensemble --out runs/mine/options")
 def train_options(
-    ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
-    out: Out,
-    options: Annotated[
-        Path | None,
-        typer.Option(help="Go on with these options of the same ensemble, from another start or elsewhere."),
-    ] = None,
-    layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    given: cli.Given,
+    ensemble: Annotated[Path, ENSEMBLE],
+    options: Annotated[Path | None, Option(help="Go on with these options of the ensemble, perhaps elsewhere.")] = None,
 ) -> None:
-    """Learn an option policy for every member, options chosen at random."""
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_options import train_options as stage
+    """Learn an option (a policy) for every member."""
+    from hypogoal.stages.train_meta import FIXED
+    from hypogoal.stages.train_options import train_options as trained
 
-    given = {"layout_seed": layout_seed}
-    config = configuration("train-options", domain_of(ensemble, "ensemble"), preset, set_, given)
-    numbers = stage(
-        ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
-    )
-    print_outcome(numbers, quiet)
-    give(out)
+    domain = cli.domain_of(ensemble, "ensemble")
+    config = given.config(domain)
+    numbers = trained(ensemble, config, given.out, options=options, **given.how)
+    plain = configuration("train-meta", domain, given.preset, ())
+    fixed = [f"--set={name}={getattr(config, name)}" for name in FIXED if getattr(config, name) != getattr(plain, name)]
+    preset, run = ["--preset", given.preset] if given.preset else [], given.out.parent
+    then = ("train-meta", ensemble, "--options", given.out, *preset, *fixed, "--out", run / "meta")
+    given.end(numbers, *(("evaluate", run) if config.restart_options else then))  # which leave no episodes to choose in
 
 
-@app.command("train-meta")
+@cli.stage(cli.MAKE, "train-meta", "train-meta runs/mine/ensemble --options runs/mine/options --out runs/mine/meta")
 def train_meta(
-    ensemble: Annotated[Path, typer.Argument(help="The folder that 'train-ensemble' wrote.")],
-    out: Out,
-    options: Annotated[Path | None, typer.Option(help="Continue the options of 'train-options'.")] = None,
-    layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    given: cli.Given,
+    ensemble: Annotated[Path, ENSEMBLE],
+    options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
 ) -> None:
-    """Learn which options to choose, by the environment's reward."""
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_meta import train_meta as stage
+    """Learn which options to choose, by the reward."""
+    from hypogoal.stages.train_meta import train_meta as trained
 
-    given = {"layout_seed": layout_seed}
-    config = configuration("train-meta", domain_of(ensemble, "ensemble"), preset, set_, given)
-    numbers = stage(
-        ensemble, config, out, options=options, seed=seed, force=force, resume=resume, quiet=quiet, device=device
-    )
-    print_outcome(numbers, quiet)
-    give(out)
+    config = given.config(cli.domain_of(ensemble, "ensemble"))
+    given.end(trained(ensemble, config, given.out, options=options, **given.how), "evaluate", given.out.parent)
 
 
-@app.command("train-baseline")
+@cli.stage(cli.MAKE, "train-baseline", "train-baseline doorkey --agent ppo --out runs/mine/ppo")
 def train_baseline(
-    domain: Annotated[str, typer.Argument(help="doorkey, montezuma, which-feature, or module:object.")],
-    out: Out,
-    agent: Annotated[str | None, typer.Option(help="ppo or dqn.")] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="States of the domain: play in the world that they were collected in.")
-    ] = None,
-    layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    given: cli.Given,
+    domain: cli.DomainName,
+    data: Annotated[Path | None, Option(help="Play in the world in which these states were collected.")] = None,
 ) -> None:
-    """Train PPO or DQN on the primitive actions, for comparison."""
-    from hypogoal.settings import configuration
-    from hypogoal.stages.train_baseline import train_baseline as stage
+    """Train PPO or DQN on primitive actions, to compare."""
+    from hypogoal.stages.train_baseline import train_baseline as trained
 
-    given = {"agent": agent, "layout_seed": layout_seed}
-    config = configuration("train-baseline", domain, preset, set_, given, given=True)
-    numbers = stage(domain, config, out, data=data, seed=seed, force=force, resume=resume, quiet=quiet, device=device)
-    print_outcome(numbers, quiet)
-    give(out)
+    config = given.config(domain, given=True)
+    given.end(trained(domain, config, given.out, data=data, **given.how), "evaluate", given.out.parent)
 
 
-@app.command()
+@cli.stage(cli.OWN, "audit", "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out audit")
 def audit(
-    classifier: Annotated[str, typer.Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
-    out: Out,
-    domain: Annotated[str, typer.Option(help="Where it is played: doorkey, montezuma, or module:object.")],
-    sub_goal: Annotated[str, typer.Option(help="Of the domain: whose truth counts.")],
-    member: Annotated[int, typer.Option(min=0, help="Of the ensemble.")] = 0,
-    layout_seed: LayoutSeed = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    given: cli.Given,
+    classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
+    domain: Annotated[str, Option(help=f"Where it is played: {cli.DOMAINS}", autocompletion=cli.offer("domain"))],
+    sub_goal: Annotated[str, Option(help="Of the domain: whose truth counts.")],
+    member: Annotated[int, Option(min=0, help="Of the ensemble.")] = 0,
 ) -> None:
-    """Train a policy against a success classifier: how often is it fooled, and where?"""
+    """How often do policies fool a success classifier, where?"""
     from hypogoal.core import own_code
     from hypogoal.evaluation.audit import lines_of
-    from hypogoal.settings import configuration
-    from hypogoal.stages.audit import audit as stage
+    from hypogoal.stages.audit import audit as audited
 
-    config = configuration("audit", domain, preset, set_, {"layout_seed": layout_seed}, given=True)
+    config = given.config(domain, given=True)
     with own_code.given(classifier, domain):
-        report = stage(
-            classifier, config, out, domain=domain, sub_goal=sub_goal, member=member,
-            seed=seed, force=force, resume=resume, quiet=quiet, device=device,
-        )  # fmt: skip
-    for line in () if quiet else lines_of(report):
+        found = audited(classifier, config, given.out, domain=domain, sub_goal=sub_goal, member=member, **given.how)
+    for line in () if given.how["quiet"] else lines_of(found):
         say(line)
-    give(out)
+    given.end({})
 
 
-@app.command()
+@cli.command(cli.MAKE, "evaluate runs/mine")
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="A run: a folder with artefacts in it.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Default: RUN/evaluation.")] = None,
+    run: Annotated[Path, Argument(help="A run: a folder with artefacts in it.")],
+    out: Annotated[Path | None, Option("--out", help="Default: RUN/evaluation.")] = None,
     layouts: Annotated[
-        str | None,
-        typer.Option(help="Agents, and each option alone, also play these without learning: 2000-2099 or 7,9."),
+        str | None, Option(help="Agents, and each option alone, also play these as they are: 2000-2099 or 7,9.")
     ] = None,
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    force: cli.Force = False,
+    resume: cli.Resume = False,
+    quiet: cli.Quiet = False,
 ) -> None:
-    """Compute every number of the report: accuracy, curves, controls, selection."""
-    from hypogoal.stages.evaluate import evaluate as stage
+    """Compute every number of a run: accuracy, curves, choices."""
+    from hypogoal.stages.evaluate import evaluate as evaluated
     from hypogoal.stages.evaluate import summary_table
 
     out = out or run / "evaluation"
-    metrics = stage(run, out, layouts=layouts or "", force=force, resume=resume, quiet=quiet)
+    metrics = evaluated(run, out, layouts=layouts or "", force=force, resume=resume, quiet=quiet)
     if not quiet:
         draw(summary_table(metrics), 100)
+    cli.print_next(quiet, *(["report", run] if out == run / "evaluation" else ["show", out]))
     give(out)
 
 
-@app.command()
+@cli.command(cli.MAKE, "report runs/mine --videos 3")
 def report(
-    run: Annotated[Path, typer.Argument(help="A run that was evaluated.")],
-    figures: Annotated[
-        Path | None, typer.Option(help="Instead of the page: the paper's figures, with captions, into this folder.")
-    ] = None,
-    format_: Annotated[
-        str | None, typer.Option("--format", help="Of --figures: svg (where it is not said), pdf or png.")
-    ] = None,
-    videos: Annotated[
-        int, typer.Option(min=0, help="Also so many episodes of the policy over options, as RUN/report/videos/*.gif.")
-    ] = 0,
-    force: Force = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    run: Annotated[Path, Argument(help="A run that was evaluated.")],
+    figures: Annotated[Path | None, Option(help="The paper's figures, into this folder, instead of the page.")] = None,
+    format_: Annotated[str | None, Option("--format", help="Of --figures: svg (if not said), pdf or png.")] = None,
+    videos: Annotated[int | None, Option(min=0, help=f"Films of the policy over options, {FILMS}")] = None,
+    force: cli.Force = False,
+    resume: cli.Resume = False,
+    quiet: cli.Quiet = False,
 ) -> None:
-    """Draw RUN/report/index.html: one file, readable offline."""
+    """Draw the report of an evaluated run: one HTML file."""
     from hypogoal.core.errors import Complete, UserError
     from hypogoal.stages.report import draw_figures
-    from hypogoal.stages.report import report as stage
+    from hypogoal.stages.report import report as drawn
 
     if figures is None and format_ is not None:
         raise UserError("--format is for --figures", format_, "Give --figures DIR too, or leave it out.")
@@ -255,7 +164,7 @@ def report(
         raise UserError(f"{what} is for the page, not for --figures", figures, "Give one command for each.")
     if figures is None:
         try:
-            give(stage(run, videos=videos, force=force, resume=resume))
+            give(drawn(run, videos=videos, force=force, resume=resume))
         except Complete as complete:
             raise Complete(run / "report" / "index.html", complete.note) from None
         return
@@ -266,15 +175,18 @@ def report(
         give(path)
 
 
-@app.command()
+@cli.command(cli.LOOK, "compare runs/mine runs/other --out runs/both")
 def compare(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN RUN ...", help="Evaluated runs; the first is compared with.")
-    ],
-    out: Out,
-    force: Force = False,
+    runs: Annotated[list[Path], Argument(metavar="RUN RUN ...", help="Evaluated; the first is compared with.")],
+    out: cli.Out,
+    force: cli.Force = False,
 ) -> None:
-    """Evaluated runs side by side: what differs, curves, tables, who wins seed by seed."""
-    from hypogoal.stages.compare import compare as stage
+    """Evaluated runs side by side: what differs, who wins."""
+    from hypogoal.core.files import read_json
+    from hypogoal.evaluation.compare import winners
+    from hypogoal.stages.compare import compare as compared
 
-    give(stage(runs, out, force=force))
+    page = compared(runs, out, force=force)
+    for line in winners(read_json(out / "metrics.json", "the comparison is", "Compare again.")["comparisons"]):
+        say(line)
+    give(page)

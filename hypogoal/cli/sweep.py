@@ -1,31 +1,35 @@
 """Many cells with one command: ``run`` chains the stages, ``sweep`` runs experiments here or by Slurm (Spec A6, G4)."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from hypogoal.cli.common import AsJson, Device, Force, Out, Preset, Quiet, Set, app, echo, values_of
+from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 
-DryRun = Annotated[bool, typer.Option("--dry-run", help="List the commands and what they cost, run none.")]
-SLURM = "Slurm (with --engine slurm)"
+KNOWN = "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or an own .toml file."
+DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost, run none.")]
+_slurm = partial(Option, rich_help_panel="Slurm (with --engine slurm)")
 
 
-@app.command()
+@cli.command(cli.MAKE, "run doorkey --preset demo --out runs/demo")
 def run(
-    experiment: Annotated[str, typer.Argument(help="doorkey, montezuma-ladders or which-feature.")],
-    out: Out,
-    preset: Preset = None,
-    set_: Set = None,
-    device: Device = "auto",
-    force: Force = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
-    quiet: Quiet = False,
+    experiment: Annotated[str, Argument(help=KNOWN, autocompletion=cli.offer("experiment"))],
+    out: Annotated[Path | None, Option(help="What to write. [dim]\\[default: runs/EXPERIMENT][/dim]")] = None,
+    preset: cli.Preset = None,
+    set_: cli.Set = None,
+    seed: Annotated[int | None, Option(min=0, help="The one run seed, instead of the experiment's.")] = None,
+    device: cli.Device = "auto",
+    force: cli.Force = False,
+    resume: Annotated[bool, Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
+    quiet: cli.Quiet = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Chain all stages: from nothing to a report. --set takes KEY=VALUE or STAGE.KEY=VALUE."""
+    """Chain all stages: from nothing to a report. (--set also takes STAGE.KEY=VALUE.)"""
     from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
     from hypogoal.core.drafts import place_of
@@ -33,13 +37,14 @@ def run(
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
-    out = place_of(out)
-    planned = plan(experiment, out, preset=preset, assignments=set_ or (), device=device, short=True)
+    out = place_of(out or Path("runs", Path(experiment).stem))
+    seeds = None if seed is None else str(seed)
+    planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
     if dry_run:
         _list(planned)
         return
     prepare(device)
-    with own_code.given(*values_of(set_)):
+    with own_code.given(*cli.values_of(set_)):
         stage(planned, out, force=force, resume=resume, quiet=quiet)
     metrics = out / "evaluation" / "metrics.json"
     if not metrics.is_file():
@@ -49,48 +54,35 @@ def run(
     give(out / "report" / "index.html")
 
 
-@app.command()
+@cli.command(cli.MANY, "sweep figure6 --out runs/figure6 --seeds 0-2 --dry-run")
 def sweep(
-    out: Annotated[Path, typer.Option("--out", help="The sweep's folder. Started again on it, a sweep goes on.")],
-    experiment: Annotated[
-        str | None,
-        typer.Argument(
-            help="doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or an own .toml file."
-        ),
-    ] = None,
-    preset: Preset = None,
-    set_: Set = None,
-    seeds: Annotated[str | None, typer.Option(help="The run seeds: 0-9, or 0,3,7.")] = None,
-    device: Device = "auto",
-    engine: Annotated[str, typer.Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
+    out: Annotated[Path, Option("--out", help="The sweep's folder. Started again on it, a sweep goes on.")],
+    experiment: Annotated[str | None, Argument(help=KNOWN, autocompletion=cli.offer("experiment"))] = None,
+    preset: cli.Preset = None,
+    set_: cli.Set = None,
+    seeds: Annotated[str | None, Option(help="The run seeds: 0-9, or 0,3,7.")] = None,
+    device: cli.Device = "auto",
+    engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
-    status: Annotated[bool, typer.Option("--status", help="Only say how far it is.")] = False,
-    cancel: Annotated[bool, typer.Option("--cancel", help="Only end its jobs in Slurm; they save first.")] = False,
-    gather: Annotated[bool, typer.Option("--gather", help="Only write results.csv of what is done.")] = False,
-    cell: Annotated[str | None, typer.Option(hidden=True, help="Only this cell, within a Slurm job.")] = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-    partition: Annotated[str, typer.Option(rich_help_panel=SLURM, help="As sbatch's.")] = "",
-    time: Annotated[str, typer.Option(rich_help_panel=SLURM, help="Limit of a cell, as sbatch's: 4:00:00.")] = "",
-    memory: Annotated[
-        str, typer.Option(rich_help_panel=SLURM, help="Of a cell, as sbatch's --mem; else estimated.")
-    ] = "",
-    cpus: Annotated[int, typer.Option(min=0, rich_help_panel=SLURM, help="Of a cell; 0: what it can use.")] = 0,
-    gpus: Annotated[int, typer.Option(min=0, rich_help_panel=SLURM, help="Of a cell.")] = 0,
-    cap: Annotated[int, typer.Option(min=0, rich_help_panel=SLURM, help="Cells of an array that run at once.")] = 0,
-    warn: Annotated[
-        int,
-        typer.Option(min=1, max=65535, rich_help_panel=SLURM, help="Seconds before its limit at which a cell saves."),
-    ] = 120,
-    sbatch: Annotated[
-        list[str] | None,
-        typer.Option(rich_help_panel=SLURM, help="Another option for sbatch, as --sbatch=--account=x; repeatable."),
-    ] = None,
+    yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
+    status: Annotated[bool, Option("--status", help="Only say how far it is.")] = False,
+    cancel: Annotated[bool, Option("--cancel", help="Only end its jobs in Slurm; they save first.")] = False,
+    gather: Annotated[bool, Option("--gather", help="Only write results.csv of what is done.")] = False,
+    cell: Annotated[str | None, Option(hidden=True, help="Only this cell, within a Slurm job.")] = None,
+    quiet: cli.Quiet = False,
+    as_json: cli.AsJson = False,
+    partition: Annotated[str, _slurm(help="As sbatch's.")] = "",
+    time: Annotated[str, _slurm(help="Limit of a cell, as sbatch's: 4:00:00.")] = "",
+    memory: Annotated[str, _slurm(help="Of a cell, as sbatch's --mem; else estimated.")] = "",
+    cpus: Annotated[int, _slurm(min=0, help="Of a cell; 0: what it can use.")] = 0,
+    gpus: Annotated[int, _slurm(min=0, help="Of a cell.")] = 0,
+    cap: Annotated[int, _slurm(min=0, help="Cells of an array that run at once.")] = 0,
+    warn: Annotated[int, _slurm(min=1, max=65535, help="Seconds before its limit at which a cell saves.")] = 120,
+    sbatch: Annotated[list[str] | None, _slurm(help="Of sbatch: --sbatch=--account=x; repeatable.")] = None,
 ) -> None:
-    """Run every cell of an experiment that is not finished: seeds, layouts, ladders, methods.
+    """Run an experiment's cells: seeds, layouts, methods.
 
-    --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
+    What is finished is not run again. --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
     """
     from hypogoal.core.drafts import place_of
 
@@ -105,7 +97,7 @@ def sweep(
         from hypogoal.experiments.status import lines, read_status
 
         found = read_status(out)
-        echo(status_json(found), as_json, lines(found))
+        cli.echo(status_json(found), as_json, lines(found))
         return
     if cancel:
         from hypogoal.experiments.runners.slurm import cancel as end
@@ -133,11 +125,11 @@ def sweep(
     ask = None if yes or not sys.stdin.isatty() else _confirm
     if engine == "local":  # with Slurm another machine's device is meant
         prepare(device)
-        with own_code.given(*values_of(set_)):
+        with own_code.given(*cli.values_of(set_)):
             give(stage.sweep(planned, out, quiet=quiet, confirm=ask))
         return
     options = Options(partition, time, memory, gpus, cpus, cap, warn, tuple(sbatch or ()))
-    with own_code.given(*values_of(set_)):
+    with own_code.given(*cli.values_of(set_)):
         jobs = stage.submit(planned, out, options, quiet=quiet, confirm=ask)
     for job in jobs:
         say(f"job {job['id']}: {job['name']}, {max(1, len(job['cells']))} cells", err=True)

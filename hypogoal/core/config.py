@@ -8,6 +8,7 @@ default > default.
 import dataclasses
 import difflib
 import hashlib
+import inspect
 import json
 import math
 import re
@@ -146,16 +147,19 @@ def as_dict(config: Any) -> dict[str, Any]:
     }
 
 
-def describe(config_class: type, defaults: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
-    """Every setting with default (a domain's own where given), type, unit, meaning, source and allowed values."""
+def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
+    """Every setting with default (of the last of ``instead``, values and source, that has one), meaning and so on."""
     kinds = typing.get_type_hints(config_class)
     rows = []
     for field in dataclasses.fields(config_class):
-        kind = kinds[field.name]
-        default = (defaults or {}).get(field.name, field.default)
+        kind, default, about = kinds[field.name], field.default, dict(field.metadata)
+        for values, source in instead:
+            if field.name in values:
+                default, about["source"] = values[field.name], source
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
-        rows.append(row | {key: field.metadata.get(key) for key in ("unit", "meaning", "source")})
-        rows[-1]["allowed"] = _allowed(field.metadata)
+        rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source")})
+        home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))
+        rows[-1] |= {"allowed": _allowed(about), "part": (home.__doc__ or "").partition(".")[0]}
     return rows
 
 

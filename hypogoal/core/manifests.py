@@ -103,10 +103,12 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
     "sub_goals": plain_names,
     "members": _size,
     "observation_shape": lambda value: isinstance(value, list) and bool(value) and all(map(_size, value)),
+    "observation_dtype": lambda value: value in ("uint8", "float32"),
     "domain_config": lambda value: isinstance(value, dict),
     **dict.fromkeys(("crop_height", "crop_width"), _size),
     **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), _count),
-    **dict.fromkeys(("ended_at", "options_ended_at"), _count),
+    **dict.fromkeys(("ended_at", "options_ended_at", "hidden_width"), _count),
+    "encoder": _is_text,
     **dict.fromkeys(
         ("domain", "network", "setting", "agent", "termination", "chooser", "start", "view", "localiser", "diversity"),
         _is_text,

@@ -66,19 +66,21 @@ def check_fit(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], where: 
             raise UserError(f"the weights do not fit the network (at {name})", where, do)
 
 
-def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object) -> M:
-    """The module that ``make`` makes, with these weights; nothing is allocated before they are known to fit.
+def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object, *, own: bool = False) -> M:
+    """The module that ``make`` makes, with these weights; nothing is allocated before they are known to fit, unless
+    the user's ``own`` code makes it, which may need numbers.
 
     Where they do not, or none can be made as the manifest says, it is a ``UserError``.
     """
     import torch
 
     try:
-        with torch.device("meta"):  # shapes without numbers: what a manifest asks for may be a thousand times too large
-            wanted = make().state_dict()
+        # Shapes without numbers: what a manifest asks for may be a thousand times too large.
+        with torch.device("cpu" if own else "meta"):
+            module = make()
     except (RuntimeError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         raise UserError("the weights do not fit the manifest", where, AGAIN) from None
-    check_fit(wanted, weights, where, AGAIN)
-    module = make()
+    check_fit(module.state_dict(), weights, where, AGAIN)
+    module = module if own else make()
     module.load_state_dict(weights)
     return module

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from math import prod
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +16,7 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import Collected
+from hypogoal.dataset import PICTURE, Collected, Observations, Standard
 
 if TYPE_CHECKING:
     import gymnasium
@@ -89,7 +90,8 @@ class Engine(ABC):
     Attributes:
         n_actions: primitive actions are 0 .. n_actions - 1.
         count: environments (E).
-        observation_shape: (H, W, C).
+        observation_shape, observation_dtype: uint8 (H, W, C), pictures, or float32 of any shape.
+        standard: of the latter, what agents standardise them by; set by who trains some.
         max_steps: steps after which an episode is truncated.
         ids: int64 (E,), the current state of each environment.
         elapsed: int64 (E,), steps since its episode began.
@@ -105,6 +107,8 @@ class Engine(ABC):
     n_actions: int
     count: int
     observation_shape: tuple[int, ...]
+    observation_dtype: np.dtype[Any] = PICTURE
+    standard: Standard | None = None
     max_steps: int
     ids: NDArray[np.int64]
     elapsed: NDArray[np.int64]
@@ -129,8 +133,8 @@ class Engine(ABC):
         """Step every environment, actions (E,); where an episode ends, ``ids`` is a start state again afterwards."""
 
     @abstractmethod
-    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, *observation_shape) of known states, into ``out`` where given."""
+    def images(self, ids: NDArray[np.int64], out: Any = None) -> Observations:
+        """Observations (n, *observation_shape), ``observation_dtype``, of known states, into ``out`` where given."""
 
     @abstractmethod
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -140,13 +144,13 @@ class Engine(ABC):
         """The labels of the environments' current states, bool (E, G), asked anew where they are kept by id."""
         return self.labels(self.ids)
 
-    def room_for(self, count: int, out: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    def room_for(self, count: int, out: Observations | None) -> Observations:
         """Where to draw ``count`` observations: ``out``, a ``ValueError`` where it does not fit, or a new array."""
         shape = (count, *self.observation_shape)
         if out is None:
-            return np.empty(shape, np.uint8)
-        if out.dtype != np.uint8 or out.shape != shape or not out.flags.c_contiguous:
-            raise ValueError(f"out must be contiguous uint8 {shape}, not {out.dtype} {out.shape}")
+            return np.empty(shape, self.observation_dtype)
+        if out.dtype != self.observation_dtype or out.shape != shape or not out.flags.c_contiguous:
+            raise ValueError(f"out must be contiguous {self.observation_dtype} {shape}, not {out.dtype} {out.shape}")
         return out
 
     def restart(self, where: NDArray[np.bool_]) -> None:
@@ -255,7 +259,7 @@ class Domain(ABC):
         sub_goals: their names (G).
         config_class: what ``collect`` can be told, a frozen dataclass of ``core.config.setting`` fields.
         engine_settings: the names of those that are the world's own: who plays in it later is told them too.
-        defaults: settings of stages that suit it, by stage.
+        defaults: settings of stages that suit it, by stage; sources: where these are from, where that can be told.
         env_id: its Gymnasium environment, where it has a registered one.
         resumes: ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which the part of
             that name is kept until all are there.
@@ -264,6 +268,7 @@ class Domain(ABC):
         many_starts: it takes some of them, too, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
+        reading: a sentence on how to read its observations, for people.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
@@ -272,19 +277,31 @@ class Domain(ABC):
     config_class: type
     engine_settings: tuple[str, ...] = ()
     defaults: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+    sources: Mapping[str, str] = MappingProxyType({})
     env_id: str = ""
     resumes = False
     kinds: Sequence[str] = ()
     starts: tuple[str, ...] = ()
     many_starts: bool = False
     many_layouts = False
+    reading = ""
     measures = pictures = sees_agent = False
     near = 0
 
     @property
     @abstractmethod
     def observation_shape(self) -> tuple[int, ...]:
-        """(H, W, C)."""
+        """(H, W, C) of pictures; of other observations any."""
+
+    @property
+    def observation_dtype(self) -> np.dtype[Any]:
+        """uint8 of pictures, float32 of other observations."""
+        return PICTURE
+
+    @property
+    def observation_bytes(self) -> int:
+        """Of one observation."""
+        return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     @abstractmethod
     def collect(self, config: Any, seed: int, progress: Any) -> Collected:

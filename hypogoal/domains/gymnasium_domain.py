@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from math import prod
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -16,7 +15,7 @@ from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States, digest
+from hypogoal.dataset import Collected, Observations, States, digest
 from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
 
@@ -52,9 +51,9 @@ class GymnasiumDomain(Domain):
     """Spec B6: all that hypogoal needs to know of a problem, from a Gymnasium environment.
 
     Args:
-        make: makes an environment: observations uint8 (H, W, C) or (H, W), actions ``Discrete``. What ``seed`` of
-            ``reset`` fixes is the layout: the same seed and actions give the same episode. Its arguments are the
-            domain's own settings, see ``config_class``.
+        make: makes an environment: observations are pictures, uint8 (H, W, C) or (H, W), or numbers, a ``Box`` of any
+            shape or a ``Dict`` of such; actions ``Discrete``. What ``seed`` of ``reset`` fixes is the layout: the same
+            seed and actions give the same episode. Its arguments are the domain's own settings, see ``config_class``.
         sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state, however
             it came there; or names alone, with ``labels``.
         labels: for names alone, one function from the environment to all of ``{name: bool}``.
@@ -63,7 +62,9 @@ class GymnasiumDomain(Domain):
             sum above 0.
         policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
-        memory: distinct states that training keeps pictures of, see ``GymnasiumEngine``.
+        memory: distinct states that training keeps observations of, see ``GymnasiumEngine``.
+        features: names of the numbers in observations that are no pictures; else those of a ``Dict``, or x0, x1, ...
+        resize: pixels of a side to which pictures are resized; 0, not at all.
         name: for messages; artefacts name the domain as the user named it to ``collect``.
         config_class: a frozen dataclass that adds settings of its own to ``GymnasiumConfig``: ``make`` gets them, in
             collection, training, baselines and evaluation alike.
@@ -85,11 +86,13 @@ class GymnasiumDomain(Domain):
         policy: Policy | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = engines.MEMORY,
+        features: Sequence[str] = (),
+        resize: int = 0,
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
         self.make, self.policy, self.memory, self.name = make, policy, memory, name
-        self.success = success
+        self.success, self._named, self.resize = success, tuple(features), resize
         self.config_class = config_class
         generic = {field.name for field in fields(GymnasiumConfig)}
         self._own_settings = {field.name: field.default for field in fields(config_class) if field.name not in generic}
@@ -99,10 +102,23 @@ class GymnasiumDomain(Domain):
         self.defaults = dict(defaults or {})
 
     @cached_property
-    def observation_shape(self) -> tuple[int, ...]:
+    def look(self) -> engines.Look:
+        """How its observations are read."""
         env = engines.make_checked(self.make_env)
+        look = engines.look_of(env)
         env.close()
-        return engines.shape_of(env)
+        if self._named and len(self._named) != len(look.features):
+            given = f"{len(self._named)} for {len(look.features)}"
+            raise UserError("there are not as many names of features as numbers", given, "Give one for each.")
+        return look._replace(features=self._named or look.features)
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        return self.look.shape
+
+    @property
+    def observation_dtype(self) -> np.dtype[Any]:
+        return self.look.dtype
 
     @property
     def has_env(self) -> bool:
@@ -110,7 +126,8 @@ class GymnasiumDomain(Domain):
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
         """An environment; ``arguments``: settings of its own, the defaults of those that are not there."""
-        return engines.made(self.make, **{**self._own_settings, **arguments})
+        env = engines.made(self.make, **{**self._own_settings, **arguments})
+        return engines.resized(env, self.resize) if self.resize else env
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> engines.GymnasiumEngine:
         """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory``, and settings of its own."""
@@ -121,10 +138,10 @@ class GymnasiumDomain(Domain):
 
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)
-        return layouts * min(config.states, config.steps) * prod(self.observation_shape)
+        return layouts * min(config.states, config.steps) * self.observation_bytes
 
     def played_bytes(self, steps: int, frames: int) -> int:
-        return min(2 * self.memory, steps) * prod(self.observation_shape)
+        return min(2 * self.memory, steps) * self.observation_bytes
 
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
         """Labelled, unlabelled and held-out states: what play on each layout meets, each picture once.
@@ -141,12 +158,12 @@ class GymnasiumDomain(Domain):
         for seeds in seeds_of_sets:
             avoid = learnt if len(sets) == 2 else set()
             met = [state for layout in seeds for state in self._play(env, config, layout, seed, avoid, progress)]
-            sets.append(_states(met, self.observation_shape, len(self.sub_goals)))
+            sets.append(_states(met, self.look, len(self.sub_goals)))
             learnt.update(map(digest, sets[-1].observations))
         env.close()
         labelled, unlabelled, heldout = sets
         self._require_classes(labelled, unlabelled, heldout, config)
-        return Collected(self.observation_shape, self.sub_goals, labelled, unlabelled, heldout)
+        return Collected(self.look.shape, self.sub_goals, labelled, unlabelled, heldout, self.look.features)
 
     def _play(
         self, env: gymnasium.Env, config: GymnasiumConfig, layout: int, seed: int, avoid: set[bytes], progress: Any
@@ -158,7 +175,7 @@ class GymnasiumDomain(Domain):
         actions = int(env.action_space.n)  # type: ignore[attr-defined]
 
         def look(observation: Any) -> None:
-            image = engines.as_image(env, observation, self.observation_shape)
+            image = self.look.read(env, observation)
             picture = digest(image)
             if picture not in seen:
                 seen.add(picture)
@@ -199,7 +216,7 @@ class GymnasiumDomain(Domain):
 class _Met(NamedTuple):
     """A state, and where it was met: layout seed, episode, step."""
 
-    picture: NDArray[np.uint8]
+    picture: Observations
     labels: NDArray[np.bool_]
     whence: tuple[int, int, int]
 
@@ -232,8 +249,8 @@ def _shared_out(groups: list[_Sample], size: int, rng: np.random.Generator) -> l
     return sorted(states, key=lambda state: state.whence)
 
 
-def _states(met: list[_Met], shape: tuple[int, ...], sub_goals: int) -> States:
-    images = np.array([state.picture for state in met], np.uint8).reshape(-1, *shape)
+def _states(met: list[_Met], look: engines.Look, sub_goals: int) -> States:
+    images = np.array([state.picture for state in met], look.dtype).reshape(-1, *look.shape)
     labels = np.array([state.labels for state in met], np.bool_).reshape(-1, sub_goals)
     whence = np.array([state.whence for state in met], np.int64).reshape(-1, 3)
     return States(images, labels, dict(zip(("layout_seed", "episode", "step"), whence.T, strict=True)))

@@ -1,17 +1,18 @@
 """Any Gymnasium environment as an engine: many of it stepped in turn, states by id, each distinct one kept once."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from PIL import Image
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
-from hypogoal.dataset import digest
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 
 MakeEnv = Callable[..., gymnasium.Env]
@@ -32,16 +33,11 @@ def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
 
 
 def make_checked(make: MakeEnv) -> gymnasium.Env:
-    """An environment whose observations are uint8 images, and actions ``Discrete``; else a ``UserError``."""
+    """An environment whose observations can be read, and actions are ``Discrete``; else a ``UserError``."""
     env = made(make)
+    look_of(env)
     with UsersCode("the environment", env, failed="has no spaces:"):
-        space, actions = env.observation_space, env.action_space
-    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
-        do = "Wrap it so that it gives images, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
-        raise UserError("observations must be images, uint8 (H, W, C) or (H, W)", space, do)
-    if channels_first(space.shape):
-        do = "Wrap it in gymnasium.wrappers.TransformObservation with x.transpose(1, 2, 0)."
-        raise UserError("observations have their channels, or stacked frames, first", space.shape, do)
+        actions = env.action_space
     if not isinstance(actions, spaces.Discrete) or actions.start != 0:
         raise UserError("actions must be Discrete(n), from 0", actions, "Wrap it so that they are.")
     return env
@@ -55,34 +51,99 @@ def channels_first(shape: tuple[int, ...]) -> bool:
     return len(shape) == 3 and shape[0] <= MOST_CHANNELS < min(shape[1:])
 
 
-def shape_of(env: gymnasium.Env) -> tuple[int, ...]:
-    """(H, W, C) of an environment's observations."""
-    shape = env.observation_space.shape
-    assert shape is not None
-    return with_channels(tuple(map(int, shape)))
+class Look(NamedTuple):
+    """How observations of a space are read: as arrays of one shape and type, see ``dataset.Observations``.
 
+    ``features`` are the names of the numbers in one that is no picture; ``key`` is that of the picture in a dictionary
+    with nothing else in it.
+    """
 
-def with_channels(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """(H, W, 1) of (H, W), any other as it is."""
-    return (*shape, 1) if len(shape) == 2 else shape
+    space: spaces.Space[Any]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    features: tuple[str, ...] = ()
+    key: str = ""
 
-
-def as_image(env: gymnasium.Env, observation: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """An observation as uint8 (H, W, C), in memory of its own; a ``UserError`` where its space says other."""
-    code = UsersCode("the environment", env, "step")
-    if not isinstance(observation, np.ndarray):
+    def read(self, env: gymnasium.Env, observation: Any) -> Any:
+        """An observation (*shape), in memory of its own; a ``UserError`` where its space says other."""
+        code = UsersCode("the environment", env, "step")
         with code:
-            observation = np.array(observation)
-    image = np.array(observation, order="C")
-    if image.dtype != np.uint8 or with_channels(image.shape) != shape:
-        given = f"{image.dtype} {image.shape}"
-        do = f"Make the observation space and the observations agree; the former says uint8 {shape}."
-        code.refuse(f"gave another observation than its space says: {given}", do)
-    return image.reshape(shape)
+            if self.key:
+                observation = observation[self.key]
+            elif not isinstance(self.space, spaces.Box):
+                observation = spaces.flatten(self.space, observation)
+            values = np.array(observation, order="C")
+        given = f"{values.dtype} {values.shape}"
+        if self.dtype == NUMBERS and values.dtype.kind in "iufb":
+            values = values.astype(NUMBERS)
+        if values.dtype != self.dtype or values.shape not in (self.shape, self.space.shape):
+            do = f"Make the observation space and the observations agree; the former says {self.dtype} {self.shape}."
+            code.refuse(f"gave another observation than its space says: {given}", do)
+        if self.dtype == NUMBERS and not np.isfinite(values).all():
+            code.refuse("gave an observation with numbers that are not finite", "Give finite ones.")
+        return values.reshape(self.shape)
+
+
+def look_of(env: gymnasium.Env) -> Look:
+    """How to read an environment's observations; of spaces that are no numbers, or mix pictures in, a ``UserError``.
+
+    Pictures are a ``Box`` of uint8 (H, W, C) or (H, W), or a ``Dict`` of just that. Any other ``Box`` is float32; what
+    else Gymnasium's ``flatten`` makes numbers of, dictionaries for one, is float32 (D,), in that order.
+    """
+    with UsersCode("the environment", env, failed="has no spaces:"):
+        whole = space = env.observation_space
+    parts, key = list(_parts(space)), ""
+    if any(map(_is_picture, dict(parts).values())):
+        if len(parts) > 1 or not isinstance(space, spaces.Box | spaces.Dict):
+            do = "Wrap it in gymnasium.wrappers.FilterObservation, and keep the picture alone, or all but pictures."
+            raise UserError("observations mix pictures with others", ", ".join(name for name, _ in parts), do)
+        [(key, space)] = parts
+        if channels_first(space.shape):
+            do = "Wrap it in gymnasium.wrappers.TransformObservation with x.transpose(1, 2, 0)."
+            raise UserError("observations have their channels, or stacked frames, first", space.shape, do)
+        return Look(space, space.shape if len(space.shape) == 3 else (*space.shape, 1), PICTURE, key=key)
+    try:
+        sizes = [(name, spaces.flatdim(part)) for name, part in parts]
+    except (NotImplementedError, ValueError):
+        do = "Wrap it so that it gives those, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
+        what = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
+        raise UserError(what, whole, do) from None
+    names = [(name, size, place) for name, size in sizes for place in range(size)]
+    features = [(name if size == 1 else f"{name}[{place}]") if name else f"x{place}" for name, size, place in names]
+    shape = (isinstance(space, spaces.Box) and space.shape) or (len(features),)
+    return Look(space, shape, NUMBERS, tuple(features))
+
+
+def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
+    """The same with pictures of side x side pixels, means over areas; without pictures a ``UserError``."""
+    look = look_of(env)
+    if look.dtype != PICTURE:
+        raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
+
+    def small(observation: Any) -> NDArray[np.uint8]:
+        channels = map(Image.fromarray, np.moveaxis(look.read(env, observation), -1, 0))
+        return np.stack([np.asarray(one.resize((side, side), Image.Resampling.BOX)) for one in channels], -1)
+
+    space = spaces.Box(0, 255, (side, side, look.shape[-1]), np.uint8)
+    return gymnasium.wrappers.TransformObservation(env, small, space)
+
+
+def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """The spaces in a ``Dict`` or ``Tuple``, in the order in which they are flattened, by name; else itself."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        for key, part in inner:
+            yield from _parts(part, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, space
+
+
+def _is_picture(space: Any) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3)
 
 
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-    """What ``env.reset(**arguments)`` gives: an observation, see :func:`as_image`, and a dict; else a ``UserError``."""
+    """What ``env.reset(**arguments)`` gives: an observation, see :class:`Look`, and a dict; else a ``UserError``."""
     with UsersCode("the environment's reset", env, "reset") as code:
         given: Any = env.reset(**arguments)
         if not isinstance(given, tuple | list) or len(given) != 2 or not isinstance(given[1], dict):
@@ -91,7 +152,7 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """What ``env.step(action)`` gives: an observation, see :func:`as_image`, and the rest; else a ``UserError``."""
+    """What ``env.step(action)`` gives: an observation, see :class:`Look`, and the rest; else a ``UserError``."""
     with UsersCode("the environment's step", env, "step") as code:
         given: Any = env.step(action)
         if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
@@ -179,9 +240,10 @@ class GymnasiumEngine(TurnEngine):
         self._envs = [make_checked(make) for _ in range(count)]
         self._ask, self._success = labels, success
         self._earned, self._succeeded = [0.0] * count, [False] * count  # in the episode so far; it ended so just now
-        self.observation_shape = shape_of(self._envs[0])
+        self.look = look_of(self._envs[0])
+        self.observation_shape, self.observation_dtype = self.look.shape, self.look.dtype
         self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
-        self._ring: list[NDArray[np.uint8]] = []
+        self._ring: list[Observations] = []
         self._labels = bytearray()
         self._ids: OrderedDict[bytes, int] = OrderedDict()  # of the states in the ring, by digest, the oldest first
         self._played: list[list[int]] = [[] for _ in range(count)]
@@ -219,7 +281,7 @@ class GymnasiumEngine(TurnEngine):
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
         """The id of what an environment is in now."""
-        image = as_image(env, observation, self.observation_shape)
+        image = self.look.read(env, observation)
         labels = self._ask.of(env).tobytes()
         look, new = digest(image, labels), self.n_states
         known = self._ids.get(look)
@@ -240,7 +302,7 @@ class GymnasiumEngine(TurnEngine):
         if self._ids[next(iter(self._ids))] < self.oldest:
             self._ids.popitem(last=False)
 
-    def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    def images(self, ids: NDArray[np.int64], out: Observations | None = None) -> Observations:
         if len(ids) and not self.oldest <= ids.min() <= ids.max() < self.n_states:
             raise ValueError(f"states {self.oldest} to {self.n_states - 1} are kept, not {ids.min()} to {ids.max()}")
         out = self.room_for(len(ids), out)
@@ -287,7 +349,7 @@ class GymnasiumEngine(TurnEngine):
             for action in actions:
                 observation, reward, *_ = stepped(env, action)
                 self._earned[number] += reward
-            here, was = as_image(env, observation, self.observation_shape), int(snapshot["ids"][number])
+            here, was = self.look.read(env, observation), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 what = "the environment does not do the same again for the same seed, so this cannot be gone on with"
                 raise UserError(what, f"layout_seed={seed}", "Begin anew with --force.")

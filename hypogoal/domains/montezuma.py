@@ -146,6 +146,7 @@ class MontezumaDomain(Domain):
     distance = staticmethod(distance_to_base)
     pixel = staticmethod(pixel)
     agent_pixels = staticmethod(observed_pixel)
+    sources = MappingProxyType({"train-ensemble": "paper, appendix (Table 1)"})
     defaults = MappingProxyType(
         {
             "train-ensemble": {

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.evaluation.exploits import option_numbers
 from hypogoal.evaluation.numbers import grouped
@@ -37,10 +38,10 @@ Classifier = Callable[[Engine, NDArray[np.int64]], NDArray[np.floating]]  # stat
 
 
 def own_classifier(name: str) -> Classifier:
-    """Code of the user's own, from observations uint8 (n, *obs) to probabilities (n,); else a ``UserError``."""
+    """Code of the user's own, from observations (n, *obs) to probabilities (n,); else a ``UserError``."""
     function = own_code.load_own(name, "classifier", "hypogoal.classifiers", {})
     if not callable(function):
-        raise UserError("this is no function", name, "Give one from uint8 (N, H, W, C) to probabilities (N,).")
+        raise UserError("this is no function", name, "Give one from observations (N, *obs) to probabilities (N,).")
 
     def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
         told = []
@@ -85,7 +86,7 @@ def findings(
     """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
 
     False yes are of one kind where the same sub-goals hold and, of engines that know positions, the cell is the same;
-    of each of the most frequent kinds a film of the shortest execution is put into ``folder``.
+    of each of the most frequent kinds a film of the shortest execution is put into ``folder``, of pictures.
     """
     engine, own, rows = loop.engine, table["option"] == option, list(loop.recorder.executions[option])
     says_yes, near = table["reached"][own] > 0, table["near"][own] > 0
@@ -102,7 +103,8 @@ def findings(
         path = np.array([row.began, *row.states])
         at = engine.positions(path[-1:])[0].tolist() if engine.position_names else []
         film = f"{POLICIES[option]}-{len(kinds) + 1}.gif"
-        if shown := len(kinds) < FILMS and bool(engine.remembers(path).all()):
+        pictures = engine.observation_dtype == PICTURE
+        if shown := pictures and len(kinds) < FILMS and bool(engine.remembers(path).all()):
             (folder / film).write_bytes(_film(loop, path, option))
         about = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
         kinds.append({"executions": len(alike), **about, "film": film if shown else None})

@@ -256,12 +256,6 @@ COLUMNS = (
     page.number("score", "score", page.spread, 2),
     page.number("runs", "success.n"),
 )
-MEMBERS = (
-    page.label("sub-goal", "sub_goal", once=True),
-    page.number("member", "member"),
-    page.number("quality", "quality", page.fixed, 2),
-    page.number("preference among its sub-goal's", "conditional_preference", page.fixed, 2),
-)
 
 
 def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
@@ -277,7 +271,7 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The table, and the members of the first run."""
+    """One table; each member's quality and preference are in ``numbers.csv``."""
     agents = material.metrics.get("choosing", [])
     if not agents:
         return []
@@ -288,11 +282,8 @@ def sections(material: Material) -> list[Block]:
         "how often the better of two that differ by .2 is taken (chance .5), and how much of the way from the mean to "
         "the best quality it goes (chance 0)."
     )
-    blocks = [
-        page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED),
-        page.table(MEMBERS, agents[0]["runs"][0]["members"], folded=f"Members of {agents[0]['runs'][0]['path']}"),
-    ]
-    return [page.section("choosing", TITLE, [text], blocks)]
+    table = page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED)
+    return [page.section("choosing", TITLE, [text], [table])]
 
 
 QUESTION = Question(
@@ -300,15 +291,4 @@ QUESTION = Question(
     rows=rows,
     summary=summary,
     sections=sections,
-    meanings={
-        "quality": (
-            "fraction",
-            "share of an option's greedy executions that bring about the true sub-goal, the episode not lost; begun "
-            "where the agent decides, the option is offered and the sub-goal can be had within its timeout",
-        ),
-        "conditional_preference": ("ratio", "chosen / expected among the members offered of the chosen sub-goal"),
-        "within_rho": ("Spearman's rho, -1..1", "of quality and conditional preference, mean over sub-goals"),
-        "pair": ("fraction", "how often the better of two members is taken, whose qualities differ by .2; chance .5"),
-        "score": ("ratio", "(quality taken - mean quality offered) / (best - mean); chance 0"),
-    },
 )

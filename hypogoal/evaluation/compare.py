@@ -1,18 +1,17 @@
 """Several evaluated runs side by side: whether they can be compared, what differs, and who wins (Spec F5, F7)."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import curves, distance, hypotheses, page, rooms
 from hypogoal.evaluation.numbers import Metrics, Rows, grouped
 from hypogoal.evaluation.page import Block, Column, Drawn, Entry, Material
-from hypogoal.evaluation.plots import PALETTE
+from hypogoal.evaluation.plots import PALETTE, STYLES
 from hypogoal.evaluation.provenance import domains_of
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
@@ -22,7 +21,6 @@ QUANTITIES = {
     "length": ("Episode length", "episode length (steps)"),
 }
 MOST_LINES = len(PALETTE)  # in one figure
-POINTS = 151
 RUN = page.label("run", "run")
 LADDERS = [rooms.METHOD._replace(once=None), rooms.N]
 
@@ -33,16 +31,12 @@ class Part:
 
     title: str  # of its section
     entries: Callable[[Metrics], Sequence[Entry]]  # the rows of its table in a run's metrics
-    alike: tuple[str, ...]  # keys; rows alike in all of them stand next to each other
-    first: Sequence[Column]  # columns before that of the run, shown once for rows alike
+    first: Sequence[Column]  # columns before that of the run; rows alike in them stand together, and show them once
     then: Sequence[Column]  # columns behind it
     caption: str  # of the table
     name: str  # the key of measured entries that says of what agent or method they are
     measured: Callable[[Metrics], Sequence[Entry]]  # what ``against`` takes
     against: Callable[[Sequence[Entry]], Rows]  # pairs of runs, see ``numbers.pairs``
-    # Drawn beside the table, above it where ``above``.
-    figures: Callable[[Runs, Curves], Iterable[Drawn]] = lambda runs, arrays: ()
-    above: bool = False
 
 
 def labels_of(paths: Sequence[str]) -> list[str]:
@@ -131,17 +125,26 @@ def compare_runs(runs: Runs) -> Rows:
     return rows
 
 
+def winners(comparisons: Rows) -> list[str]:
+    """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
+    told = []
+    for row in (row for row in comparisons if row["n"]):
+        (low, high), first, second = row["difference_interval"], row["first"], row["second"]
+        clear = low is not None and (low > 0 or high < 0)
+        order = (first, second) if (row["difference"] > 0) == row["higher"] else (second, first)
+        who = "{} beats {}".format(*order) if clear else f"no clear winner of {first} and {second}"
+        between = f", 95 % [{low:.3g}, {high:.3g}], n = {row['units']}" if low is not None else ""
+        won = f"{first} wins {row['wins']} of {row['n']}, {row['ties']} tied"
+        what = ": ".join(filter(None, [row["where"], row["quantity"].replace("_", " ")]))
+        told.append(f"{what}: {who} ({first} {row['difference']:+.3g}{between}; {won})")
+    return told or ["no pairs: no two runs share a seed of the same agent or method"]
+
+
 def common_names(tables: Sequence[Sequence[Mapping[str, Any]]], key: str = "name") -> list[str]:
     """The names that every table has, in the first one's order."""
     first, *others = tables
     names = dict.fromkeys(row[key] for row in first)
     return [name for name in names if all(any(row[key] == name for row in table) for table in others)]
-
-
-def on_grid(values: NDArray[np.float64], steps: NDArray[np.int64], grid: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Curves (R, G) known at ``steps`` (G,) at those of ``grid`` (H,): the last value known; NaN past the end."""
-    index = np.searchsorted(steps, grid, side="right") - 1
-    return np.where((index >= 0) & (grid <= steps[-1]), values[:, np.maximum(index, 0)], np.nan)
 
 
 def compared_sections(runs: Runs, arrays: Curves, about: Mapping[str, Any], material: Material) -> list[Block]:
@@ -155,14 +158,17 @@ def compared_sections(runs: Runs, arrays: Curves, about: Mapping[str, Any], mate
 
 
 def _result(name: str, part: Part, runs: Runs, arrays: Curves, material: Material) -> Block:
-    """Figures, and the entries of all runs in one table."""
-    alike = itemgetter(*part.alike)
+    """The entries of all runs in one table, and the learning curves of agents."""
+
+    def alike(entry: Entry) -> tuple[str, ...]:
+        return tuple(str(column.of(entry)) for column in part.first)
+
     entries = [{**entry, "run": run} for run, metrics in runs.items() for entry in part.entries(metrics)]
     together = [entry for group in grouped(entries, alike).values() for entry in group]
     columns = [*(column._replace(once=column.once or alike) for column in part.first), RUN, *part.then]
-    drawn = [page.shown(material, figure) for figure in part.figures(runs, arrays)]
-    blocks = [page.table(columns, together, tight=name != "agents", caption=part.caption)]
-    return page.section(name, part.title, [], [*drawn, *blocks] if part.above else [*blocks, *drawn])
+    table = page.table(columns, together, tight=name != "agents", caption=part.caption)
+    drawn = [page.shown(material, figure) for figure in _curves(runs, arrays)] if name == "agents" else []
+    return page.section(name, part.title, [], [table, *drawn])
 
 
 def _runs(about: Entry) -> Block:
@@ -212,15 +218,13 @@ def _curve(
 ) -> Drawn:
     """A figure with a line for each (run, agent, what it is called)."""
     drawn = wanted[:MOST_LINES]
-    end = max(int(arrays[run]["curves/grid"][-1]) for run, _, _ in drawn)
-    grid = np.linspace(0, end, POINTS).round().astype(np.int64)
     lines = []
     for index, (run, agent, called) in enumerate(drawn):
         agents = runs[run]["agents"]
         place = [other["name"] for other in agents].index(agent)
-        values = on_grid(arrays[run][f"curves/{place}/{quantity}"], arrays[run]["curves/grid"], grid)
-        values = curves.values_of(agents[place], values)
-        lines.append(curves.Line(called, values, PALETTE[index], dashed=index % 2 == 1))
+        values = curves.values_of(agents[place], arrays[run][f"curves/{place}/{quantity}"])
+        look = PALETTE[index], STYLES[index % len(STYLES)]
+        lines.append(curves.Line(called, arrays[run]["curves/grid"], values, *look))
     about, axis = QUANTITIES[quantity]
     bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
     played = ((run, page.pick(runs[run]["agents"], "name", agent)) for run, agent, _ in drawn)
@@ -232,24 +236,7 @@ def _curve(
         f"{curves.BANDS} over them ({counts}).{more}"
     )
     title = f"{about}: {name}"
-    return Drawn(identity, title, curves.learning_curves(grid, lines, axis, (), bounds), caption, heading=title)
-
-
-def _panels(runs: Runs, arrays: Curves) -> Iterator[Drawn]:
-    """Of each method that every run has its scores against N, a line per run."""
-    for index, name in enumerate(common_names([metrics["rooms"] for metrics in runs.values()], "method")):
-        rows = [{**row, "method": run} for run in runs for row in runs[run]["rooms"] if row["method"] == name]
-        if all(row["groups"] is None for row in rows) or len({row["sub_goal"] for row in rows}) > 1:
-            continue
-        panels = [
-            (f"{which} member, unseen rooms", "unseen", "balanced_accuracy", which) for which in ("best", "validated")
-        ]
-        caption = (
-            f"{name}: balanced accuracy on rooms that training never saw, against labelled ladder groups. Lines: mean "
-            f"over ensemble seeds; {rooms.bands(rows)}: ± one standard deviation over seeds. Dotted: chance."
-        )
-        title, drawn = f"Scores on unseen rooms: {name}", rooms.scores_over_groups(rows, panels, list(runs))
-        yield Drawn(f"rooms-{index}", title, drawn, caption, heading=title)
+    return Drawn(identity, title, curves.learning_curves(lines, axis, (), bounds), caption, heading=title)
 
 
 def _pairs(about: Mapping[str, Any]) -> Block:
@@ -271,7 +258,6 @@ PARTS: Mapping[str, Part] = {
     "agents": Part(
         "Agents",
         itemgetter("agents"),
-        ("name",),
         [curves.AGENT],
         curves.HEADLINE,
         "Over the last 100 training episodes of each run of an agent: mean ± standard error over layouts, or over "
@@ -281,12 +267,10 @@ PARTS: Mapping[str, Part] = {
         "name",
         itemgetter("agents"),
         curves.against,
-        _curves,
     ),
     "hypotheses": Part(
         "Hypotheses",
         itemgetter("hypotheses"),
-        ("name", "sub_goal"),
         [hypotheses.ENSEMBLE, page.label("sub-goal", "sub_goal")],
         [*hypotheses.SCORES, hypotheses.DISAGREE, hypotheses.SEEDS],
         "Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of held-out states on "
@@ -298,7 +282,6 @@ PARTS: Mapping[str, Part] = {
     "rooms": Part(
         "Hypotheses against labelled ladders",
         itemgetter("rooms"),
-        ("method", "groups"),
         LADDERS,
         rooms.UNSEEN,
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; accuracy of the "
@@ -306,13 +289,10 @@ PARTS: Mapping[str, Part] = {
         "method",
         lambda metrics: [ensemble for ensemble in metrics["ensembles"] if rooms.of_rooms([ensemble])],
         rooms.against,
-        _panels,
-        above=True,
     ),
     "distance": Part(
         "Options on ladders",
         lambda metrics: metrics["distance"]["over_ladders"],
-        ("method", "groups"),
         LADDERS,
         [
             page.label("ladders", lambda entry: ", ".join(entry["ladders"])),

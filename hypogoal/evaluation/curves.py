@@ -32,13 +32,26 @@ from hypogoal.evaluation.numbers import (
     rows_of,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, drawing
+from hypogoal.evaluation.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    NARROW,
+    ORANGE,
+    PURPLE,
+    SKY,
+    STYLES,
+    VERMILLION,
+    label_lines,
+    styled,
+)
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
+SEVERAL = 3  # runs of an agent from which on intervals and pairs say more than the runs
 SOLVED = 0.95  # share of the window's episodes
 GAMMA = 0.99  # per environment step, of the discounted return
 NEAR = 1.5  # times the shortest path
@@ -66,19 +79,20 @@ BANDS = (
 HIGHER = {"success": True, "length": False, "near": True, "discounted_return": True}  # compared; the higher is better
 Bounds = tuple[float | None, float | None]
 SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
-COLOURS = {
-    LEARNED: (BLUE, False),
-    RANDOM: (ORANGE, False),
-    PRETRAINING: (ORANGE, True),
-    ORACLE: (GREEN, False),
-    ORACLE_RANDOM: (GREEN, True),
-    "PPO tuned": (VERMILLION, False),
-    "PPO paper": (VERMILLION, True),
-    "DQN tuned": (PURPLE, False),
-    "DQN paper": (PURPLE, True),
+SOLID, DASHED, MIXED, LONG, SHORT = STYLES
+COLOURS = {  # lines differ in how they are drawn, too, for readers who do not see their colours
+    LEARNED: (BLUE, SOLID),
+    RANDOM: (ORANGE, DASHED),
+    PRETRAINING: (ORANGE, SHORT),
+    ORACLE: (GREEN, MIXED),
+    ORACLE_RANDOM: (GREEN, SHORT),
+    "PPO tuned": (VERMILLION, LONG),
+    "PPO paper": (VERMILLION, SHORT),
+    "DQN tuned": (PURPLE, MIXED),
+    "DQN paper": (PURPLE, DASHED),
 }
 # Of agents with other names; the last ones only where no agent of the figure has them by its name.
-OTHERS = ((SKY, False), (GREY, False), (SKY, True), (GREY, True), (BLUE, True), *COLOURS.values())
+OTHERS = ((SKY, SOLID), (GREY, DASHED), (SKY, LONG), (GREY, SOLID), (BLUE, DASHED), *COLOURS.values())
 
 
 @dataclass(frozen=True)
@@ -295,15 +309,8 @@ def layout_of(facts: Entry) -> int | str:
 
 
 def missing(work: Work) -> list[str]:
-    """Spec E6, E7: the comparisons that are not there, so that nothing is silently left out."""
-    names = [agent["name"] for agent in work.metrics["agents"]]
-    if not names:  # nor anything to compare: which ones Figure 6 has, the report says
-        return [] if work.metrics["rooms"] or work.contents.ladders else ["no agents"]
-    said = [name for name in names if name != ORACLE_RANDOM]
-    # Where one step solves a layout an option is a primitive action: baselines would choose among the same.
-    one_step = {layout.get("shortest_path") for layout in work.metrics.get("layouts", ())} == {1}
-    wanted = (LEARNED, RANDOM, ORACLE, *(() if one_step else BASELINES))
-    return [f"no agent '{name}'" for name in wanted if not any(f"{other}, ".startswith(f"{name}, ") for other in said)]
+    """That there are no agents, of a run that is about them; controls that nobody asked for are not missed."""
+    return [] if work.metrics["agents"] or work.metrics["rooms"] or work.contents.ladders else ["no agents"]
 
 
 def solved(steps: Mapping[str, Any]) -> str:
@@ -344,25 +351,6 @@ INTERVALS = (
     page.number("discounted return", "discounted_return", page.interval, 2),
     page.number("runs", "success.n"),
 )
-EVERY_RUN = (
-    page.label("agent", "name", once=True),
-    page.number("layout", layout_of),
-    page.number("seed", "seed"),
-    page.number("budget", "steps", page.thousands),
-    page.number("episodes", "episodes"),
-    page.number("success", "success", page.percent),
-    page.number("steps", "length", page.fixed, 1),
-    page.number("× shortest", "length_over_shortest", page.fixed, 2),
-    page.number(*NEARLY, page.fixed, 2),
-    page.number("return", "discounted_return", page.fixed, 2),
-    page.number("95 % at", "steps_to_95", lambda steps: "never" if steps is None else page.thousands(steps)),
-)
-LAYOUTS = (
-    page.label("layout seed", lambda layout: str(layout_of(layout))),
-    page.number("shortest path, steps", "shortest_path", page.fixed, 0),
-    page.number("random play succeeds", "random_success", page.percent),
-    page.number("episodes of random play", "random_episodes"),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -373,18 +361,20 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """The summary and the curves, of a run with agents."""
-    return [summary_section(material), curves_section(material)] if material.of_agents() else []
+    """The summary with film and curves, of a run with agents; intervals of three runs or more, one run's are none."""
+    if not material.of_agents():
+        return []
+    several = max((len(agent["runs"]) for agent in material.metrics["agents"]), default=0) >= SEVERAL
+    return [summary_section(material), *([runs_section(material)] if several else [])]
 
 
 def summary_section(material: Material) -> Block:
     """What was asked, what came out."""
     metrics = material.metrics
     asked = (
-        "Each sub-goal is known from one context only. An ensemble of classifiers holds several hypotheses about what "
-        "the sub-goal is; every member becomes an option of its own, and a policy over all of them is rewarded by "
-        "the task alone. Does that agent solve layouts that no data came from, and does it come to prefer the "
-        "hypotheses that are true there?"
+        "Asked was: each sub-goal is known from one context. Each member of an ensemble of classifiers is a hypothesis "
+        "about it, and becomes an option. Does a policy that chooses among all options solve layouts that no data came "
+        "from, and does it choose the hypotheses that are true there?"
     )
     headline = page.table(
         (AGENT, *HEADLINE),
@@ -396,8 +386,10 @@ def summary_section(material: Material) -> Block:
         "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
         "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
-    blocks = [headline] if metrics["agents"] else []
-    return page.section("summary", "Summary", [*_answers(material), asked], blocks, metrics["missing"])
+    drawn = [page.shown(material, figure) for figure in figures(material)]
+    row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": asked}
+    blocks = [row, headline] if metrics["agents"] else drawn
+    return page.section("summary", "Summary", _answers(material), blocks, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
@@ -408,48 +400,53 @@ def _answers(material: Material) -> list[str]:
     paragraphs = []
     for agent in shown:
         name = f"the agent '{agent['name']}'" if several else "the option agent"
-        text = _achieved(agent, name, material.metrics["settings"]["window"])
+        text = _achieved(agent, name)
         control = control_of(material, agent)
-        if agent["success"]["mean"] is not None and control is not None:
-            alike = not several or same_settings(agent, control)
-            text += f" {_by_chance(control, 'options of the same members' if alike else 'options of its ensemble')}"
+        alike = not several or control is None or same_settings(agent, control)
+        among = f"uniformly random choice among options of {'the same members' if alike else 'its ensemble'}"
+        against = [] if control is None else [(among, control)]
+        if not several:
+            against += [(other["name"], other) for other in agents if other not in (agent, control)]
+        if agent["success"]["mean"] is not None and against:
+            text += f" {_listed(against)}"
         frozen = [entry for entry in material.metrics.get("choosing", []) if entry["name"] == agent["name"]]
         for entry in frozen:
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
             text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
         if several and control is None and not frozen:
             text += " No random choice among options of the same members was run."
+        if len(agent["runs"]) < SEVERAL and not several:
+            text += " So few runs decide nothing: more seeds and layouts do."
         paragraphs.append(text)
     return paragraphs
 
 
-def _achieved(agent: Mapping[str, Any], name: str, window: int) -> str:
+def _achieved(agent: Mapping[str, Any], name: str) -> str:
     success, ratio = agent["success"]["mean"], agent["length_over_shortest"]["mean"]
     if success is None:
         return f"No episode of {name} came to its end ({runs_of(agent)}): it needs more steps."
     against = "" if ratio is None else f", {page.fixed(ratio, 1)} times the shortest path"
     return (
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
-        f"{_episodes(agent, window)}, which took {page.fixed(agent['length']['mean'], 0)} steps{against} "
-        f"({runs_of(agent)})."
+        f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
 
 
-def _by_chance(control: Mapping[str, Any], among: str) -> str:
-    if control["success"]["mean"] is None:
-        return f"Of uniformly random choice among {among} no episode came to its end."
-    return (
-        f"Uniformly random choice among {among}: {page.percent(control['success']['mean'])}, "
-        f"{page.fixed(control['length']['mean'], 0)} steps. Where success ties, length tells a policy from chance."
-    )
+def _listed(others: Sequence[tuple[str, Entry]]) -> str:
+    """The same of other agents in one sentence."""
+    told = []
+    for name, agent in others:
+        success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
+        told.append(f"{name}: {'no episode ended' if success is None else f'{page.percent(success)}, {steps} steps'}")
+    text = "; ".join(told)
+    return f"{text[0].upper()}{text[1:]}."
 
 
-def _episodes(agent: Mapping[str, Any], window: int) -> str:
+def _episodes(agent: Mapping[str, Any]) -> str:
     """How many of its last training episodes an agent is judged by: fewer where a run had fewer."""
-    counts = [min(window, run["episodes"]) for run in agent["runs"] if run["episodes"]]
-    fewest, most = min(counts), max(counts)
-    count = str(most) if fewest == most else f"{fewest} to {most}"
-    return f"{count} training episode{'s' if most > 1 else ''}"
+    windows = sorted({run["window"] for run in agent["runs"] if run["window"]})
+    count = f"{windows[0]} to {windows[-1]}" if len(windows) > 1 else str(windows[0])
+    return f"{count} training episode{'s' if windows[-1] > 1 else ''}"
 
 
 def runs_of(agent: Entry) -> str:
@@ -462,40 +459,19 @@ def runs_of(agent: Entry) -> str:
     )
 
 
-def curves_section(material: Material) -> Block:
-    """Figure 6 with controls and baselines, and every run's numbers."""
+def runs_section(material: Material) -> Block:
+    """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
-    drawn = [page.shown(material, figure) for figure in figures(material)]
-    if not agents:
-        return page.section("curves", "Learning curves", [], drawn)
-    text = (
-        "Success at a cap of 500 steps cannot show by itself that choices are learned, so episode length stands "
-        "beside it. Oracle terminations use the true sub-goals: an upper bound. Baselines act with the primitive "
-        "actions on the same observations and budget."
-    )
     digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
     blocks = [
-        *drawn,
         page.table(
             INTERVALS,
             agents,
-            heading="Intervals",
             caption=f"Over the last 100 episodes of each run. {page.INTERVALS.format(units=LAYOUTS_OR_RUNS)}",
         ),
         *page.comparison_tables(material.comparisons("agents"), "layout and seed", LAYOUTS_OR_RUNS, digits),
-        page.table(
-            EVERY_RUN,
-            [{**run, "name": agent["name"]} for agent in agents for run in agent["runs"]],
-            folded="Every run",
-        ),
-        page.table(
-            LAYOUTS,
-            material.metrics["layouts"],
-            heading="How hard the layouts are",
-            caption="Random play: uniformly random primitive actions, the same cap.",
-        ),
     ]
-    return page.section("curves", "Learning curves", [text], blocks)
+    return page.section("runs", "Intervals and pairs", [], blocks, folded=True)
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -512,7 +488,7 @@ def _curve(material: Material, quantity: str) -> Drawn:
     others = cycle(look for look in OTHERS if look not in used)
     looks = [COLOURS.get(agent["name"]) or next(others) for agent in agents]
     lines = [
-        Line(agent["name"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
+        Line(agent["name"], arrays["curves/grid"], values_of(agent, arrays[f"curves/{index}/{quantity}"]), *look)
         for index, (agent, look) in enumerate(zip(agents, looks, strict=True))
     ]
     bounds: Bounds
@@ -527,12 +503,12 @@ def _curve(material: Material, quantity: str) -> Drawn:
         which_figure, name, dotted = "Beside Figure 6 of the paper", "shortest path", "the shortest path"
     values = [value for value in values if value is not None]
     references = [(name, float(np.mean(values)))] if values else []
-    drawn = learning_curves(arrays["curves/grid"], lines, axis, references, bounds)
+    drawn = learning_curves(lines, axis, references, bounds)
     reference = f" Dotted: mean over layouts of {dotted}." if references else ""
+    several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
-        f"{which_figure}: {title.lower()}, mean over the last 100 episodes known at each step. Lines: mean over runs; "
-        f"{BANDS} over runs. {agents[0]['name']}: {runs_of(agents[0])}; "
-        f"the other agents: {_others(agents)}.{reference}"
+        f"{which_figure}: {title.lower()}, mean of the last 100 at each step.{several} {agents[0]['name']}: "
+        f"{runs_of(agents[0])}; the other agents: {_others(agents)}.{reference}"
     )
     return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
 
@@ -543,17 +519,18 @@ def _others(agents: Sequence[Mapping[str, Any]]) -> str:
     alike = [{(run["layout_seed"], run["seed"]) for run in agent["runs"]} for agent in agents]
     if all(runs == alike[0] for runs in alike):
         return "the same layouts and seeds"
-    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see the table of runs"
+    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see numbers.csv"
 
 
 @dataclass(frozen=True)
 class Line:
-    """One agent's curve: values float (R, G), a row per layout or run, NaN where it has no value."""
+    """One agent's curve: values float (R, G) at ``steps`` (G,), a row per layout or run, NaN where it has no value."""
 
     name: str
+    steps: NDArray[np.int64]
     values: NDArray[np.float64]
     colour: str
-    dashed: bool = False
+    style: Any = SOLID
 
 
 def reward_bounds(lines: Sequence[Line]) -> Bounds:
@@ -563,27 +540,29 @@ def reward_bounds(lines: Sequence[Line]) -> Bounds:
 
 
 def learning_curves(
-    grid: NDArray[np.int64],
     lines: Sequence[Line],
     quantity: str,
     references: Sequence[tuple[str, float]] = (),
     bounds: Bounds = (0.0, None),
 ) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps, ``grid`` (G,), a line per agent; the mean, and of few
-    layouts or runs each, of more a band of one standard error.
+    """Figure 6: a quantity of episodes against environment steps, a line per agent; the mean, and of few layouts or
+    runs each, of more a band of one standard error.
 
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
     """
-    with drawing(3.1, 2, handlelength=2.4) as (figure, axes):
+    with styled():
+        figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
+        axes = figure.subplots()
         for line in lines:
-            _draw_curve(axes, grid / 1000, line)
-        for (name, value), style in zip(references, (":", (0, (1, 3)), "-."), strict=False):
-            axes.axhline(value, color=GREY, linewidth=1.2, linestyle=style, label=name)
+            _draw_curve(axes, line)
+        for name, value in references:
+            axes.axhline(value, color=GREY, linewidth=1.2, linestyle=":", label=name)
         axes.set_xlabel("environment steps, in thousands")
         axes.set_ylabel(quantity)
-        axes.set_xlim(0, grid[-1] / 1000)
+        axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
+        label_lines(figure, axes, 2, handlelength=2.4)
     return figure
 
 
@@ -592,10 +571,10 @@ def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return by_layout(values, [run["layout_seed"] for run in agent["runs"]])[0]
 
 
-def _draw_curve(axes: Axes, steps: NDArray[np.float64], line: Line) -> None:
-    known = np.ma.masked_invalid(line.values)
+def _draw_curve(axes: Axes, line: Line) -> None:
+    steps, known = line.steps / 1000, np.ma.masked_invalid(line.values)
     mean = known.mean(0).filled(np.nan)
-    look: dict[str, Any] = {"color": line.colour, "linestyle": "--" if line.dashed else "-"}
+    look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
     axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
     if len(known) >= BOOTSTRAP_FROM:
         error = known.std(0, ddof=1) / np.sqrt(known.count(0))
@@ -655,12 +634,5 @@ QUESTION = Question(
     summary=summary,
     sections=sections,
     figures=figures,
-    meanings={
-        "near": (
-            "fraction",
-            "share of the last 100 training episodes (scope frozen: of those played after training) that succeeded "
-            f"within {NEAR} times the layout's shortest path",
-        )
-    },
     needed={"figure6": "options, meta or baseline artefacts: train-meta, train-baseline"},
 )

@@ -1,5 +1,8 @@
 """What in a state a member goes by: DeepLift attributions and the check that they are complete (Spec F2, Figures 2, 9).
 
+Members with layers that DeepLift has no right rules for are explained by integrated gradients (Sundararajan et al.
+2017): means over ``STEPS`` states on the way from the baseline, and complete but for what so few miss.
+
 Attributed is the log-odds of "reached", the difference of a member's two logits: its sign is the verdict at a threshold
 of 0.5, so positive attributions speak for "reached" whatever the member says. The attributions of a state, summed over
 pixels and frames, must be the difference between its log-odds and the baseline's; how far they are off is reported.
@@ -18,7 +21,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hypogoal.dataset import PICTURE, Observations
 from hypogoal.hypotheses.networks import as_input
+
+DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
+STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together
+RULED = (nn.Conv2d, nn.Linear, nn.BatchNorm2d, nn.ReLU, nn.AvgPool2d, nn.AdaptiveAvgPool2d, nn.Flatten, nn.Dropout)
 
 if TYPE_CHECKING:
     from hypogoal.hypotheses.ensemble import Ensemble
@@ -26,33 +34,39 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Attributions:
-    """DeepLift of every member on n states."""
+    """Of every member on n states."""
 
-    values: NDArray[np.float64]  # (n, K, H, W, C), in log-odds; they speak for "reached" where positive
+    values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), in log-odds; for "reached" where positive
     log_odds: NDArray[np.float64]  # (n, K), each member's of each state
     baseline_log_odds: NDArray[np.float64]  # (K,), of the baseline
+    method: str = DEEP_LIFT
 
     def completeness_error(self) -> NDArray[np.float64]:
         """Spec F2: |sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
-        return np.abs(self.values.sum(axis=(2, 3, 4)) - (self.log_odds - self.baseline_log_odds))
+        return np.abs(self.sums() - (self.log_odds - self.baseline_log_odds))
+
+    def sums(self) -> NDArray[np.float64]:
+        """Of each state and member, (n, K)."""
+        return np.asarray(self.values.reshape(*self.log_odds.shape, -1).sum(-1))
 
 
-def mean_state(observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The baseline: the mean of observations (N, H, W, C), rounded, uint8 (H, W, C).
+def mean_state(observations: Observations) -> Observations:
+    """The baseline: the mean of what is seen of observations, (N, ...) -> (...), of pictures rounded, uint8 (H, W, C).
 
     A black image would be a baseline that is a state of no domain: what all states share (walls, the floor) would get
     most of the attribution, and what is black in a state (a pit, an open door) none. Against the mean state, what is
     usual gets none, and what makes the state differ from the usual gets all.
     """
-    return observations.mean(axis=0, dtype=np.float64).round().astype(np.uint8)
+    mean = observations.mean(axis=0, dtype=np.float64)
+    return (mean.round() if observations.dtype == PICTURE else mean).astype(observations.dtype)
 
 
 def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -> list[dict[str, Any]]:
     """Spec F2: the check, state by state and member by member, of n states ``picked`` as (index, kind)."""
-    errors, sums = attributions.completeness_error(), attributions.values.sum(axis=(2, 3, 4))
-    last = np.abs(attributions.values[..., -1]).sum(axis=(2, 3))
-    everywhere = np.abs(attributions.values).sum(axis=(2, 3, 4))
-    share = np.divide(last, everywhere, out=np.full_like(last, np.nan), where=everywhere > 0)
+    errors, sums = attributions.completeness_error(), attributions.sums()
+    frames = np.abs(attributions.values).reshape(*sums.shape, -1, attributions.values.shape[-1]).sum(2)
+    everywhere = frames.sum(-1)
+    share = np.divide(frames[..., -1], everywhere, out=np.full_like(sums, np.nan), where=everywhere > 0)
     every = range(attributions.values.shape[1])
     columns = {
         "log_odds": attributions.log_odds,
@@ -65,12 +79,37 @@ def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -
         [{"member": member, **{name: float(of[state, member]) for name, of in columns.items()}} for member in every]
         for state in range(len(picked))
     ]
-    return [{"kind": kind, "members": rows} for (_, kind), rows in zip(picked, members, strict=True)]
+    method = attributions.method
+    return [{"kind": kind, "method": method, "members": rows} for (_, kind), rows in zip(picked, members, strict=True)]
 
 
-def deep_lift(ensemble: Ensemble, observations: NDArray[np.uint8], baseline: NDArray[np.uint8]) -> Attributions:
+def method_of(member: nn.Module) -> str:
+    """How it is explained: by DeepLift where it is a chain of layers that its rules hold for, each used once."""
+    layers, example = list(member.children()), torch.zeros(1, 1, 1, 1)
+    ruled = all(type(layer) in RULED or _window_of(layer, example) is not None for layer in layers)
+    return DEEP_LIFT if ruled and len(layers) == len(member._modules) else INTEGRATED
+
+
+def attributed(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
+    """Spec F2: what every member goes by, by the method that is right for it; of what :func:`deep_lift` is given."""
+    if method_of(ensemble.members[0]) == DEEP_LIFT:
+        return deep_lift(ensemble, observations, baseline)
+    from captum.attr import IntegratedGradients
+
+    inputs, reference = as_input(torch.from_numpy(observations)), as_input(torch.from_numpy(baseline[None]))
+    found = []
+    for member in ensemble.members:
+        network = nn.Sequential(member, _LogOdds(), nn.Flatten(0))
+        values = IntegratedGradients(network).attribute(inputs, reference, n_steps=STEPS, internal_batch_size=AT_ONCE)
+        with torch.no_grad():
+            found.append((_as_seen(values), network(inputs), network(reference)))
+    values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*found, strict=True))
+    return Attributions(values, log_odds, baselines[0], INTEGRATED)
+
+
+def deep_lift(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
     """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) of every member, a plain ``nn.Sequential`` of modules
-    used once, on what members see of a few states (n, H, W, C), compared with a baseline (H, W, C).
+    used once, on what members see of a few states (n, ...), compared with a baseline (...).
     """
     inputs = as_input(torch.from_numpy(observations)).double().requires_grad_()
     reference = as_input(torch.from_numpy(baseline[None])).double()
@@ -82,7 +121,7 @@ def deep_lift(ensemble: Ensemble, observations: NDArray[np.uint8], baseline: NDA
 def _of_member(
     member: nn.Module, inputs: Tensor, reference: Tensor
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Attributions (n, H, W, C), log-odds (n,) and the baseline's (1,); in double, where rounding is no matter."""
+    """Attributions (n, ...), log-odds (n,) and the baseline's (1,); in double, where rounding is no matter."""
     from captum.attr import DeepLift
 
     network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
@@ -91,7 +130,12 @@ def _of_member(
         values = DeepLift(network).attribute(inputs, reference, target=0)
     with torch.no_grad():
         log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
-    return values.detach().permute(0, 2, 3, 1).numpy(), log_odds.numpy(), baseline.numpy()
+    return _as_seen(values.detach()).numpy(), log_odds.numpy(), baseline.numpy()
+
+
+def _as_seen(values: Tensor) -> Tensor:
+    """In the order of observations what is in that of :func:`as_input`."""
+    return values.permute(0, 2, 3, 1) if values.ndim == 4 else values
 
 
 def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.own_code import UsersCode, as_number
@@ -39,18 +40,15 @@ from hypogoal.evaluation.numbers import (
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
-from hypogoal.evaluation.rooms import CELL, of_rooms
+from hypogoal.evaluation.rooms import CELL, WHICH, group_name, of_rooms
 from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, within
 from hypogoal.hypotheses.scores import most_and_least
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hypogoal.evaluation.judging import Work
 
 INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
-WHICH = ("best", "validated", "mean", "worst")
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
 SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
 _NAMES = (*WHICH, "executions_deviation", *SHARES)
@@ -134,8 +132,8 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
     Of each artefact it takes method, groups, ladder, seed and a row of :func:`ladder_numbers`. ``by_ladder``: per
     method, N, ladder: the distance of the best, validated, mean and worst member and the best member's shares, over
     seeds. ``over_ladders``: per method and N: the same, each seed's mean over ladders first. A seed that lacks one of
-    the ladders is left out there, so that nothing is compared over unlike ladders. Artefacts alike in all of this count
-    each for itself.
+    the ladders is left out there, so that nothing is compared over unlike ladders; ``each_seed`` has what the others
+    came to, the best member's. Artefacts alike in all of this count each for itself.
     """
     by_ladder, over_ladders = [], []
     cells = grouped(rows, itemgetter(*CELL))
@@ -156,6 +154,7 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
         ]
         incomplete = [seed[0] for seed in seeds if seed not in whole]
         about |= {"ladders": list(ladders), "seeds": len(whole), "incomplete_seeds": incomplete}
+        about["each_seed"] = [mean["best"] for mean in means]
         over_ladders.append({**about, **_over_seeds(means, *map(str, key))})
     return {"by_ladder": by_ladder, "over_ladders": over_ladders}
 
@@ -360,63 +359,25 @@ def _group(entry: Entry) -> str:
     return "true sub-goal" if entry["groups"] is None else f"N={entry['groups']}"
 
 
-METHOD = page.label("method", "method")
-LABELS = page.label("labels", _group)
 STOPPED = tuple(page.number(which, which, page.deviation, 1) for which in WHICH)
 SHARED = tuple(page.number(title, f"{share}.mean", page.percent) for share, title in SHARES.items())
 SEEDS = page.number("seeds", "seeds")
 OVER_LADDERS = (
     page.label("labels", _group, once=True),
-    METHOD,
+    page.label("method", "method"),
     *STOPPED,
     page.number("± exec.", "executions_deviation.mean", page.fixed, 1),
     *SHARED,
     SEEDS,
 )
-INTERVALS = (METHOD, LABELS, *(page.number(which, which, page.interval, 1) for which in ("best", "validated", "mean")))
-BY_LADDER = (page.label("ladder", "ladder", once=True), METHOD, LABELS, *STOPPED, *SHARED, SEEDS)
-OPTIONS = (
-    page.label("options", "path", once=lambda option: (option["path"], option["sub_goal"])),
-    page.label("member", "name"),
-    page.number("executions", "executions"),
-    page.number("distance", "distance", page.fixed, 1),
-    page.number("±", "executions_deviation", page.fixed, 1),
-    page.number("steps", "duration", page.fixed, 1),
-    *(page.number(title, share, page.percent) for share, title in SHARES.items()),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
-    """Figure 4: by ladder and N the best member's distance and the mean one's, a column per method; at most 80 wide."""
-    from rich.table import Table
-
-    if not metrics["distance"]["options"]:
-        return []
-    by_ladder, over_ladders = metrics["distance"]["by_ladder"], metrics["distance"]["over_ladders"]
-    name_of = page.method_of(over_ladders)
-    methods = list(dict.fromkeys(map(name_of, over_ladders)))
-    title = "Distance from a true base where options stop: best member (mean member)"
-    drawn = Table("ladder", "N", title=title, title_justify="left", width=79)
-    for method in methods:
-        drawn.add_column(method, justify="right", ratio=1)
-
-    def both(entry: Entry) -> str:
-        return f"{page.fixed(entry['best']['mean'], 0)} ({page.fixed(entry['mean']['mean'], 0)})"
-
-    parts = [(ladder, entries, both) for ladder, entries in grouped(by_ladder, itemgetter("ladder")).items()]
-    parts.append(("mean", over_ladders, both))
-    parts.append(("at base, best", over_ladders, lambda entry: page.percent(entry["reached_base"]["mean"])))
-    for name, entries, show in parts:
-        if name == "mean" and entries is over_ladders:
-            drawn.add_section()
-        numbers: list[int | None] = [groups for groups in by_groups(entries) if groups is not None]
-        for groups in numbers or [None]:
-            cells = {name_of(entry): show(entry) for entry in entries if entry["groups"] in (groups, None)}
-            drawn.add_row(
-                str(name), "–" if groups is None else str(groups), *(cells.get(method, "–") for method in methods)
-            )
-            name = ""
-    return [drawn]
+    """Figure 4 by method and N."""
+    rows = metrics["distance"]["over_ladders"] if metrics["distance"]["options"] else []
+    title = "Distance from a true base where options stop, mean over ladders"
+    columns = (page.label("method", page.method_of(rows)), page.number("N", group_name), *STOPPED, SHARED[0])
+    return [page.terminal(title, columns, rows)] if rows else []
 
 
 def sections(material: Material) -> list[Block]:
@@ -440,7 +401,6 @@ def distance_section(material: Material) -> Block:
     rows = found["over_ladders"]
     short = [f"{entry['method']}, {_group(entry)}" for entry in rows if entry["incomplete_seeds"]]
     left = f" Seeds that lack a ladder are left out: {'; '.join(short)}." if short else ""
-    by_ladder = grouped(found["by_ladder"], itemgetter("ladder")).values()
     blocks = [
         drawn,
         page.table(
@@ -453,30 +413,8 @@ def distance_section(material: Material) -> Block:
             f"{NEAR} of a true one and not begun inside; inside, begun in its own termination set; timed out; died. A "
             f"death or a time-out at a base counts as both.{left}",
         ),
-        page.table(
-            INTERVALS,
-            _ordered(rows),
-            tight=True,
-            folded="Distance with intervals",
-            caption=page.INTERVALS.format(units="seeds"),
-        ),
         *page.comparison_tables(
             material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
-        ),
-        page.table(
-            BY_LADDER,
-            [entry for entries in by_ladder for entry in _ordered(entries)],
-            tight=True,
-            folded="Every ladder",
-            caption="As above, ladder by ladder.",
-        ),
-        page.table(
-            OPTIONS,
-            [line for entry in found["options"] for line in _options(entry)],
-            tight=True,
-            folded=f"Every option of {len(found['options'])} artefacts",
-            caption=f"The last {LAST} executions of each. An option without any was never offered: it would always "
-            f"have begun inside its own termination set, and counts {INSIDE}.",
         ),
     ]
     return page.section("distance", title, [text], blocks)
@@ -485,12 +423,6 @@ def distance_section(material: Material) -> Block:
 def _ordered(rows: Sequence[Entry]) -> list[Entry]:
     """By N, then as they come; those without N last."""
     return sorted(rows, key=lambda entry: (entry["groups"] is None, entry["groups"] or 0))
-
-
-def _options(entry: Entry) -> Iterator[Entry]:
-    for index, option in enumerate(entry["options"]):
-        name = page.noted(index, {word: entry[word] for word in ("best", "validated")})
-        yield {**option, "path": entry["path"], "sub_goal": entry["sub_goal"], "name": name}
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -506,7 +438,8 @@ def _bars(material: Material) -> Drawn:
     name_of, bars = page.method_of(found["options"]), []
     for entry in rows:
         mean, wide = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
-        bars.append((name_of(entry), _group(entry), mean, wide, _seed_means(found["options"], entry)))
+        each = [seed for seed in entry.get("each_seed", ()) if seed is not None]
+        bars.append((name_of(entry), _group(entry), mean, wide, each))
     names = list(dict.fromkeys(name for name, *_ in bars if not name.startswith(ORACLE)))
     drawn = distance_bars(bars, names, INSIDE) if bars else None
     seeds = sorted({row["seed"] for row in found["options"]})
@@ -518,18 +451,6 @@ def _bars(material: Material) -> Drawn:
         "executions instead: in the table."
     )
     return Drawn("figure4", name, drawn, caption, "No seed has executions on all ladders of the run.")
-
-
-def _seed_means(options: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> list[float]:
-    """Each complete seed's mean over ladders of the best member's distance."""
-    cell = itemgetter(*CELL)
-    alike = [row for row in options if cell(row) == cell(entry) and row["best"] is not None]
-    values = []
-    for seed in sorted({row["seed"] for row in alike} - set(entry["incomplete_seeds"])):
-        distances = [row["options"][row["best"]]["distance"] for row in alike if row["seed"] == seed]
-        if len(distances) == len(entry["ladders"]):
-            values.append(float(np.mean(distances)))
-    return values
 
 
 def stops_section(material: Material) -> Block:

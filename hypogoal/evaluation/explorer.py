@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import settings_of, variants
 from hypogoal.evaluation.page import Block, Entry, Material, Question
@@ -25,15 +26,16 @@ if TYPE_CHECKING:
 MOST_STATES = 300  # over all sub-goals, for the page's sake
 MOST_OF_ONE = 180  # of one sub-goal
 MOST_EXPLAINED = 120  # states with attributions, over all sub-goals: DeepLift takes .05 s for a state and member
+MOST_INTEGRATED = 12  # where they are integrated gradients: of a large network seconds
 PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 TITLE = "Explore the hypotheses"
 
 
 def look(work: Work, judgement: Judgement) -> None:
     """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
-    if judgement.number != work.browsed:
+    if judgement.number != work.browsed or judgement.split.observations.dtype != PICTURE:
         return
-    from hypogoal.evaluation.deep_lift import deep_lift
+    from hypogoal.evaluation.deep_lift import DEEP_LIFT, attributed, method_of
 
     split, sub_goal, verdicts = judgement.split, judgement.case.sub_goal, judgement.judged.verdicts
     sub_goals = len(judgement.case.config["sub_goals"])
@@ -45,14 +47,16 @@ def look(work: Work, judgement: Judgement) -> None:
     group = work.arrays.create_group(f"explorer/{sub_goal}")
     judgement.write_states(group, list(zip(picked.tolist(), names, strict=True)))
     group["rows"] = picked
-    explained = picked[: min(len(picked), MOST_EXPLAINED // sub_goals)]
-    ensemble, seen, baseline = judgement.see(explained)
-    values = [to_bytes(flat(deep_lift(ensemble, seen[i : i + 8], baseline).values)) for i in range(0, len(seen), 8)]
+    ensemble, seen, baseline = judgement.see(picked[: MOST_EXPLAINED // sub_goals])
+    if method_of(ensemble.members[0]) != DEEP_LIFT:
+        seen = seen[: MOST_INTEGRATED // sub_goals]
+    values = [to_bytes(flat(attributed(ensemble, seen[i : i + 8], baseline).values)) for i in range(0, len(seen), 8)]
     shape = (0, len(ensemble), *seen.shape[1:3])
     group["attributions"] = np.concatenate([np.zeros(shape, np.int8), *values])
     group["brightness"] = brightness(seen)
-    counts = {"states": len(split.labels), "shown": len(picked), "explained": len(explained)}
-    work.looked["explorer"].append({"sub_goal": sub_goal, **counts})
+    counts = {"states": len(split.labels), "shown": len(picked), "explained": len(seen)}
+    reading = judgement.domain.reading if judgement.domain else ""
+    work.looked["explorer"].append({"sub_goal": sub_goal, **counts, "reading": reading})
 
 
 def pick_to_browse(
@@ -97,11 +101,13 @@ def explorer_section(material: Material) -> Block:
     source = page.pick(material.metrics["ensembles"], "path", found["ensemble"])
     shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
-        f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them: {shown:,} "
-        f"of {states:,} for a sub-goal, drawn so that every kind of outcome and every place comes up; how often one "
-        "does says nothing. Choose a state to see each member's verdict and what it goes by (orange speaks for "
-        "'reached', blue against it), and a member to see the options it became. The address of the page holds the "
-        "filters: it can be shared."
+        f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them. Choose a "
+        "state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against it. Choose "
+        f"a member to see the options it became. {found['sub_goals'][0].get('reading', '')}"
+    )
+    sample = (
+        f"{shown:,} of {states:,} states of a sub-goal, drawn so that every kind of outcome and every place comes up; "
+        "how often one does says nothing. The page's address holds the filters."
     )
     goals = [_goal(material, source, goal["sub_goal"]) for goal in found["sub_goals"]]
     places = list(dict.fromkeys(state["place"] for goal in goals for state in goal["states"] if state["place"]))
@@ -115,7 +121,7 @@ def explorer_section(material: Material) -> Block:
         "place": _any(sorted(places, key=_natural)),
         "kind": _any(sorted(kinds)),
     }
-    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}}
+    block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "caption": sample}
     return page.section("explorer", TITLE, [text], [block])
 
 
@@ -231,5 +237,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=lambda material: [explorer_section(material)],
+    sections=lambda material: [] if material.of_numbers() else [explorer_section(material)],
 )

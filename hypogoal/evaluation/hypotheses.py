@@ -154,21 +154,13 @@ HYPOTHESES = (
     SEEDS,
 )
 DISAGREE = page.number("disagree", "disagreement_heldout", page.spread, 3)
-MEMBERS = (
-    page.label("sub-goal", "sub_goal", once=True),
-    page.label("member", lambda member: f"member {member['member']}"),
-    page.number("bal. acc.", "balanced_accuracy", page.fixed, 3),
-    *(page.number(name, name, page.fixed, 3) for name in ("precision", "recall", "accuracy")),
-    page.number("F1", "f1", page.fixed, 3),
-    page.number("yes, unlabelled", "says_yes_unlabelled", page.fixed, 3),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
     """Balanced accuracy of the best, mean and worst member on held-out states."""
     columns = (ENSEMBLE._replace(title="method"), page.label("sub-goal", "sub_goal"), *SCORES, DISAGREE)
     title = "Balanced accuracy on held-out states: best, mean and worst member"
-    return [page.terminal(title, columns, metrics["hypotheses"], sections=True)] if metrics["hypotheses"] else []
+    return [page.terminal(title, columns, metrics["hypotheses"])] if metrics["hypotheses"] else []
 
 
 def sections(material: Material) -> list[Block]:
@@ -202,31 +194,17 @@ def hypotheses_section(material: Material) -> Block:
     )
     over_all = [entry for entry in material.comparisons("hypotheses") if entry["where"] == ALL]
     shared = "ensemble seed and sub-goal (each sub-goal by itself is in metrics.json)"
-    members = [_members(ensemble) for ensemble in metrics["ensembles"]]
     blocks = [
         *(page.shown(material, figure) for figure in figures(material)),
         whole,
         *page.comparison_tables(over_all, shared),
     ]
-    return page.section("hypotheses", "Hypotheses", [text], [*blocks, *members])
+    return page.section("hypotheses", "Hypotheses", [text], blocks)
 
 
 def _has_layouts(metrics: Entry) -> bool:
     """Whether held-out states are of layouts, as collected ones are, and not only states, as imported ones."""
     return any(goal["by_layout"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
-
-
-def _members(ensemble: Entry) -> Block:
-    goals = ensemble["sub_goals"]
-    goal: Entry = next(iter(goals), {"states": 0, "by_layout": []})
-    layouts = f" of {len(goal['by_layout'])} layouts" if goal["by_layout"] else ""
-    return page.table(
-        MEMBERS,
-        [{**member, "sub_goal": goal["sub_goal"]} for goal in goals for member in goal["members"]],
-        folded=f"Every member of {ensemble['path']} ({ensemble['name']}, seed {ensemble['seed']})",
-        caption=f"Pooled over {goal['states']} held-out states{layouts}; the last "
-        "column is the share of unlabelled states that the member calls positive.",
-    )
 
 
 def figures(material: Material) -> list[Drawn]:

@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +18,8 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.dataset import Split, open_dataset
-from hypogoal.domains.base import installed_domain
+from hypogoal.dataset import Observations, Split, open_dataset
+from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.views import positions_of
@@ -33,9 +32,9 @@ WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"} 
 
 @dataclass(frozen=True)
 class Unlabelled:
-    """Unlabelled states: observations uint8 (M, H, W, C), positions int64 (M, 3) where they are known."""
+    """Unlabelled states: observations (M, *obs), positions int64 (M, 3) where they are known."""
 
-    observations: NDArray[np.uint8]
+    observations: Observations
     positions: NDArray[np.int64] | None
 
 
@@ -68,13 +67,18 @@ class Judgement:
     case: Case  # the sub-goal's ensemble and its data
     split: Split  # N held-out states
     unlabelled: Unlabelled  # M states
-    kinds: Sequence[str]  # names of the values of the origin ``kind``
+    domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
     # Filled by the questions: what is said of this sub-goal's members in ``ensembles``.
     row: dict[str, Any] = field(default_factory=dict)
 
-    def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, NDArray[np.uint8], NDArray[np.uint8]]:
-        """The ensemble, what it sees of some held-out states (n, h, w, C), and of the unlabelled ones on average."""
+    @property
+    def kinds(self) -> Sequence[str]:
+        """Names of the values of the origin ``kind``."""
+        return self.domain.kinds if self.domain else ()
+
+    def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
+        """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
         from hypogoal.evaluation.deep_lift import mean_state
 
         ensemble, positions = self.case.read(), positions_of(self.split.origins)
@@ -152,7 +156,7 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
         dataset = open_dataset(case.data)
         counts = dataset.counts()
         states = counts["heldout"][case.sub_goal]["states"] + counts["unlabelled"]
-        work += case.config["members"] * states * prod(dataset.observation_shape)
+        work += case.config["members"] * states * dataset.observation_bytes
     return min(cores, len(cases)) if work >= SPREAD_FROM else 1
 
 
@@ -173,7 +177,7 @@ def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[
     for index, (number, case) in enumerate(cases):
         split, unlabelled = states_of(case.data, case.sub_goal)
         domain = installed_domain(open_dataset(case.data).domain)
-        yield Judgement(number, case, split, unlabelled, domain.kinds if domain else (), judged.pop(index))
+        yield Judgement(number, case, split, unlabelled, domain, judged.pop(index))
     states_of.cache_clear()
 
 

@@ -32,7 +32,7 @@ PICKED = ("best", "validated", "mean")  # members that methods are compared by
 NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
-        *("world", "members"),  # which the domain's settings and the ensemble's name say
+        *("world", "members", "observation_dtype"),  # which the domain's settings and the ensemble's name say
         *("ended_at", "until_reached", "options_ended_at"),  # which came out
     }
 )
@@ -43,121 +43,12 @@ IDLE = {
 }
 METHODS = {"dbat": "D-BAT", "no diversity": "an ensemble without diversity", "single CNN": "a single CNN"}
 ORACLE = "oracle termination"
-# By name the unit and the meaning.
-QUANTITIES: dict[str, tuple[str, str]] = {
-    "balanced_accuracy": ("fraction", "mean of recall and of the share of negatives called negative"),
-    "precision": ("fraction", "positives among the states that a member calls positive"),
-    "recall": ("fraction", "share of positives that a member calls positive"),
-    "accuracy": ("fraction", "share of states that a member calls right"),
-    "f1": ("fraction", "harmonic mean of precision and recall; misleads where positives abound"),
-    "ranking": (
-        "fraction",
-        "share of pairs of a positive and a negative in which a member gives the positive the higher probability: "
-        "the area under the ROC curve, whatever the threshold",
-    ),
-    "says_yes_unlabelled": ("fraction", "share of unlabelled states that a member calls positive"),
-    "disagreement": ("fraction", "share of states on which two members' verdicts differ"),
-    "success": (
-        "fraction",
-        "share of the last 100 training episodes that succeeded: terminated, reward above 0, or as the domain says",
-    ),
-    "reward": ("reward", "mean undiscounted reward of the last 100 training episodes"),
-    "length": ("steps", "mean length of the last 100 training episodes, failures at the cap included"),
-    "length_over_shortest": ("ratio", "length / the layout's shortest path"),
-    "discounted_return": ("reward", "mean of 0.99 ** (length - 1) * reward over the last 100 episodes"),
-    "steps_to_95": (
-        "environment steps",
-        "first step at which 95 of the last 100 episodes succeeded; steps of train-options count",
-    ),
-    "steps": ("environment steps", "budget, summed over parallel environments and stages"),
-    "shortest_path": ("steps", "primitive steps from the start to the goal, at least"),
-    "random_success": ("fraction", "share of episodes of uniformly random actions that succeed"),
-    "groups": ("ladder groups", "N: how many ladder groups the labelled states are from"),
-    "seen": (
-        "code",
-        "a held-out state's room: 0 in no training set, 1 among the unlabelled, 2 among the labelled states",
-    ),
-    "scopes": (
-        "rooms",
-        "unseen: seen is 0; all: every held-out room, the paper's way; labelled: seen is 2, for validation",
-    ),
-    "best": ("as said beside it", "of the members: the highest score, or the least distance"),
-    "worst": ("as said beside it", "of the members: the lowest score, or the greatest distance"),
-    "validated": (
-        "as said beside it",
-        "of the member with the highest balanced accuracy on the labelled rooms, the first of several",
-    ),
-    "always_no": ("fraction", "accuracy of a member that never says yes: the share of negatives"),
-    "validation": ("fraction", "the validated member's balanced accuracy on the labelled rooms"),
-    "tied": ("members", "members that have that balanced accuracy; in tables the mean over seeds"),
-    "false_positives": ("fraction", "per kind of negatives, each member's share that it calls positive"),
-    "executions": ("executions", "the last ones of an option that count, 100 at most"),
-    "distance": (
-        "units of position",
-        "mean over executions of the way from where it stopped to the nearest true base, through the rooms; 300 "
-        "for one that began inside its own termination set",
-    ),
-    "executions_deviation": (
-        "units of position",
-        "standard deviation of that over an option's last executions; in tables the best member's",
-    ),
-    "reached_base": ("fraction", "share of executions that stopped within 4 of a true base and did not begin inside"),
-    "inside_at_start": ("fraction", "share of executions that began in their own termination set"),
-    "timed_out": ("fraction", "share of executions that neither their classifier nor a death ended"),
-    "died": ("fraction", "share of executions that ended in a terminal state of the episode"),
-    "log_odds": ("log-odds", "a member's difference of logits, positive: reached more likely than not"),
-    "baseline_log_odds": ("log-odds", "the same of the baseline that a state is compared with"),
-    "attributed": ("log-odds", "sum of a state's DeepLift attributions over pixels and frames"),
-    "completeness_error": (
-        "log-odds",
-        "|attributed - (log_odds - baseline_log_odds)|; 0 but for rounding if attributions are complete",
-    ),
-    "shown": ("states", "held-out states of a sub-goal that the page lets one browse"),
-    "explained": ("states", "those of them whose attributions are kept"),
-    "last_frame": ("fraction", "share of all attribution, absolute, that is in the last channel"),
-    "match": (
-        "fraction",
-        "a member's balanced accuracy against the true sub-goal on the layout's reachable states; of many layouts the "
-        "first ten's",
-    ),
-    "expected": ("decisions", "sum of 1 / (options offered) over the decisions that offered it"),
-    "offered": ("decisions", "decisions at which the option was not masked"),
-    "chosen": ("decisions", "decisions that chose the option"),
-    "reached": ("executions", "executions that ended because the option's own classifier said yes"),
-    "duration": ("steps", "mean steps of an execution"),
-    "preference": ("ratio", "chosen / expected; 1 for a chooser that does not care"),
-    "late_preference": ("ratio", "preference over the last quarter of training"),
-    "probability": (
-        "fraction",
-        "share of pairs of runs, alike in layout and seed, in which the first is better; a tie counts half; each unit "
-        "counts once, by its mean",
-    ),
-    "units": (
-        "layouts or seeds",
-        "that pairs are of: those of one are not independent; seeds where there is one layout",
-    ),
-    "wins": ("pairs", "in which the first is better"),
-    "ties": ("pairs", "in which both are the same"),
-    "difference": ("as said beside it", "mean over units of the mean over pairs of first - second"),
-    "difference_interval": ("as said beside it", "95 % interval of the difference, Student's t"),
-    "sign_test": ("probability", "of units won and lost as unevenly as these if neither were better"),
-    "mean": ("as said beside it", "over layouts, each by the mean of its runs; over runs where there is one layout"),
-    "standard_error": ("as said beside it", "of that mean"),
-    "iqm": ("as said beside it", "interquartile mean over the same"),
-    "interval": (
-        "as said beside it",
-        "95 %: Student's t, of the mean or the probability; of 8 or more layouts or runs a bootstrap's, of the "
-        "interquartile mean; interval_over says which",
-    ),
-    "standard_deviation": ("as said beside it", "over the same (n - 1)"),
-    "n": ("runs", "runs that have this number"),
-}
 
 
 class Row(NamedTuple):
     """One number of ``numbers.csv`` and what it is of; empty where that is not said of it."""
 
-    quantity: str  # see ``QUANTITIES``
+    quantity: str  # see ``quantities.toml``
     value: float | int
     method: str = ""  # the ensemble's, or the agent's name
     sub_goal: str = ""

@@ -58,6 +58,7 @@ class Material:
     # Filled while the page is made, to be written as files too.
     figures: dict[str, Figure] = field(default_factory=dict)
     drawings: dict[str, str] = field(default_factory=dict)  # the figures' SVG
+    films: Sequence[Block] = ()  # of episodes, see :func:`film`
 
     def comparisons(self, of: str) -> list[Entry]:
         """One method against the others; none in evaluations from before there were any."""
@@ -67,6 +68,10 @@ class Material:
         """The arrays of a folder, by their names in it."""
         start = f"{folder}/"
         return {name.removeprefix(start): of for name, of in self.arrays.items() if name.startswith(start)}
+
+    def of_numbers(self) -> bool:
+        """Whether observations are no pictures."""
+        return any(name.startswith("saliency/") and name.endswith("/features") for name in self.arrays)
 
     def of_ladders(self) -> bool:
         """Whether the run has anything of labelled ladders."""
@@ -162,8 +167,8 @@ def table(
     }
 
 
-def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, sections: bool = False) -> Table:
-    """The same table for a terminal, 79 columns wide; a line between groups of rows where ``sections``."""
+def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
+    """The same table for a terminal, 79 columns wide; a line between groups of rows."""
     drawn = table(columns, entries)
     found = Table(title=title, title_justify="left", width=79)
     for column in columns:
@@ -172,7 +177,7 @@ def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any], *, s
         else:
             found.add_column(column.title, ratio=1, overflow="fold")
     for index, row in enumerate(drawn["rows"]):
-        if sections and index and row["mark"]:
+        if index and row["mark"]:
             found.add_section()
         found.add_row(*(str(cell["text"] if isinstance(cell, dict) else cell) for cell in row["cells"]))
     return found
@@ -184,14 +189,17 @@ def section(
     paragraphs: Iterable[str],
     blocks: Iterable[Block],
     missing: Iterable[str] = (),
+    *,
+    folded: bool = False,
 ) -> Block:
-    """A section of the page."""
+    """A section of the page; until asked for only its title where ``folded``."""
     return {
         "id": identity,
         "title": title,
         "paragraphs": [text for text in paragraphs if text],
         "blocks": list(blocks),
         "missing": list(missing),
+        "folded": folded,
     }
 
 
@@ -223,8 +231,13 @@ def picture(image: NDArray[np.uint8]) -> str:
     return encoded(image_png(reduced(image)))
 
 
+def film(gif: bytes, caption: str) -> Block:
+    """A moving picture."""
+    return {"kind": "film", "gif": encoded(gif), "caption": caption}
+
+
 def encoded(png: bytes) -> str:
-    """A PNG as base64."""
+    """A picture's file as base64."""
     return base64.b64encode(png).decode("ascii")
 
 
@@ -238,12 +251,6 @@ def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:
     """How an entry's method is called: with its sub-goal where the entries are of several."""
     several = len({entry["sub_goal"] for entry in entries}) > 1
     return lambda entry: f"{entry['method']} ({entry['sub_goal']})" if several else str(entry["method"])
-
-
-def noted(member: int, words: Mapping[str, int | None], most: int | None = None) -> str:
-    """A member's number with the words that are of it, ``most`` of them: ``2 (best, validated)``."""
-    told = [word for word, of in words.items() if of == member][:most]
-    return f"{member} ({', '.join(told)})" if told else str(member)
 
 
 def facts(folded: str, rows: Iterable[tuple[str, str]], *, heading: str = "") -> Block:
@@ -393,7 +400,7 @@ class Question:
     rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()  # of ``numbers.csv``
     # Methods against each other, by their key in ``comparisons``.
     pairs: Callable[[Entry], dict[str, Rows]] = lambda metrics: {}
-    # Unit and meaning of its quantities, those that ``numbers.QUANTITIES`` does not have.
+    # Unit and meaning of its quantities, of a question of your own; others are in ``quantities.toml``.
     meanings: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     summary: Callable[[Entry], list[Table]] = lambda metrics: []  # tables for a terminal
     sections: Callable[[Material], list[Block]] = lambda material: []  # those that the run has anything for

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 INK, RULE = "#24272b", "#d4d7dc"
@@ -24,10 +25,16 @@ COLOURS = {
 }  # fmt: skip
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, GREY)
 MARKERS = "osD^vPX*<>p"  # 11, so that a colour has the same one again late
+STYLES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))  # of lines; dotted is what is no method
 METHOD_COLOURS = PALETTE[:-1]  # of methods in Figures 3 and 4; grey is for what is no method
-WIDTH = 5.6  # inches; readable on a phone where it is scaled to the screen
+WIDTH, NARROW = 5.6, 4.6  # inches; readable on a phone where it is scaled to the screen, and where two are in a row
 UNNAMED = re.compile(r"_(child|container)\d+|_nolegend_|")  # labels that matplotlib gives of itself
-LABEL = 60  # characters of a legend's line, which fits the figure also in capitals
+LABEL = 60  # characters of a legend's line, which fits a figure of WIDTH also in capitals
+BESIDE, BESIDE_LINES, APART = (
+    19,
+    12,
+    0.085,
+)  # of names beside lines: characters of one of theirs, how many, how far apart
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
     "font.size": 10.5,
@@ -79,11 +86,12 @@ def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any)
     very long labels are broken; ``more`` are matplotlib's settings of a legend.
     """
     handles: dict[str, Any] = {}
+    longest = int(LABEL * figure.get_figwidth() / WIDTH)
     drawn: list[Any] = [artist for place in places for artist in (*place.lines, *place.containers)]
     for handle in drawn:
         label = str(handle.get_label())
         if not UNNAMED.fullmatch(label):  # before a name's own "_" a space, else matplotlib leaves it out
-            handles.setdefault(textwrap.fill(f" {label}" if label[0] == "_" else label, LABEL), handle)
+            handles.setdefault(textwrap.fill(f" {label}" if label[0] == "_" else label, longest), handle)
     if not handles:
         return
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -94,6 +102,41 @@ def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any)
             figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
             return
         legend.remove()
+
+
+def label_lines(figure: Figure, axes: Axes, columns: int, **more: Any) -> None:
+    """Each line's name at its right end, a short piece of the line before it; :func:`legend_below` where too many.
+
+    Names stand in the order of the lines' last values, as near to them as their room lets them.
+    """
+    lines = [line for line in axes.lines if not UNNAMED.fullmatch(str(line.get_label()))]
+    names = [textwrap.fill(str(line.get_label()), BESIDE, break_long_words=False) for line in lines]
+    rows = [name.count("\n") + 1 for name in names]
+    if sum(rows) > BESIDE_LINES or any(len(row) > LABEL // 2 for name in names for row in name.split("\n")):
+        legend_below(figure, [axes], columns, **more)
+        return
+    low, high = axes.get_ylim()
+    ends = []
+    for line in lines:
+        known = np.asarray(line.get_ydata(), dtype=np.float64)
+        known = known[np.isfinite(known)]
+        ends.append((known[-1] - low) / (high - low) if len(known) else 0.0)
+    order, free, places = np.argsort(ends, kind="stable").tolist(), 0.0, np.zeros(len(lines))
+    for index in order:  # from below, each pushed up as far as it must be; then down again what is above the plot
+        half = APART * rows[index] / 2
+        places[index] = max(ends[index], free + half)
+        free = places[index] + half
+    free = 1 + APART
+    for index in reversed(order):
+        half = APART * rows[index] / 2
+        places[index] = min(places[index], free - half)
+        free = places[index] - half
+    for line, name, place in zip(lines, names, places.tolist(), strict=True):
+        piece = Line2D([1.02, 1.1], [place, place])
+        piece.update_from(line)
+        piece.set(transform=axes.transAxes, clip_on=False)
+        axes.add_artist(piece)
+        axes.annotate(name, (1.115, place), xycoords=axes.transAxes, annotation_clip=False, va="center", fontsize=9)
 
 
 def grid_of_pictures(rows: int, columns: int, below: float = 0.0) -> tuple[Figure, list[Axes]]:
@@ -124,13 +167,17 @@ def slug(text: str) -> str:
     return text if plain == text else f"{plain}-{blake2b(text.encode(), digest_size=4).hexdigest()}"
 
 
+def _saved(figure: Figure, settings: Mapping[str, Any], **how: Any) -> bytes:
+    buffer = io.BytesIO()
+    with styled(settings):
+        figure.savefig(buffer, **how)
+    return buffer.getvalue()
+
+
 def to_svg(figure: Figure, name: str) -> str:
     """The figure as SVG, the same bytes each time, its ids unique on a page by the :func:`slug` of ``name``."""
     name = slug(name)
-    buffer = io.StringIO()
-    with styled({"svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
+    text = _saved(figure, {"svg.hashsalt": name}, format="svg", metadata={"Date": None, "Creator": None}).decode()
     text = text[text.index("<svg") :]
     text = re.sub(r' id="image[0-9a-f]+"', "", text)  # a hash of the picture: the same where it is drawn twice
     text = re.sub(r'\bid="', f'id="{name}-', text)
@@ -140,17 +187,12 @@ def to_svg(figure: Figure, name: str) -> str:
 
 def to_png(figure: Figure) -> bytes:
     """The figure as a PNG on white, for READMEs and slides."""
-    buffer = io.BytesIO()
-    with styled():
-        figure.savefig(buffer, format="png", dpi=160, facecolor="white", metadata={"Software": None})
-    return buffer.getvalue()
+    return _saved(figure, {}, format="png", dpi=160, facecolor="white", metadata={"Software": None})
 
 
 def to_file(figure: Figure, name: str, kind: str) -> bytes:
     """The figure as ``svg``, ``png``, or ``pdf`` with its fonts in it as fonts; the same bytes each time."""
     if kind != "pdf":
         return to_svg(figure, name).encode() if kind == "svg" else to_png(figure)
-    buffer = io.BytesIO()
-    with styled({"pdf.fonttype": 42}):
-        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Producer": None, "Creator": None})
-    return buffer.getvalue()
+    undated = {"CreationDate": None, "Producer": None, "Creator": None}
+    return _saved(figure, {"pdf.fonttype": 42}, format="pdf", metadata=undated)

@@ -89,7 +89,7 @@ def provenance_section(material: Material) -> Block:
         page.facts("Versions", [(name, ", ".join(version for _, version in items)) for name, items in by_package]),
         page.facts("What each number means", [(name, f"{of['meaning']} ({of['unit']})") for name, of in meanings]),
     ]
-    return page.section("provenance", "Data, settings, provenance", [text], blocks)
+    return page.section("provenance", "Data, settings, provenance", [text], blocks, folded=True)
 
 
 def _settings(about: Mapping[str, Any]) -> list[Block]:

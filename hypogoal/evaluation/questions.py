@@ -1,6 +1,9 @@
 """Which questions of the paper an evaluation answers: a new one is a file of its own and a line here."""
 
+import tomllib
 from collections.abc import Iterator
+from importlib import resources
+from operator import itemgetter
 
 from rich.console import Group
 from rich.table import Table
@@ -18,7 +21,7 @@ from hypogoal.evaluation import (
     selection,
     zero_shot,
 )
-from hypogoal.evaluation.numbers import QUANTITIES, Metrics
+from hypogoal.evaluation.numbers import Metrics
 from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
 from hypogoal.evaluation.provenance import domains_of, provenance_section
 
@@ -46,7 +49,8 @@ def agents_last() -> list[Question]:
 
 def meanings() -> dict[str, dict[str, str]]:
     """What each quantity is."""
-    quantities = dict(QUANTITIES)
+    told = resources.files("hypogoal.evaluation").joinpath("quantities.toml").read_text(encoding="utf-8")
+    quantities: dict[str, tuple[str, str]] = tomllib.loads(told)
     for question in QUESTIONS:
         quantities |= question.meanings
     return {name: {"unit": unit, "meaning": meaning} for name, (unit, meaning) in quantities.items()}
@@ -73,6 +77,7 @@ def render(material: Material, version: str) -> str:
     if metrics["quantities"].get("interval") != meanings()["interval"]:
         subtitle += OLDER
     sections = [section for question in QUESTIONS for section in question.sections(material)]
+    sections.sort(key=itemgetter("folded"))  # what is open comes first
     return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version)
 
 

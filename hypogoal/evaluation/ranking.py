@@ -133,7 +133,8 @@ def sections(material: Material) -> list[Block]:
     caption = (
         "On held-out states of layouts or rooms that no training set holds; mean over ensemble seeds ± standard error."
     )
-    return [page.section("ranking", TITLE, [text], [page.table(COLUMNS, material.metrics["ranking"], caption=caption)])]
+    blocks = [page.table(COLUMNS, material.metrics["ranking"], caption=caption)]
+    return [page.section("ranking", TITLE, [text], blocks, folded=True)]
 
 
 QUESTION = Question(
@@ -141,13 +142,4 @@ QUESTION = Question(
     numbers=numbers,
     rows=rows,
     sections=sections,
-    meanings={
-        "at_best_threshold": ("fraction", "a member's balanced accuracy at the threshold that is best for it there"),
-        "calibration_gap": ("fraction", "at_best_threshold less the balanced accuracy at the member's own threshold"),
-        "cross_fitted_ranking": (
-            "fraction",
-            "ranking of the member that is best on half of the held-out layouts or rooms, on the other half",
-        ),
-        "cross_fitted_accuracy": ("fraction", "the same of balanced accuracy at the members' own thresholds"),
-    },
 )

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,6 @@ from hypogoal.evaluation.numbers import (
     PICKED,
     Metrics,
     Rows,
-    by_groups,
     by_method,
     grouped,
     methods_lacking,
@@ -36,7 +33,7 @@ from hypogoal.evaluation.numbers import (
     ranked,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
-from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, WIDTH, legend_below, styled
+from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
 from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
 
 if TYPE_CHECKING:
@@ -46,26 +43,18 @@ if TYPE_CHECKING:
 # among the labelled ones.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
-TABLED = {"unseen": "unseen rooms", "all": "all rooms"}  # scopes of the table and of Figure 3
-FIGURE = {"balanced_accuracy": "balanced accuracy", "accuracy": "accuracy"}  # scores of the table
-SCORED = (*FIGURE, "ranking")  # of which best, mean, ... are told
-WHICH = {
-    "best": "best member",
-    "validated": "validated member",
-    "mean": "mean of members",
-    "worst": "worst member",
-}
+TABLED = ("unseen", "all")  # scopes of the tables and of Figure 3
+SCORED = ("balanced_accuracy", "accuracy", "ranking")  # of which best, mean, ... are told
+WHICH = ("best", "validated", "mean", "worst")
+SHOWN = {"best": "best member", "validated": "validated member", "mean": "mean of members"}
 SHARE = "share of states"
 SPREAD = ("mean", "standard_deviation")  # of the figures
 CELL = ("method", "groups", "sub_goal")  # what rows are over seeds of
-IN_ROOMS = {"balanced_accuracy": "bal. acc.", "accuracy": "accuracy"}
-SEEN = {0: "no", 1: "unlabelled", 2: "labelled"}
 PAPER = (
     "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
     "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
     "positive is not said, so look at the differences between methods and N rather than at the level."
 )
-STYLES = ("-", "--", "-.", ":", (0, (5, 1)))  # 5 beside 6 colours: both come again together after 30
 BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 
 
@@ -166,12 +155,6 @@ def of_rooms(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
     return [(ensemble, goal) for ensemble in ensembles for goal in ensemble["sub_goals"] if "rooms" in goal]
 
 
-def cell_of(judged: tuple[Entry, Entry]) -> tuple[str, int | None, str]:
-    """Method, N and sub-goal of one of these."""
-    ensemble, goal = judged
-    return ensemble["method"], ensemble["groups"], goal["sub_goal"]
-
-
 def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
@@ -181,7 +164,8 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
     disagreement on unlabelled and held-out states.
     """
     table = []
-    for key, judged in sorted(grouped(of_rooms(ensembles), cell_of).items(), key=lambda item: by_method(item[0])):
+    cells = grouped(of_rooms(ensembles), lambda of: (of[0]["method"], of[0]["groups"], of[1]["sub_goal"]))
+    for key, judged in sorted(cells.items(), key=lambda item: by_method(item[0])):
         cell, goals = " ".join(map(str, key)), [goal for _, goal in judged]
         scopes = [goal["rooms"]["scopes"] for goal in goals]
         entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
@@ -263,44 +247,6 @@ SUMMARY = (
     page.number("mean", "distance.mean", page.deviation, 1),
     page.number("at base: best", "distance.reached_base.mean", page.percent),
 )
-INTERVALS = (
-    METHOD,
-    N,
-    *(
-        page.number(f"{scope}: {which}", f"scores.{scope}.balanced_accuracy.{which}", page.interval, 3)
-        for scope in TABLED
-        for which in PICKED
-    ),
-)
-DIFFERENCES = (
-    METHOD,
-    N,
-    page.number("disagree, unlabelled", "disagreement_unlabelled", page.deviation, 3),
-    page.number("disagree, held-out", "disagreement_heldout", page.deviation, 3),
-    page.number("tied on validation", "tied", page.fixed, 1),
-    *(
-        # which an evaluation of before does not have
-        page.number(
-            f"ranking, {which}",
-            lambda entry, which=which: entry["scores"]["unseen"].get("ranking", {}).get(which),
-            page.deviation,
-            3,
-        )
-        for which in ("best", "mean", "worst")
-    ),
-)
-SHORT = {"balanced_accuracy": "bal. acc.", "accuracy": "acc.", "precision": "prec.", "recall": "recall"}
-MEMBERS = (
-    page.label("ensemble", "path", once=lambda entry: (entry["path"], entry["sub_goal"])),
-    page.label("member", "name"),
-    *(
-        page.number(f"{scope}: {short}", f"{scope}.{score}", page.fixed, 3)
-        for scope in TABLED
-        for score, short in SHORT.items()
-    ),
-    page.number("validation: bal. acc.", "labelled.balanced_accuracy", page.fixed, 3),
-    page.number("yes, unlabelled", "says_yes_unlabelled", page.fixed, 3),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -377,7 +323,7 @@ def _stopped(rows: Sequence[Entry]) -> str:
 
 
 def rooms_section(material: Material) -> Block:
-    """Figure 3, its tables, every room and every kind of false positive."""
+    """Figure 3 and its table; what else is known of members and rooms is in ``metrics.json``."""
     title = "Hypotheses against labelled ladders"
     if not material.metrics["rooms"]:
         lacking = ["Figure 3: it needs ensemble artefacts of data whose held-out states say which rooms training saw."]
@@ -390,12 +336,9 @@ def rooms_section(material: Material) -> Block:
         "groups, which a user could pick too."
     )
     blocks = []
-    for rows in _by_sub_goal(material):
-        blocks += [page.shown(material, figure) for figure in _drawn(material, rows)]
-        blocks += [*(_table(rows, scope) for scope in TABLED), *_over_seeds(rows)]
-        blocks += kinds_tables(material, rows) + room_tables(material, rows)
+    for figure, rows in zip(figures(material), _by_sub_goal(material), strict=True):
+        blocks += [page.shown(material, figure), _table(rows)]
     blocks += page.comparison_tables(material.comparisons("rooms"), "ensemble seed and N")
-    blocks.append(members_table(material))
     return page.section("rooms", title, [text], blocks)
 
 
@@ -403,52 +346,27 @@ def _by_sub_goal(material: Material) -> list[list[Entry]]:
     return list(grouped(material.metrics["rooms"], itemgetter("sub_goal")).values())
 
 
-def _table(rows: Sequence[Entry], scope: str) -> Block:
+def _table(rows: Sequence[Entry]) -> Block:
     return page.table(
         (
             METHOD,
             N,
-            *(
-                page.number(f"{name} {which}", f"scores.{scope}.{score}.{which}", page.deviation, 2)
-                for score, name in (("balanced_accuracy", "bal."), ("accuracy", "acc."))
-                for which in WHICH
-            ),
-            page.number("seeds", "ensembles"),
+            *UNSEEN,
+            page.number("disagree, unlabelled", "disagreement_unlabelled", page.deviation, 3),
+            page.number("disagree, held-out", "disagreement_heldout", page.deviation, 3),
         ),
         rows,
         tight=True,
-        heading=f"On held-out states of {TABLED[scope]}",
-        caption="Balanced accuracy (bal.) and accuracy (acc.) of the best, the validated, the mean and the "
-        f"worst member: mean over ensemble seeds ± standard deviation over them. {_never(rows, scope)}"
-        f"{_why_dashes(rows) if scope == 'unseen' else PAPER}",
+        caption="Balanced accuracy on held-out states of unseen rooms of the best, the validated, the mean and the "
+        "worst member; accuracy (acc.) of the best one on those of all rooms; the share of states on which two "
+        "members' verdicts differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
+        f"{_never(rows)}{_why_dashes(rows)}{PAPER}",
     )
 
 
-def _over_seeds(rows: Sequence[Entry]) -> list[Block]:
-    intervals = page.table(
-        INTERVALS,
-        rows,
-        tight=True,
-        folded="Balanced accuracy with intervals",
-        caption=page.INTERVALS.format(units="ensemble seeds"),
-    )
-    differences = page.table(
-        DIFFERENCES,
-        rows,
-        tight=True,
-        heading="How different the members are, and what they know",
-        caption="Share of states on which two members' verdicts differ, mean over pairs; mean over seeds ± standard "
-        "deviation. Tied: members with the same, highest balanced accuracy in the rooms of labelled groups, of which "
-        "the first counts as validated; where all are tied, validation chooses nothing. Ranking: share of pairs of a "
-        "positive and a negative of unseen rooms in which a member gives the positive the higher probability (area "
-        "under the ROC curve); what lies between that and balanced accuracy is where its threshold is.",
-    )
-    return [intervals, differences]
-
-
-def _never(rows: Sequence[Mapping[str, Any]], scope: str) -> str:
-    """What accuracy is worth here: that of a member that never says yes, by N."""
-    found = {entry["groups"]: entry["always_no"][scope] for entry in rows if entry["always_no"][scope] is not None}
+def _never(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What accuracy on all rooms is worth here: that of a member that never says yes, by N."""
+    found = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
     every = sorted(found.items(), key=str)
     told = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
     return f"Never saying yes has accuracy {page.listed(told)}. " if told else ""
@@ -465,37 +383,24 @@ def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def figures(material: Material) -> Iterator[Drawn]:
-    """Figure 3, and what it leaves out."""
-    for rows in _by_sub_goal(material):
-        yield from _drawn(material, rows)
-
-
-def _drawn(material: Material, rows: Sequence[Entry]) -> Iterator[Drawn]:
-    """Of one sub-goal the best member, then every way to pick one."""
-    suffix = f"-{rows[0]['sub_goal']}" if len(_by_sub_goal(material)) > 1 else ""
-    methods = {entry["method"] for entry in rows}
-    seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
-    panels = [
-        (f"{FIGURE[score]}, {TABLED[scope]}", scope, score, "best")
-        for score in ("accuracy", "balanced_accuracy")
-        for scope in ("all", "unseen")
-    ]
-    caption = (
-        "Figure 3 of the paper (top left) and what it leaves out: the best member, mean over ensemble seeds; "
-        f"{bands(rows)}: ± one standard deviation over seeds, as in the paper. Dotted: never saying yes. "
-        f"Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. {_why_dashes(rows)}{PAPER}"
-    )
-    nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
-    title, drawn = "Figure 3: the best member against labelled ladder groups", scores_over_groups(rows, panels)
-    yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
-    panels = [(name, "unseen", "balanced_accuracy", which) for which, name in WHICH.items()]
-    caption = (
-        "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; mean "
-        f"over ensemble seeds, {bands(rows)}: ± one standard deviation. {_why_dashes(rows)}"
-        "Only the second can be had without labels from the rooms it is for."
-    )
-    title, drawn = "Balanced accuracy on unseen rooms", scores_over_groups(rows, panels)
-    yield Drawn(f"unseen{suffix}", title, drawn, caption, "As above.", file=f"figure3-unseen{suffix}")
+    """Figure 3, and what it leaves out, of each sub-goal."""
+    by_sub_goal = _by_sub_goal(material)
+    for rows in by_sub_goal:
+        methods = {entry["method"] for entry in rows}
+        seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
+        panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
+        panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
+        caption = (
+            "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
+            "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
+            f"mean one; mean over ensemble seeds, {bands(rows)}: ± one standard deviation over seeds, as in the paper. "
+            f"Dotted: never saying yes. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. "
+            f"{_why_dashes(rows)}{PAPER}"
+        )
+        nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
+        title, drawn = "Figure 3: members against labelled ladder groups", scores_over_groups(rows, panels)
+        suffix = f"-{rows[0]['sub_goal']}" if len(by_sub_goal) > 1 else ""
+        yield Drawn(f"figure3{suffix}", title, drawn, caption, nothing)
 
 
 def bands(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -507,19 +412,16 @@ def bands(rows: Sequence[Mapping[str, Any]]) -> str:
     return "bands, and bars where a method has one N (those methods side by side)" if any(alone) else "bands"
 
 
-def scores_over_groups(
-    rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]], names: Sequence[str] = ()
-) -> Figure | None:
+def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, str, str]]) -> Figure | None:
     """Figure 3: scores against the number of labelled ladder groups; bands of one standard deviation.
 
     A method with one N has an error bar instead of a band, a little beside the other methods'. Dotted is what it takes
     no seeing to score.
 
     Rows are of :func:`rooms_table`; those without N are left out, and where all are there is no figure. A panel is a
-    title, and of which scope, score and member; two are in a row. Methods are coloured in the order of ``names``, by
-    default that of the rows.
+    title, and of which scope, score and member; two are in a row. Methods are coloured in the order of the rows.
     """
-    names, rows = names or list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
+    names, rows = list(grouped(rows, itemgetter("method"))), [row for row in rows if row["groups"] is not None]
     if not rows:
         return None
     with styled():
@@ -552,8 +454,6 @@ def scores_over_groups(
             place.set_xlabel("labelled ladder groups, N")
         for place in axes[:, 0]:
             place.set_ylabel("fraction")
-        for place in axes.flat[len(panels) :]:
-            place.set_visible(False)
         legend_below(figure, list(axes.flat), 3, handlelength=2.6)
         return figure
 
@@ -566,9 +466,8 @@ def _draw_method(
     deviation: NDArray[np.float64],
     names: Sequence[str],
 ) -> None:
-    index, count = names.index(name), len(names)
-    colour, line = METHOD_COLOURS[index % len(METHOD_COLOURS)], STYLES[index % len(STYLES)]
-    marker = MARKERS[index % len(MARKERS)]
+    index, count = names.index(name), len(names)  # of colours there are 6, of lines 5: both again after 30
+    colour, line, marker = (looks[index % len(looks)] for looks in (METHOD_COLOURS, STYLES, MARKERS))
     if len(groups) == 1:  # the others with one N lie at the same place
         groups = groups + (index - (count - 1) / 2) * min(BESIDE, MOST_BESIDE / count)
     axes.plot(groups, mean, marker, linestyle=line, color=colour, linewidth=1.6, markersize=5, label=name)
@@ -578,108 +477,6 @@ def _draw_method(
         axes.errorbar(groups, mean, deviation, color=colour, capsize=3, linewidth=1.2)
     else:
         axes.fill_between(groups, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
-
-
-def _at_each_n(material: Material, rows: Sequence[Entry]) -> Iterator[tuple[str, list[tuple[str, list[Entry]]]]]:
-    """For each N of the rows its name, and of every method what the rooms say of its ensembles (seeds)."""
-    judged = grouped(of_rooms(material.metrics["ensembles"]), cell_of)
-    for groups in by_groups(rows):
-        here = [entry for entry in rows if entry["groups"] == groups]
-        cells = [judged.get((entry["method"], groups, entry["sub_goal"]), []) for entry in here]
-        rooms = [[goal["rooms"] for _, goal in cell] for cell in cells]
-        yield group_name(here[0]), list(zip([entry["method"] for entry in here], rooms, strict=True))
-
-
-def kinds_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
-    """A table for each N: what share of each kind of negatives members call reached."""
-    blocks: list[Block] = []
-    for place, (groups, methods) in enumerate(_at_each_n(material, rows)):
-        found = [of for _, judged in methods for rooms in judged for of in rooms["false_positives"]]
-        lines = {(of["scope"], of["kind"]): of for of in found}
-        columns = [
-            page.label("held-out states of", lambda of: TABLED[of["scope"]], once=True),
-            page.label("negatives", "kind"),
-            page.number("states", "negatives", "{:,}".format),
-            *(
-                page.number(f"{method}: {name}", partial(_called_reached, judged, name))
-                for (method, judged), name in product(methods, ("mean", "validated"))
-            ),
-        ]
-        name = f"False positives by kind, N={groups}"
-        caption = (
-            "Share of each kind of negatives that a member calls reached, in %: mean over members and "
-            "seeds, and of the validated member, mean over seeds. Balanced accuracy hides these: a "
-            "member that says yes on the ladder ends an option half-way."
-        )
-        heading, folded = ("", name) if place else (name, "")
-        more: dict[str, Any] = {"heading": heading, "folded": folded, "caption": caption}
-        blocks += [page.table(columns, lines.values(), tight=True, **more)] if lines else []
-    return blocks
-
-
-def _called_reached(judged: Sequence[Entry], which: str, negatives: Entry) -> str:
-    """Of these negatives in every seed's rooms, in percent."""
-    alike = [
-        (of["share"], rooms["validated"]["member"])
-        for rooms in judged
-        for of in rooms["false_positives"]
-        if (of["scope"], of["kind"]) == (negatives["scope"], negatives["kind"])
-    ]
-    if which == "mean":
-        shares = [float(np.mean(share)) for share, _ in alike]
-    else:
-        shares = [share[member] for share, member in alike if member is not None]
-    return page.fixed(100 * float(np.mean(shares)) if shares else None, 1)
-
-
-def room_tables(material: Material, rows: Sequence[Entry]) -> list[Block]:
-    """A folded table for each N: accuracies in every room."""
-    blocks: list[Block] = []
-    for groups, methods in _at_each_n(material, rows):
-        lines = [room for rooms in methods[0][1][:1] for room in rooms["by_room"]]
-        columns = [
-            page.label("room", lambda line: str(line["room"])),
-            page.label("in training", lambda line: SEEN.get(line["seen"], str(line["seen"]))),
-            page.number("states", "states", "{:,}".format),
-            page.number("positives", "positives", "{:,}".format),
-            *(
-                page.number(f"{method}: {name}", partial(_in_room, judged, score), page.fixed, 2)
-                for (method, judged), (score, name) in product(methods, IN_ROOMS.items())
-            ),
-        ]
-        caption = (
-            "Mean over members and ensemble seeds, on the room's held-out states. Rooms without a "
-            "ladder base have no positives and so no balanced accuracy."
-        )
-        folded = f"Every room, N={groups}"
-        blocks += [page.table(columns, lines, tight=True, folded=folded, caption=caption)] if lines else []
-    return blocks
-
-
-def _in_room(judged: Sequence[Entry], score: str, room: Entry) -> float | None:
-    """Every seed's and member's score in a room, on average."""
-    alike = [of for rooms in judged for of in rooms["by_room"] if of["room"] == room["room"]]
-    values = [value for of in alike for value in of[score] if value is not None]
-    return float(np.mean(values)) if values else None
-
-
-def members_table(material: Material) -> Block:
-    """A folded table of every member of every ensemble."""
-    judged = of_rooms(material.metrics["ensembles"])
-    lines = []
-    for ensemble, goal in judged:
-        for index, member in enumerate(goal["members"]):
-            name = page.noted(index, {"validated": goal["rooms"]["validated"]["member"]})
-            scopes = {scope: of["members"][index] for scope, of in goal["rooms"]["scopes"].items()}
-            lines.append({**member, **scopes, "path": ensemble["path"], "sub_goal": goal["sub_goal"], "name": name})
-    return page.table(
-        MEMBERS,
-        lines,
-        tight=True,
-        folded=f"Every member of {len(judged)} ensembles",
-        caption="Validation: held-out states in rooms of labelled groups. The last column is the share of unlabelled "
-        "states that the member calls positive.",
-    )
 
 
 QUESTION = Question(

@@ -204,11 +204,11 @@ def read_layout(path: Path) -> dict[str, Any]:
     return {key: facts[key] for key in (*wanted, "random_episodes")} | told
 
 
-def read_terminations(path: Path) -> dict[int, NDArray[np.uint8]]:
-    """``terminations.h5``: option -> the last states in which its classifier ended it, uint8 (n, *obs)."""
+def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
+    """``terminations.h5``: option -> the last states in which its classifier ended it, (n, *obs)."""
     with open_hdf5(path, "the file of terminations", AGAIN) as file:
         try:
-            return {int(name): read_array(file, name, "u").astype(np.uint8) for name in members(file)}
+            return {int(name): read_array(file, name, "uf") for name in members(file)}
         except ValueError as error:  # a name that is no number
             raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
 

@@ -1,7 +1,8 @@
-"""Figures 2 and 9: held-out states worth looking at, and what in them each member goes by (Spec F2)."""
+"""Figures 2 and 9: what each member goes by in a few held-out states (Spec F2)."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,36 +13,36 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hypogoal.core.hdf5 import fixed
+from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import attribution_image, attribution_png, brightness, flat
-from hypogoal.evaluation.plots import BLUE, VERMILLION, grid_of_pictures, show_picture, styled
+from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_of_pictures, show_picture, styled
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
 
+SPREAD = "spread"  # a state as any other
 KINDS = {
     "true positive": "a true positive",
     "disagree": "members disagree",
     "false positive": "a false positive",
 }
-EXAMPLES = {
-    "disagree": "members disagree",
-    "wrong": "all members wrong",
-    "right yes": "all right",
-    "right no": "all right",
-}
-NEEDED = "an ensemble artefact with a member that calls a held-out state reached: train-ensemble"
+NEEDED = "an ensemble artefact on pictures with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
 EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
+AVERAGED = 64  # states over which attributions to features are averaged
+MOST_BARS = 15  # features
 KEY = 0.75  # inches below all pictures
 
 
 def look(work: Work, judgement: Judgement) -> None:
-    """Example states and attributions of the ensemble that is shown; from unseen rooms where positives are in them.
+    """Attributions of the ensemble that is shown; on states of unseen rooms where positives are in them.
 
-    ``examples/<sub-goal>`` and ``saliency/<sub-goal>`` are written: the states, and of the latter ``attributions``
-    float32 (n, K, h, w, C), in log-odds, to what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``.
+    ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
+    what members saw: ``seen`` uint8 (n, h, w, C), against ``baseline``. Where they are no pictures, of states spread
+    over the held-out ones, each of ``features`` having a name.
     """
     if judgement.number != work.shown:
         return
@@ -49,42 +50,25 @@ def look(work: Work, judgement: Judgement) -> None:
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
     labels, probabilities, verdicts = split.labels[among], judged.probabilities[among], judged.verdicts[among]
-    examples = pick_examples(probabilities, verdicts, labels)
-    explained = pick_to_explain(probabilities, verdicts, labels)
-    for name, picked in (("examples", examples), ("saliency", explained)):
-        picked = [(int(among[index]), kind) for index, kind in picked]
-        judgement.write_states(work.arrays.create_group(f"{name}/{sub_goal}"), picked)
+    pictures = split.observations.dtype == PICTURE
+    spread = np.linspace(0, len(among) - 1, min(len(among), AVERAGED)).astype(np.int64).tolist()
+    explained = pick_to_explain(probabilities, verdicts, labels) if pictures else [(at, SPREAD) for at in spread]
+    picked = [(int(among[index]), kind) for index, kind in explained]
+    judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
     if explained:
-        from hypogoal.evaluation.deep_lift import deep_lift, explanation
+        from hypogoal.evaluation.deep_lift import attributed, explanation
 
         ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
-        found = deep_lift(ensemble, seen, baseline)
+        found = attributed(ensemble, seen, baseline)
         group = work.arrays[f"saliency/{sub_goal}"]
         values = found.values.astype(np.float32)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
         group["seen"], group["baseline"] = seen, baseline
+        if not pictures:
+            group["features"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
         states = explanation(found, explained)
     work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
-
-
-def pick_examples(
-    probabilities: NDArray[np.float32], verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]
-) -> list[tuple[int, str]]:
-    """States on which members disagree, all err, or all are right, so that a reader sees each.
-
-    Of N states with K members' probabilities and verdicts, (index, kind), of each kind a true and a false one:
-    ``disagree`` (the widest spread of probabilities), ``wrong`` (the most sure error), ``right yes`` and ``right no``;
-    fewer where there are none.
-    """
-    correct = verdicts == labels[:, None]
-    spread = probabilities.max(1) - probabilities.min(1)
-    error = np.abs(probabilities - labels[:, None]).min(1)
-    disagree, wrong, right = ~(verdicts.all(1) | (~verdicts).all(1)), ~correct.any(1), correct.all(1)
-    picked: list[tuple[int, str]] = []
-    for mask, order, kind in ((disagree, -spread, "disagree"), (wrong, -error, "wrong")):
-        picked += _first(mask & labels, order, kind) + _first(mask & ~labels, order, kind)
-    return [*picked, *_first(right & labels, error, "right yes"), *_first(right & ~labels, error, "right no")]
 
 
 def pick_to_explain(
@@ -116,40 +100,8 @@ def _first(mask: NDArray[np.bool_], order: NDArray[np.floating], kind: str) -> l
 
 
 def sections(material: Material) -> list[Block]:
-    """States with each member's verdict, and what members look at."""
-    return [examples_section(material), saliency_section(material)]
-
-
-def examples_section(material: Material) -> Block:
-    """Held-out states with each member's verdict beside the truth."""
-    names = [name for name in material.arrays if name.startswith("examples/") and name.endswith("/observations")]
-    if not names:
-        missing = ["No example states: they need an ensemble artefact."]
-        return page.section("examples", "Example states", [], [], missing)
-    source = page.pick(material.metrics["ensembles"], "path", material.metrics["saliency"]["ensemble"])
-    text = (
-        f"Held-out states and what each member of {source['path']} (seed {source['seed']}) says of them: its "
-        "probability that the sub-goal is reached. Orange: verdicts that differ from the truth. Chosen to show "
-        "each kind, so their frequency here says nothing."
-    )
-    order = [goal["sub_goal"] for goal in source["sub_goals"]]
-    goals = sorted((name.split("/")[1] for name in names), key=order.index)
-    return page.section("examples", "Example states", [text], [_example_cards(material, goal) for goal in goals])
-
-
-def _example_cards(material: Material, sub_goal: str) -> Block:
-    arrays = material.within(f"examples/{sub_goal}")
-    cards = []
-    for index, kind in enumerate(page.texts(arrays["kinds"])):
-        truth = bool(arrays["labels"][index])
-        lines = []
-        for member, probability in enumerate(arrays["probabilities"][index]):
-            said = page.verdict(probability, bool(arrays["verdicts"][index, member]), truth)
-            lines.append({**said, "text": f"member {member}: {said['text']}"})
-        place = page.texts(arrays["places"])[index]
-        title = f"{EXAMPLES[kind]}; truth: {'yes' if truth else 'no'}{f', {place}' if place else ''}"
-        cards.append(_state_card(arrays["observations"][index], sub_goal, truth, title, lines))
-    return {"kind": "cards", "heading": sub_goal, "cards": cards}
+    """What members look at."""
+    return [saliency_section(material)]
 
 
 def _state_card(
@@ -160,32 +112,38 @@ def _state_card(
 
 
 def saliency_section(material: Material) -> Block:
-    """DeepLift of every member of one ensemble on a few held-out states."""
+    """Attributions of every member of one ensemble on a few held-out states."""
     found = material.metrics["saliency"]
     title = "What members look at"
     if found is None:
         lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
-        return page.section("saliency", title, [], [], lacking)
+        return page.section("saliency", title, [], [], lacking, folded=True)
     states = [state for goal in found["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
+    method = states[0].get("method", "DeepLift") if states else "DeepLift"  # evaluations of earlier versions do not say
     text = (
-        f"DeepLift attributions (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
+        f"Attributions by {method} (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
         f"{found['seed']}) on a few held-out states, against {found['baseline']}: what a state has in common with the "
         "usual one gets none. Orange speaks for 'reached', blue against it, each picture on its own scale; the state "
         "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
         "that goes by what will not be there elsewhere cannot transfer."
     )
+    if bars := [page.shown(material, drawn) for drawn in feature_figures(material)]:
+        text = (
+            f"Attributions by {method} of each member of {found['ensemble']} (seed {found['seed']}), against "
+            f"{found['baseline']}. A member that goes by what means something else elsewhere cannot transfer."
+        )
     check = (
         f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
         f"{max(errors, default=0.0):.0e} (log-odds)."
     )
-    blocks = [
+    blocks = bars or [
         _cards(material, goal["sub_goal"], index, state)
         for goal in found["sub_goals"]
         for index, state in enumerate(goal["states"])
     ]
     missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
-    return page.section("saliency", title, [text, check if errors else ""], blocks, missing)
+    return page.section("saliency", title, [text, check if errors else ""], blocks, missing, folded=True)
 
 
 def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block:
@@ -206,8 +164,36 @@ def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block
     return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
 
 
+def feature_figures(material: Material) -> Iterator[Drawn]:
+    """Of observations that are no pictures: which features each member goes by, a plot for each sub-goal."""
+    found = material.metrics["saliency"]
+    for goal in (goal["sub_goal"] for goal in (found["sub_goals"] if found and material.of_numbers() else ())):
+        arrays = material.within(f"saliency/{goal}")
+        caption = f"Mean absolute attribution on held-out states of {goal}, the {MOST_BARS} largest at most."
+        values = np.abs(arrays["attributions"]).mean(0)
+        plot = bars_of_features(values.reshape(len(values), -1), page.texts(arrays["features"]))
+        yield Drawn(f"features-{goal}", f"What members go by: {goal}", plot, caption, heading=goal)
+
+
+def bars_of_features(values: NDArray[np.floating], names: Sequence[str]) -> Figure:
+    """Bars side by side, those of features that members (K, numbers) go by most."""
+    order = np.argsort(-values.mean(0), kind="stable")[:MOST_BARS]
+    high, places = 0.8 / len(values), np.arange(len(order))
+    with drawing(0.7 + 0.35 * len(order), 4) as (figure, axes):
+        for member, of_member in enumerate(values):
+            colour = PALETTE[member % len(PALETTE)]
+            axes.barh(places + high * member, of_member[order], high, color=colour, label=f"member {member}")
+        axes.set_yticks(places + (0.8 - high) / 2, [names[feature] for feature in order])
+        axes.invert_yaxis()
+        axes.set_xlabel("mean absolute attribution, log-odds")
+    return figure
+
+
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 2 and 9: of each sub-goal the first state that is explained, a true positive where there is one."""
+    if material.of_numbers():
+        yield from feature_figures(material)
+        return
     found = material.metrics["saliency"]
     goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
     for goal in goals:
@@ -217,8 +203,9 @@ def figures(material: Material) -> Iterator[Drawn]:
         place = page.texts(arrays["places"])[0]
         error = max(member["completeness_error"] for member in goal["states"][0]["members"])
         about = (
-            f"DeepLift attributions of each member of {found['ensemble']} (seed {found['seed']}) on a held-out state "
-            f"of {goal['sub_goal']}{f' ({place})' if place else ''}: {KINDS[goal['states'][0]['kind']]}. Against "
+            f"Attributions by {goal['states'][0].get('method', 'DeepLift')} of each member of {found['ensemble']} "
+            f"(seed {found['seed']}) on a held-out state of {goal['sub_goal']}{f' ({place})' if place else ''}: "
+            f"{KINDS[goal['states'][0]['kind']]}. Against "
             f"{found['baseline']}. Orange speaks for 'reached', blue against it; each picture has a scale of its own. "
             f"They add up to the difference in log-odds within {error:.0e}."
         )

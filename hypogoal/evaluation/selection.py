@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import BANDITS, LEARNED, PRETRAINING, RANDOM, base_name, variants, which
@@ -113,6 +114,8 @@ def numbers(work: Work) -> dict[str, Any]:
             seeds = layout_seeds(config.get("layouts", ""), about["layout_seed"])[:LOOKED_AT]
             match, choices = match_of(ensemble, tuple(seeds)), read_choices(folder / "choices.csv")
             for option, states in read_terminations(folder / "terminations.h5").items():
+                if states.dtype != PICTURE:
+                    break
                 place = f"terminations/{about['path']}/{option}"
                 work.arrays[place] = overlay(states)
                 work.arrays[place].attrs["states"] = len(states)
@@ -196,8 +199,8 @@ MEMBERS = (
 
 
 def sections(material: Material) -> list[Block]:
-    """Where options stop and which are chosen, of a run with agents."""
-    return [terminations_section(material), choices_section(material)] if material.of_agents() else []
+    """Which options are chosen and where they stop, of a run with agents."""
+    return [choices_section(material)] if material.of_agents() else []
 
 
 def _agent(material: Material) -> Entry | None:
@@ -209,45 +212,6 @@ def _name(run: Entry) -> str:
     return f"layout seed {run['layout_seed']}, run seed {run['seed']}"
 
 
-def terminations_section(material: Material) -> Block:
-    """Figures 7 and 8: where the most and the least preferred member's options stopped."""
-    agent, title = _agent(material), "Where options stop"
-    if agent is None:
-        lacking = ["Overlaid termination states: they need a meta artefact with learned terminations: train-meta."]
-        return page.section("terminations", title, [], [], lacking)
-    text = (
-        "The states in which a member's classifier ended its option, laid over each other: what all of them share is "
-        "sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
-        "it prefers least; match is the member's balanced accuracy against the true sub-goal on that layout."
-    )
-    blocks = [
-        {
-            "kind": "pairs",
-            "heading": "" if index else _name(run),
-            "folded": _name(run).capitalize() if index else "",
-            "pairs": [_pair(material, run, goal) for goal in run["sub_goals"]],
-            "caption": f"Figures 7 and 8 of the paper, for all sub-goals: {run['path']}, {_name(run)}. The last "
-            "states, 128 at most, in which the option's own classifier said yes.",
-        }
-        for index, run in enumerate(agent["runs"])
-    ]
-    return page.section("terminations", title, [text, which(agent, material.metrics["selection"])], blocks)
-
-
-def _pair(material: Material, run: Entry, goal: Entry) -> dict[str, Any]:
-    sides = []
-    for word in MOST:
-        side = {"png": "", "nothing": "never offered", "title": f"{word} preferred: none", "note": ""}
-        if goal[word] is not None:
-            title, note, image = _side(material, run["path"], goal, word)
-            side |= {"nothing": "its classifier never ended it", "title": title, "note": note}
-            if image is not None:
-                alt = f"Overlaid termination states of {goal['sub_goal']}, member {goal[word]}"
-                side |= {"png": page.picture(image), "alt": alt}
-        sides.append(side)
-    return {"title": goal["sub_goal"], "sides": sides}
-
-
 def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, str, NDArray[np.uint8] | None]:
     """Title, note and picture of the most or the least preferred member."""
     member = goal["members"][goal[word]]
@@ -257,43 +221,45 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
 
 
 def choices_section(material: Material) -> Block:
-    """How often each member was chosen, over what a uniform choice would have."""
-    agent, title = _agent(material), "Which hypotheses are chosen"
+    """Of the first run how often each member was chosen, over what a uniform choice would have; Figures 7 and 8."""
+    agent, title = _agent(material), "Which hypotheses are chosen, and where they stop"
     if agent is None:
-        lacking = ["How often each member was chosen: it needs a meta artefact with learned terminations: train-meta."]
-        return page.section("choices", title, [], [], lacking)
+        lacking = ["Choices and termination states: they need a meta artefact with learned terminations: train-meta."]
+        return page.section("choices", title, [], [], lacking, folded=True)
+    run = agent["runs"][0]
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
-        "would have chosen it: 1 for a chooser that does not care; numbers.csv has the random chooser's too, if one "
-        "was run. Match is the balanced accuracy of the member's classifier on the layout, not how good its option is. "
-        f"What that choosing is worth is the question below, '{choosing.TITLE}', for agents whose options can be asked "
-        "anywhere."
+        "would have chosen it: 1 for a chooser that does not care. Match is the balanced accuracy of the member's "
+        "classifier against the true sub-goal on the layout, not how good its option is. numbers.csv has the same of "
+        "every run, the random chooser's too, if one was run. What that choosing is worth is asked in "
+        f"'{choosing.TITLE}', of agents whose options can be asked anywhere."
     )
-    members = [_members(run, folded=index > 0) for index, run in enumerate(agent["runs"])]
-    return page.section("choices", title, [text, which(agent, material.metrics["selection"])], members)
-
-
-def _members(run: Entry, *, folded: bool) -> Block:
-    lines = [
-        {**member, "sub_goal": goal["sub_goal"], "name": page.noted(index, {word: goal[word] for word in MOST}, most=1)}
-        for goal in run["sub_goals"]
-        for index, member in enumerate(goal["members"])
-    ]
-    name = f"Every member: {_name(run)}"
-    return page.table(
+    stops = (
+        "The states in which a member's classifier ended its option are laid over each other: what all of them share "
+        "is sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
+        "that it prefers least."
+    )
+    lines = []
+    for goal in run["sub_goals"]:
+        words = {goal[word]: f" ({word})" for word in reversed(MOST)}
+        for index, member in enumerate(goal["members"]):
+            lines.append({**member, "sub_goal": goal["sub_goal"], "name": f"{index}{words.get(index, '')}"})
+    members = page.table(
         MEMBERS,
         lines,
-        heading="" if folded else name,
-        folded=name if folded else "",
-        caption="Decisions at which the option was offered and chosen; expected under uniform choice; preference "
-        "over all and over the last quarter of training; mean steps of an execution; match on this layout.",
+        caption=f"{run['path']}, {_name(run)}: decisions at which the option was offered and chosen; expected under "
+        "uniform choice; preference over all and over the last quarter of training; mean steps of an execution; match.",
     )
+    drawn = [page.shown(material, figure) for figure in figures(material)]  # none of numbers
+    rows = [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
+    texts = [text, which(agent, material.metrics["selection"])]
+    return page.section("choices", title, texts, [members, *rows], folded=True)
 
 
 def figures(material: Material) -> Iterator[Drawn]:
     """Figures 7 and 8 and the other sub-goals', of the agent's first run."""
     agent, selection = _agent(material), material.metrics["selection"]
-    run = agent["runs"][0] if agent else {"sub_goals": []}
+    run = agent["runs"][0] if agent and not material.of_numbers() else {"sub_goals": []}
     for goal in run["sub_goals"]:
         sides = [_side(material, run["path"], goal, word) for word in MOST if goal[word] is not None]
         if not sides:

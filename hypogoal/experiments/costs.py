@@ -4,7 +4,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +94,7 @@ class Estimates:
             chosen = hyperparameters(config.agent, config.setting)
             kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
-            return Cost(seconds, *baseline_needs(prod(domain.observation_shape), kept))
+            return Cost(seconds, *baseline_needs(domain.observation_bytes, kept))
         for start in config.start.split(","):
             domain.rooms_of(start)  # which says so where there is no such start
         about: dict[str, Any] = {"sub_goals": domain.sub_goals, "members": 1}

@@ -118,7 +118,7 @@ class Experiment:
         if self.domain is None:
             closing = setting(self.table.get("evaluate", True), "evaluation and report at the end")
             fields.append(("evaluate", bool, closing))
-        return make_dataclass("RunConfig", fields, frozen=True)
+        return make_dataclass("RunConfig", fields, namespace={"__doc__": "Which cells there are."}, frozen=True)
 
 
 def read_experiment(path: Path) -> Experiment:

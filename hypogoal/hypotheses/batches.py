@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn import functional
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
+from hypogoal.dataset import Observations
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -35,9 +37,11 @@ class TrainingStates:
     """Labelled states followed by unlabelled ones, one numbering for both.
 
     Args:
-        observations, labels: (N, H, W, C) and (N,).
-        unlabelled: (M, H, W, C).
+        observations, labels: what members see of them, (N, h, w, C) or (N, *shape), and (N,).
+        unlabelled: of as many.
         network: any of the networks that will see them (their layers decide how images are stored).
+        trunk: what the networks share and see states by. Of a ``frozen`` one the features of all states are computed
+            here, once, and kept in memory; where states are changed at random, those of each batch are.
         ladders: (N,), at which ladder each labelled state is, where batches are drawn by them.
         grey: whether the shades of each state of a training batch are mapped at random.
         context: whether, before that, what is around its middle is replaced in most: :func:`.changes.other_context`.
@@ -49,9 +53,9 @@ class TrainingStates:
 
     def __init__(
         self,
-        observations: NDArray[np.uint8],
+        observations: Observations,
         labels: NDArray[np.bool_],
-        unlabelled: NDArray[np.uint8],
+        unlabelled: Observations,
         network: nn.Sequential,
         device: torch.device,
         *,
@@ -59,6 +63,8 @@ class TrainingStates:
         grey: bool = False,
         context: bool = False,
         jitter: int = 0,
+        trunk: nn.Sequential | None = None,
+        frozen: bool = False,
     ):
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
@@ -72,9 +78,16 @@ class TrainingStates:
         images = np.concatenate([observations, unlabelled])
         self._grey, self._jitter, self._context = grey, jitter, context
         tables = device.type == "cpu" and not (grey or jitter)  # of patches, which change with the images
-        self._tables = patches.make_tables(images, network) if tables else None
+        self._tables = patches.make_tables(images, trunk or network) if tables else None
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
+        self._trunk, self._features = trunk, None
+        self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # that all networks learn
+        if trunk is not None and frozen and not (grey or jitter):
+            chunks = [np.arange(at, min(at + CHUNK, len(images))) for at in range(0, len(images), CHUNK)]
+            with torch.no_grad():
+                self._features = torch.cat([_forward(trunk, self._seen([chunk]), [len(chunk)]) for chunk in chunks])
+            self._tables = self._images = None
 
     def forward(
         self,
@@ -90,21 +103,27 @@ class TrainingStates:
         a generator for each group, states are changed at random, see ``grey`` and ``jitter``: what one group draws does
         not depend on the others.
         """
-        sizes = [len(group) for group in groups]
-        if self._tables is not None:
-            batch = patches.take(self._tables, *groups)
-            features = [patches.forward(_hidden(network), batch, counted) for network in networks]
-        else:
-            if changes and (self._grey or self._jitter):
-                inputs = torch.cat([self._inputs(*group) for group in zip(groups, changes, strict=True)])
-            else:
-                inputs = self._inputs(np.concatenate(groups), None)
-            features = [_forward(_hidden(network), inputs, sizes, counted) for network in networks]
+        sizes, seen = [len(group) for group in groups], self._seen(groups, changes)
+        if self._trunk is not None and self._features is None:
+            seen = _forward(self._trunk, seen, sizes, counted)
+        features = [_forward(_hidden(network), seen, sizes, counted) for network in networks]
         logits = [network[-1](hidden) for network, hidden in zip(networks, features, strict=True)]
         return Seen(*([list(rows.split(sizes)) for rows in of_networks] for of_networks in (logits, features)))
 
+    def _seen(
+        self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator] = ()
+    ) -> Tensor | patches.Batch:
+        """Groups of states as networks see them: images, their patches, or the features that a fixed trunk makes."""
+        if self._tables is not None:
+            return patches.take(self._tables, *groups)
+        if self._features is not None:
+            return self._features[torch.from_numpy(np.concatenate(groups)).to(self.device)]
+        if changes and (self._grey or self._jitter):
+            return torch.cat([self._inputs(*group) for group in zip(groups, changes, strict=True)])
+        return self._inputs(np.concatenate(groups), None)
+
     def input_gradients(self, networks: Sequence[nn.Sequential], states: NDArray[np.int64]) -> Tensor:
-        """Gradients float (K, B, C * H * W) of each network's logit gap (yes minus no) by labelled states' pixels.
+        """Gradients float (K, B, numbers) of each network's logit gap (yes minus no) by what it sees of states.
 
         They can be differentiated. In training mode BatchNorm uses the batch's statistics and its running ones stay as
         they are, so a gradient includes what a state does to the others of its batch.
@@ -113,7 +132,9 @@ class TrainingStates:
         if self._jitter:
             inputs = inputs[:, :, self._jitter : -self._jitter, self._jitter : -self._jitter]
         inputs = inputs.requires_grad_()
-        logits = [_forward(network, inputs, [len(states)], [False]) for network in networks]
+        with sdpa_kernel(SDPBackend.MATH):  # the one way to attend whose gradient can be differentiated
+            seen = inputs if self._trunk is None else _forward(self._trunk, inputs, [len(states)], [False])
+            logits = [_forward(network, seen, [len(states)], [False]) for network in networks]
         gaps = [(each[:, 1] - each[:, 0]).sum() for each in logits]
         return torch.stack([torch.autograd.grad(gap, inputs, create_graph=True)[0].flatten(1) for gap in gaps])
 
@@ -121,16 +142,13 @@ class TrainingStates:
         self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
     ) -> None:
         """BatchNorm's running statistics of networks in training mode take states (B,) in; nothing else is computed."""
+        first = [_up_to_last_norm(network) for network in (networks if self._trunk is None else [self._trunk])]
+        if not any(len(network) for network in first):
+            return
         with torch.no_grad():
-            heads = [_up_to_last_norm(network) for network in networks]
-            if self._tables is not None:
-                batch = patches.take(self._tables, states)
-                for head in heads:
-                    patches.forward(head, batch)
-            else:
-                inputs = self._inputs(states, changes)
-                for head in heads:
-                    head(inputs)
+            seen = self._seen([states], [changes] if changes else [])
+            for network in first:
+                _forward(network, seen, [len(states)])
 
     def _inputs(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
         assert self._images is not None
@@ -217,20 +235,34 @@ def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor
     return images[torch.arange(count)[:, None, None], rows[:, :, None], columns[:, None, :]]
 
 
-def _forward(network: nn.Sequential, inputs: Tensor, sizes: Sequence[int], counted: Sequence[bool]) -> Tensor:
-    """Logits of groups of inputs, one after the other; BatchNorm sees each on its own."""
+def _forward(
+    network: nn.Sequential, seen: Tensor | patches.Batch, sizes: Sequence[int], counted: Sequence[bool] = ()
+) -> Tensor:
+    """What a network makes of groups of inputs, one after the other; BatchNorm sees each on its own."""
+    if isinstance(seen, patches.Batch):
+        return patches.forward(network, seen, counted)
     for layer in network:
-        if isinstance(layer, nn.BatchNorm2d) and layer.training:
-            groups = zip(inputs.split(list(sizes)), counted or [True] * len(sizes), strict=True)
-            inputs = torch.cat([layer(group) if counts else _normed(layer, group) for group, counts in groups])
-        else:
-            inputs = layer(inputs)
-    return inputs
+        if norms := _norms(layer):
+            groups = zip(seen.split(list(sizes)), counted or [True] * len(sizes), strict=True)
+            made = [layer(group) if counts else _uncounted(layer, norms, group) for group, counts in groups]
+        seen = torch.cat(made) if norms else layer(seen)
+    return seen
 
 
-def _normed(layer: nn.BatchNorm2d, inputs: Tensor) -> Tensor:
-    """BatchNorm by the batch's own statistics, the running ones left alone."""
-    return functional.batch_norm(inputs, None, None, layer.weight, layer.bias, training=True, eps=layer.eps)
+def _norms(layer: nn.Module) -> list[_BatchNorm]:
+    """The BatchNorms in a layer, or it, that are in training mode."""
+    return [part for part in layer.modules() if isinstance(part, _BatchNorm) and part.training]
+
+
+def _uncounted(layer: nn.Module, norms: Sequence[_BatchNorm], inputs: Tensor) -> Tensor:
+    """What a layer makes of inputs by their own statistics, the running ones left alone."""
+    tracked = [norm.track_running_stats for norm in norms]
+    for norm in norms:
+        norm.track_running_stats = False
+    made: Tensor = layer(inputs)
+    for norm, tracks in zip(norms, tracked, strict=True):
+        norm.track_running_stats = tracks
+    return made
 
 
 def _hidden(network: nn.Sequential) -> nn.Sequential:
@@ -240,5 +272,5 @@ def _hidden(network: nn.Sequential) -> nn.Sequential:
 
 def _up_to_last_norm(network: nn.Sequential) -> nn.Sequential:
     """The layers that BatchNorm's running statistics depend on."""
-    norms = [index for index, layer in enumerate(network) if isinstance(layer, nn.BatchNorm2d)]
-    return nn.Sequential(*list(network)[: norms[-1] + 1 if norms else 0])
+    last = max((index for index, layer in enumerate(network) if _norms(layer)), default=-1)
+    return nn.Sequential(*list(network)[: last + 1])

@@ -11,7 +11,7 @@ BEYOND = "own: beyond the paper"
 
 @dataclass(frozen=True)
 class EnsembleConfig:
-    """Spec C6: DoorKey's values (Table 3) are the defaults; Montezuma's are those of Table 1."""
+    """What the members are, and how they learn. Spec C6: the defaults are DoorKey's values (Table 3)."""
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(
@@ -27,9 +27,19 @@ class EnsembleConfig:
         choices=("simultaneous", "sequential"),
     )
     network: str = setting(
-        "doorkey",
-        "member network: doorkey, montezuma, montezuma-crop, tiles, or module:function",
+        "auto",
+        "member network: doorkey, montezuma, montezuma-crop, tiles, mlp, or module:function; auto: doorkey for "
+        "pictures, mlp for other observations",
         source="the paper's appendix",
+    )
+    encoder: str = setting(
+        "separate",
+        "a network but its last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
+        source="the paper; shared: DivDis (arXiv:2202.03418)",
+        choices=("separate", "shared", "frozen"),
+    )
+    hidden_width: int = setting(
+        0, "units of a layer of each member's own behind the encoder; 0: none", low=0, high=65535
     )
     steps: int = setting(
         150,
@@ -109,7 +119,7 @@ class EnsembleConfig:
 
 @dataclass(frozen=True)
 class TrainEnsembleConfig(EnsembleConfig):
-    """An ensemble's settings, and which sub-goals to train it for."""
+    """Which sub-goals to train an ensemble for."""
 
     sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
     score_every: int = setting(

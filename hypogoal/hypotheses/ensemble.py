@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -14,10 +14,11 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside
 from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
+from hypogoal.dataset import NUMBERS, Observations
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
-from hypogoal.hypotheses.networks import as_input, build_network, folded, reordered
+from hypogoal.hypotheses.networks import NETWORKS, another, as_input, build_network, folded, network_for, reordered
 from hypogoal.hypotheses.views import AgentView, FullView
 
 THRESHOLD = 0.5  # of the probability, where none was chosen
@@ -33,14 +34,19 @@ class Ensemble(nn.Module):
 
     Args:
         network: a name in ``networks.NETWORKS``.
-        observation_shape: (H, W, C) of the uint8 observations.
+        observation_shape: of the observations, (H, W, C) of pictures.
         members: K, at least 1.
         generator: draws the initial weights.
-        view: what members see of an observation; all of it where None.
+        view: what members see of an observation; all of a picture where None.
+        encoder: as of ``TrainEnsembleConfig``.
+        hidden_width: the same.
 
     Attributes:
-        members: K plain ``nn.Sequential``, float (N, C, h, w) in 0..1 (``networks.as_input``) -> logits (N,
-            2), of what ``view`` shows, uint8 (N, h, w, C).
+        members: K ``nn.Sequential``, float (N, C, h, w) in 0..1, or what else ``networks.as_input`` makes of what
+            ``view`` shows -> logits (N, 2).
+        trunk: the encoder, from the same to (N, F), that members share; None where each has its own.
+        frozen: whether it is, and so always in evaluation mode.
+        parts: the trunk, to be run once, and the K networks behind it: :meth:`networks` where there is no trunk.
         thresholds: float32 (K,), the probabilities above which the members' verdicts are yes.
 
     Raises:
@@ -56,16 +62,37 @@ class Ensemble(nn.Module):
         members: int,
         generator: torch.Generator,
         view: FullView | AgentView | None = None,
+        encoder: str = "separate",
+        hidden_width: int = 0,
     ):
         super().__init__()
-        self.network, self.observation_shape = network, tuple(int(size) for size in observation_shape)
+        self.observation_shape = tuple(int(size) for size in observation_shape)
         self.view = view or FullView(self.observation_shape)
-        self.members = nn.ModuleList(build_network(network, self.view.shape, generator) for _ in range(members))
+        self.network = network = network_for(network, self.view.dtype)
+        self.trunk: nn.Sequential | None = None
+        self.frozen = encoder == "frozen"
+        count = members if encoder == "separate" else 1
+        networks = [build_network(network, self.view.shape, generator, hidden_width) for _ in range(count)]
+        heads: list[nn.Sequential] = []
+        if encoder == "separate":
+            self.members: nn.ModuleList | tuple[nn.Sequential, ...] = nn.ModuleList(networks)
+        else:
+            layers, own = list(networks[0]), 3 if hidden_width else 1
+            self.trunk = nn.Sequential(*layers[:-own])
+            heads = [nn.Sequential(*layers[-own:])]
+            heads += (another(heads[0], generator) for _ in range(members - 1))
+            networks = [nn.Sequential(*layers[:-own], *head) for head in heads]
+            self.heads, self.members = nn.ModuleList(heads), tuple(networks)
+            if self.frozen:
+                self.trunk.requires_grad_(False)
+        self._networks = tuple(map(reordered, networks))
+        self.parts = self.trunk and reordered(self.trunk), tuple(heads) or self._networks
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
-        self._networks = tuple(reordered(member) for member in self.members if isinstance(member, nn.Sequential))
+        self.train()
 
     def __repr__(self) -> str:
-        return f"Ensemble({len(self)} members, network {self.network!r}, observations uint8 {self.observation_shape})"
+        seen = f"observations {self.view.dtype} {self.observation_shape}"
+        return f"Ensemble({len(self)} members, network {self.network!r}, {seen})"
 
     def __len__(self) -> int:
         """K, the number of members."""
@@ -74,6 +101,13 @@ class Ensemble(nn.Module):
     def networks(self) -> tuple[nn.Sequential, ...]:
         """The members in the order of layers that is fastest; weights and BatchNorm statistics are shared."""
         return self._networks
+
+    def train(self, mode: bool = True) -> Self:
+        """Training or evaluation mode; of a frozen trunk always the latter."""
+        super().train(mode)
+        if self.trunk is not None and self.frozen:
+            self.trunk.eval()
+        return self
 
     @property
     def needs_positions(self) -> bool:
@@ -90,18 +124,21 @@ class Ensemble(nn.Module):
         """The probabilities (K,) above which the members' verdicts are yes."""
         self.thresholds.copy_(torch.from_numpy(thresholds))
 
-    def see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None) -> NDArray[np.uint8]:
-        """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`."""
+    def see(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> Any:
+        """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`.
+
+        Of observations that are no pictures float32 (N, *shape), standardised.
+        """
         try:
             observations = np.asarray(observations)
         except ValueError:  # of different shapes
-            raise UserError(NO_OBSERVATIONS, "they differ in shape", "Give uint8 (N, H, W, C).") from None
+            raise UserError(NO_OBSERVATIONS, "they differ in shape", f"Give {self.view.dtype} (N, ...).") from None
+        if self.view.dtype == NUMBERS and observations.dtype == np.float64:
+            observations = observations.astype(NUMBERS)
         self._check(observations, positions)
         return np.ascontiguousarray(self.view.see(observations, positions))  # flipped pictures are no tensors
 
-    def verdicts(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.bool_]:
+    def verdicts(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
         """Whether each member says that the sub-goal is reached: bool (N, K); see :meth:`predict`.
 
         Within rounding of its threshold, some 1e-6, a member's verdict may depend on the states judged with it.
@@ -109,13 +146,11 @@ class Ensemble(nn.Module):
         says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
         return says_yes
 
-    def predict(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def predict(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Every member's probability that the sub-goal is reached.
 
         Args:
-            observations: uint8 (N, H, W, C), or a list of N (H, W, C).
+            observations: uint8 (N, H, W, C), or float32 of any shape as it was trained; or a list of N.
             positions: int64 (N, 3) of room, x, y; only where ``needs_positions``.
 
         Returns:
@@ -128,17 +163,13 @@ class Ensemble(nn.Module):
         probabilities: NDArray[np.float32] = both.softmax(dim=-1)[..., 1].numpy()
         return probabilities
 
-    def log_odds(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """How much each member's logit of yes is above that of no: float32 (N, K); see :meth:`predict`."""
         both = self.logits(observations, positions)
         gaps: NDArray[np.float32] = both[..., 1] - both[..., 0]
         return gaps
 
-    def logits(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def logits(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Every member's logits of no and of yes: float32 (N, K, 2); see :meth:`predict`."""
         observations = self.see(observations, positions)
         was_training = self.training
@@ -154,22 +185,22 @@ class Ensemble(nn.Module):
             self.train()
         return logits
 
-    def _logits(self, observations: NDArray[np.uint8]) -> Tensor:
+    def _logits(self, observations: Observations) -> Tensor:
         """(K, N, 2), each image's distinct patches computed once where that pays."""
-        networks = self.networks()
+        trunk, heads = self.parts
         device = self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
-            tables = patches.make_tables(observations, networks[0])
+            tables = patches.make_tables(observations, trunk or heads[0])
             if tables is not None:
                 batch = patches.take(tables, np.arange(len(observations)))
-                return torch.stack([patches.forward(network, batch) for network in networks])
+                return _logits(trunk, heads, batch)
         if len(observations) >= FOLD_FROM:
-            networks = tuple(folded(network) for network in networks)
+            trunk, heads = trunk and folded(trunk), tuple(folded(head) for head in heads)
         chunk = CHUNK if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
             inputs = as_input(torch.from_numpy(observations[start : start + chunk]).to(device))
-            logits.append(torch.stack([network(inputs) for network in networks]))
+            logits.append(_logits(trunk, heads, inputs))
         return torch.cat(logits, dim=1)
 
     def state(self) -> dict[str, Tensor]:
@@ -184,29 +215,42 @@ class Ensemble(nn.Module):
         members: int,
         state: Mapping[str, Tensor],
         view: FullView | AgentView | None = None,
+        **settings: Any,
     ) -> Ensemble:
         """The ensemble that ``state()`` was taken from, in evaluation mode; a ``UserError`` where it is no such state.
 
         A state without thresholds is of an ensemble from before there were any: 0.5.
         """
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
-        numbers = {name.split(".")[1] for name in state if name.startswith("members.")}
+        numbers = {name.split(".")[1] for name in state if name.startswith(("members.", "heads."))}
         if len(numbers) != members:
             what = f"the weights do not fit the ensemble (of {len(numbers)} members)"
             raise UserError(what, where, "Train it again.")
         state = {"thresholds": torch.full((members,), THRESHOLD), **state}
-        ensemble = load_fitting(lambda: cls(network, observation_shape, members, torch.Generator(), view), state, where)
-        return ensemble.eval()
 
-    def _check(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None) -> None:
-        if observations.dtype != np.uint8 or observations.shape[1:] != self.observation_shape:
+        def make() -> Ensemble:
+            return cls(network, observation_shape, members, torch.Generator(), view, **settings)
+
+        return load_fitting(make, state, where, own=network not in NETWORKS).eval()
+
+    def _check(self, observations: Observations, positions: NDArray[np.int64] | None) -> None:
+        if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
             given = f"{observations.dtype} {observations.shape}"
-            wanted = f"uint8 (N, {', '.join(map(str, self.observation_shape))})"
+            wanted = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
             raise UserError(NO_OBSERVATIONS, given, f"Give {wanted}.")
         if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
             given = "none" if positions is None else f"{positions.dtype} {positions.shape}"
             do = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
             raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", given, do)
+
+
+def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:
+    """(K, N, 2) of images or their patches: what each head makes of them, or of what the trunk makes of them once."""
+    made = [
+        patches.forward(network, images) if isinstance(images, patches.Batch) else network(images)
+        for network in (heads if trunk is None else [trunk])
+    ]
+    return torch.stack(made if trunk is None else [head(made[0]) for head in heads])
 
 
 def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:
@@ -227,13 +271,22 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
     state = load_tensors(path)
     try:
         shape = tuple(config["observation_shape"])
-        return Ensemble.from_state(config["network"], shape, config["members"], state, _view(shape, config))
+        settings = {name: config[name] for name in ("encoder", "hidden_width") if name in config}
+        view = _view(shape, config, state)
+        return Ensemble.from_state(config["network"], shape, config["members"], state, view, **settings)
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):
         raise UserError("the weights do not fit the manifest", path, "Train the ensemble again.") from None
 
 
-def _view(observation_shape: tuple[int, ...], config: Mapping[str, Any]) -> FullView | AgentView:
+def _view(
+    observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
+) -> FullView | AgentView:
     """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
+    if config.get("observation_dtype") == str(NUMBERS):
+        mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
+        if mean.shape != observation_shape:  # a manifest may ask for terabytes
+            raise ValueError(observation_shape)
+        return FullView(observation_shape, (mean, deviation))
     if config.get("view", "full") == "full":
         return FullView(observation_shape)
     localiser: Localiser = LearnedLocaliser(observation_shape)

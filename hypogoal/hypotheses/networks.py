@@ -1,8 +1,9 @@
 """Spec C5: member networks, chosen by name.
 
-Each is a plain ``nn.Sequential`` of modules used once, from float (N, C, H, W) in 0..1 to logits (N, 2),
-column 1 being "sub-goal reached". DeepLift attributes rightly only through such modules, and only with each
-ReLU before its MaxPool. :func:`reordered` gives the same function in the order that is faster to train.
+Each is an ``nn.Sequential`` from float (N, C, H, W) in 0..1, or what else :func:`as_input` gives, to logits (N, 2),
+column 1 being "sub-goal reached". Ours are of plain modules used once: DeepLift is right only of such, and with each
+ReLU before its MaxPool; the same in an order that is faster to train is :func:`reordered`. An own one may begin with
+any module, an encoder.
 
 The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors'
 public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of
@@ -11,20 +12,24 @@ public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdi
 
 from __future__ import annotations
 
+import copy
+import inspect
 from bisect import bisect_left
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
+from hypogoal.dataset import NUMBERS, PICTURE
 
 CLASSES = 2
+AUTO = "auto"  # the network that suits the observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_PIXELS = 1024  # of a side, up to which it is looked for how large an image must be
 ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
@@ -70,36 +75,58 @@ def tiles(channels: int) -> Parts:
     return [*_convolution(channels, 16, 8, 8), *_convolution(16, 16, 3, 1)], (64,)
 
 
+def mlp(channels: int) -> Parts:
+    """Two hidden dense layers, for observations of any shape."""
+    return [], (256, 256)
+
+
 NETWORKS: dict[str, Callable[[int], Parts]] = {
     "doorkey": doorkey,
     "montezuma": montezuma,
     "montezuma-crop": montezuma_crop,
     "tiles": tiles,
+    "mlp": mlp,
 }
-"""By name: number of channels -> convolutional part, and the widths of the hidden dense layers behind it."""
+"""By name: number of channels, the last axis -> convolutional part, and widths of the hidden dense layers behind it."""
 
 
-def load_network(name: str) -> Callable[[int], Parts]:
-    """The function that makes network ``name``: of :data:`NETWORKS`, an installed entry point, or ``module:function``.
+def network_for(name: str, dtype: np.dtype[Any]) -> str:
+    """``auto`` by what observations are; any other name as it is."""
+    return {PICTURE: "doorkey", NUMBERS: "mlp"}[dtype] if name == AUTO else name
+
+
+def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
+    """What makes network ``name`` of a shape: of :data:`NETWORKS`, an entry point, or ``module:function``.
 
     No such network, one that cannot be loaded, or code that the user did not allow (see :mod:`hypogoal.core.own_code`)
     is a ``UserError``.
     """
     if name in NETWORKS:
-        return NETWORKS[name]
+        return lambda shape: NETWORKS[name](shape[-1])
     built_in = {network: f"{__name__}:{function.__name__}" for network, function in NETWORKS.items()}
-    parts_of: Callable[[int], Parts] = load_own(name, "network", ENTRY_POINTS, built_in)
-    if not callable(parts_of):
-        raise UserError("this is no member network", name, "Give a function: channels -> (layers, hidden widths).")
-    return _checked(name, parts_of)
+    made_for = load_own(name, "network", ENTRY_POINTS, built_in)
+    if not callable(made_for):
+        raise UserError("this is no member network", name, "Give a function of channels or of observation_shape.")
+    return _checked(name, made_for)
 
 
-def _checked(name: str, parts_of: Callable[[int], Parts]) -> Callable[[int], Parts]:
-    """A network of someone's own, which must give what :data:`NETWORKS` do."""
+def _checked(name: str, made_for: Callable[..., Parts | nn.Module]) -> Callable[[tuple[int, ...]], Parts]:
+    """A network of someone's own: what :data:`NETWORKS` give, or an encoder, what :func:`as_input` gives -> (N, F).
 
-    def checked(channels: int) -> Parts:
-        with UsersCode(f"the network {name!r}", parts_of) as code:
-            layers, hidden = parts_of(channels)
+    It is given the observations' shape where its argument is called ``observation_shape``, else their channels.
+    """
+
+    def checked(shape: tuple[int, ...]) -> Parts:
+        with UsersCode(f"the network {name!r}", made_for) as code:
+            made = made_for(shape if "observation_shape" in inspect.signature(made_for).parameters else shape[-1])
+            if isinstance(made, nn.Module):
+                with torch.no_grad():
+                    features = made.eval()(as_input(torch.zeros(1, *shape)))
+                kind, size = getattr(features, "dtype", type(features)), tuple(getattr(features, "shape", ()))
+                if kind != torch.float32 or size[:-1] != (1,) or not all(size):
+                    code.refuse(f"is an encoder that makes {kind} {size} of a state", "Make features, float32 (N, F).")
+                return [made], ()
+            layers, hidden = made
             widths = bool(hidden) and all((as_number(width) or 0) > 0 for width in hidden)
             if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
                 code.refuse(f"gave layers {layers} and widths {hidden}", "Give (modules, hidden widths above 0).")
@@ -108,25 +135,27 @@ def _checked(name: str, parts_of: Callable[[int], Parts]) -> Callable[[int], Par
     return checked
 
 
-def build_network(name: str, observation_shape: tuple[int, ...], generator: torch.Generator) -> nn.Sequential:
-    """A member network, float (N, C, H, W) -> logits (N, 2), on the CPU, for observations of shape (H, W, C).
+def build_network(
+    name: str, observation_shape: tuple[int, ...], generator: torch.Generator, hidden_width: int = 0
+) -> nn.Sequential:
+    """A member network, what :func:`as_input` gives -> logits (N, 2), on the CPU, for observations of this shape.
 
-    ``generator`` draws the initial weights (PyTorch's default distributions). An unknown network (see
-    :func:`load_network`), BatchNorm hidden in another of its layers, or observations that are no images or too small
-    for it are a ``UserError``.
+    ``generator`` draws the initial weights (PyTorch's default distributions); before the last layer there is one of
+    ``hidden_width`` units. An unknown network (see :func:`load_network`), or observations that it does not take, images
+    too small for it, say, are a ``UserError``.
     """
     parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
-    if len(observation_shape) != 3 or min(observation_shape) < 1:
-        raise UserError("member networks need images (H, W, C)", where, "Collect image observations.")
-    height, width, channels = observation_shape
+    channels = observation_shape[-1]
+    sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
         torch.manual_seed(seed)
-        layers, hidden = parts_of(channels)
-        if any(isinstance(part, _BatchNorm) for layer in layers for part in layer.modules() if part is not layer):
-            raise UserError("BatchNorm inside another layer", name, "Make it a layer of its own.")
-        features = _features(layers, channels, height, width)
+        layers, hidden = parts_of(observation_shape)
+        features = _features(layers, *sizes)
+        if features is None and len(observation_shape) != 3:
+            do = "Give --set network=mlp, or a network of your own (--set network=module:function)."
+            raise UserError(f"the network {name!r} takes images (H, W, C)", where, do)
         if features is None:
             side = smallest_side(layers, channels)
             if side is None:
@@ -137,18 +166,28 @@ def build_network(name: str, observation_shape: tuple[int, ...], generator: torc
             what = f"the network {name!r} makes no tensor but {features!r} of images"  # type: ignore[unreachable]
             raise UserError(what, where, "Make a tensor.")
         layers.append(nn.Flatten())
-        for inputs, outputs in pairwise((features.numel(), *hidden)):
+        *widths, last = filter(None, (features.numel(), *hidden, hidden_width))
+        for inputs, outputs in pairwise((*widths, last)):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-        layers.append(nn.Linear(hidden[-1], CLASSES))
+        layers.append(nn.Linear(last, CLASSES))
     return nn.Sequential(*layers).train()
 
 
-def _features(layers: list[nn.Module], channels: int, height: int, width: int) -> Tensor | None:
-    """What a convolutional part makes of an image; None where the image is too small for it."""
+def another(head: nn.Sequential, generator: torch.Generator) -> nn.Sequential:
+    """The same dense layers with weights of their own, drawn as PyTorch does."""
+    made = copy.deepcopy(head)
+    for layer in (layer for layer in made if isinstance(layer, nn.Linear)):
+        for value in layer.parameters():
+            nn.init.uniform_(value, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
+    return made
+
+
+def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
+    """What a convolutional part makes of an input (1, *sizes); None where it does not take that, too small an image."""
     try:
         with torch.no_grad():
-            return nn.Sequential(*layers).eval()(torch.zeros(1, channels, height, width))
-    except RuntimeError:
+            return nn.Sequential(*layers).eval()(torch.zeros(1, *sizes))
+    except (RuntimeError, ValueError):
         return None
 
 
@@ -191,7 +230,7 @@ def folded(network: nn.Sequential) -> nn.Sequential:
     layers: list[nn.Module] = []
     for layer in network:
         before = layers[-1] if layers else None
-        if isinstance(layer, nn.BatchNorm2d) and isinstance(before, nn.Conv2d):
+        if type(layer) is nn.BatchNorm2d and type(before) is nn.Conv2d and layer.track_running_stats:
             layers[-1] = fuse_conv_bn_eval(before, layer)
         else:
             layers.append(layer)
@@ -199,5 +238,9 @@ def folded(network: nn.Sequential) -> nn.Sequential:
 
 
 def as_input(observations: Tensor) -> Tensor:
-    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the memory order (channels last) it came in."""
-    return observations.permute(0, 3, 1, 2).to(torch.float32).div_(255.0)
+    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the memory order (channels last) it came in.
+
+    What is no picture stays as it is, but that of (N, H, W, C) the last axis comes first, too.
+    """
+    ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
+    return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,16 +58,16 @@ def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
     """(kernel size, stride) of each convolution and pooling; None where a layer is of no supported kind."""
     windows = []
     for layer in network:
-        if isinstance(layer, (nn.Conv2d, nn.MaxPool2d)):
+        if type(layer) is nn.Conv2d or type(layer) is nn.MaxPool2d:  # no class that computes something else
             kernel, stride = _side(layer.kernel_size), _side(layer.stride)
             plain = min(kernel, stride) > 0 and _side(layer.padding) == 0 and _side(layer.dilation) == 1
             if not plain or getattr(layer, "groups", 1) != 1 or getattr(layer, "ceil_mode", False):
                 return None
             windows.append((kernel, stride))
-        elif isinstance(layer, nn.BatchNorm2d):
+        elif type(layer) is nn.BatchNorm2d:
             if not (layer.affine and layer.track_running_stats and layer.momentum):
                 return None
-        elif not isinstance(layer, (nn.ReLU, nn.Flatten, nn.Linear)):
+        elif type(layer) not in (nn.ReLU, nn.Flatten, nn.Linear):
             return None
     return windows or None
 
@@ -78,13 +79,13 @@ def _side(size: object) -> int:
     return size[0] if isinstance(size, tuple) and size[0] == size[1] else -1
 
 
-def make_tables(observations: NDArray[np.uint8], network: nn.Sequential) -> Tables | None:
+def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | None:
     """The distinct patches of images uint8 (N, H, W, C) as ``network`` looks at them.
 
     None where too few repeat to be worthwhile, or where the network has layers that tables do not know.
     """
     windows = windows_of(network)
-    if windows is None or len(observations) == 0:
+    if windows is None or len(observations) == 0 or observations.dtype != np.uint8:
         return None
     spread = np.linspace(0, len(observations) - 1, min(SAMPLE, len(observations))).astype(np.int64)
     sample = _tables(observations[spread], windows)

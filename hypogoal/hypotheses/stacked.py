@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.compute import tensor
+from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.views import FullView
@@ -25,8 +27,8 @@ class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
     The first convolution's filters stand side by side, later ones are grouped, dense layers are batched products.
-    Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Own networks with layers of other kinds
-    are not ``joined``: each ensemble predicts by itself.
+    Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Networks with layers of other kinds, or
+    an encoder that members share, are not ``joined``: each ensemble predicts by itself.
 
     The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
     ``repeats``: states are of a grid world, so what convolutions make of windows is kept, see :mod:`.windows`; where
@@ -37,10 +39,11 @@ class StackedMembers:
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
-        self._one_view = all(isinstance(ensemble.view, FullView) for ensemble in ensembles)
+        whole = [isinstance(ensemble.view, FullView) and ensemble.view.standard is None for ensemble in ensembles]
+        self._one_view = all(whole)
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
         self.count = len(networks)
-        self.joined = _can_be_joined(networks[0])
+        self.joined = ensembles[0].trunk is None and _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
         self._known: KnownWindows | None = None
         if not self.joined:
@@ -51,9 +54,7 @@ class StackedMembers:
         self._known = KnownWindows(partial(self._apply, 0, split[0]), *split[1:]) if split else None
         self._first = split[0] if split else 0  # of the layers behind the windows
 
-    def log_odds(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float32]:
+    def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
         """Of every member, float32 (N, G*K), ensemble by ensemble; as of :meth:`Ensemble.log_odds`."""
         if not self.joined:
             return np.concatenate([ensemble.log_odds(observations, positions) for ensemble in self.ensembles], axis=1)
@@ -65,14 +66,18 @@ class StackedMembers:
                 rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
         return np.concatenate(rows)
 
-    def _see(self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None) -> NDArray[np.uint8]:
-        """What the ensembles see, uint8 (N, h, w, C), or (N, h, w, G*C) where each sees with its own localiser."""
+    def _see(self, observations: Observations, positions: NDArray[np.int64] | None) -> Any:
+        """What the ensembles see, uint8 (N, h, w, C), or (N, h, w, G*C) where each sees in its own way.
+
+        Of no pictures, float32 (N, G*n, ...).
+        """
         if self._one_view:
             return self.ensembles[0].see(observations)
-        return np.concatenate([ensemble.see(observations, positions) for ensemble in self.ensembles], axis=-1)
+        seen = [ensemble.see(observations, positions) for ensemble in self.ensembles]
+        return np.concatenate(seen, axis=-1 if observations.ndim == 4 else 1)
 
-    def _logits(self, seen: NDArray[np.uint8]) -> Tensor:
-        """uint8 (N, h, w, C) -> (members, N, 2)."""
+    def _logits(self, seen: Any) -> Tensor:
+        """What :meth:`_see` gives -> (members, N, 2)."""
         x = self._known.of(seen) if self._known is not None else as_input(tensor(seen, self.device))
         return self._apply(self._first, len(self._steps), x)
 
@@ -85,7 +90,9 @@ class StackedMembers:
                 x = functional.conv2d(x, weights[0], bias, layer.stride, layer.padding, layer.dilation, groups)
                 groups = self.count
             elif isinstance(layer, nn.Flatten):
-                x = x.reshape(len(x), self.count, -1).transpose(0, 1)
+                x = x.reshape(len(x), groups, -1).transpose(0, 1)
+                if groups < self.count:  # nothing before it was a member's own
+                    x = x.repeat_interleave(self.count // groups, dim=0)
             elif isinstance(layer, nn.Linear):
                 x = torch.baddbmm(weights[1], x, weights[0])
             else:
@@ -96,12 +103,12 @@ class StackedMembers:
 def _can_be_joined(network: nn.Sequential) -> bool:
     flat = False
     for layer in network:
-        if isinstance(layer, nn.Flatten):
+        if type(layer) is nn.Flatten:
             fits, flat = (layer.start_dim, layer.end_dim) == (1, -1) and not flat, True
-        elif isinstance(layer, nn.Conv2d):
+        elif type(layer) is nn.Conv2d:
             fits = not flat and layer.groups == 1 and layer.padding_mode == "zeros"
         else:
-            fits = (isinstance(layer, nn.Linear) and flat) or isinstance(layer, WITHOUT_WEIGHTS)
+            fits = (type(layer) is nn.Linear and flat) or type(layer) in WITHOUT_WEIGHTS
         if not fits:
             return False
     return flat

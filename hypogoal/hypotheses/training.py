@@ -16,6 +16,7 @@ from torch.nn import functional
 from hypogoal.core.checkpoints import Checkpoints, State, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
+from hypogoal.dataset import Observations
 from hypogoal.diversity import Context, load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -46,9 +47,9 @@ class Report(ABC):
 
 
 def fit(
-    observations: NDArray[np.uint8],
+    observations: Observations,
     labels: NDArray[np.bool_],
-    unlabelled: NDArray[np.uint8],
+    unlabelled: Observations,
     config: EnsembleConfig,
     seed: int,
     on_step: OnStep | None = None,
@@ -64,8 +65,8 @@ def fit(
     """Eq. (1): the trained members of one sub-goal. On one CPU in one thread the same arguments give the same bytes.
 
     Args:
-        observations, labels: the labelled states (N, H, W, C), and whether the sub-goal is reached (N,).
-        unlabelled: (M, H, W, C); may be empty where nothing makes members differ.
+        observations, labels: the labelled states (N, *obs), and whether the sub-goal is reached (N,).
+        unlabelled: (M, *obs); may be empty where nothing makes members differ.
         on_step: called every ``REPORT_EVERY`` steps and at the last one (of each member, where sequential) with the
             number of steps done and with that step's ``loss``, ``labelled`` (mean over the members in training) and
             ``diversity`` (the inner sums of Eq. (1), before their weight).
@@ -89,6 +90,9 @@ def fit(
             raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
         if config.threshold in NEED_UNLABELLED:
             raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
+    if config.schedule == "sequential" and config.encoder == "shared":
+        what = "members one after the other cannot share an encoder that learns"
+        raise UserError(what, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")
     checkpoints = checkpoints or Checkpoints(None)
     saved = checkpoints.load() or {}
     view = view_of(
@@ -102,13 +106,14 @@ def fit(
         fitted=not saved,
     )
     generator = torch_generator(seed, "weights")
-    ensemble = Ensemble(config.network, observations.shape[1:], config.members, generator, view)
-    ensemble.to(device)
+    ensemble = Ensemble(
+        config.network, observations.shape[1:], config.members, generator, view, config.encoder, config.hidden_width
+    ).to(device)
     if saved:
         ensemble.load_state_dict(saved["ensemble"])
         if isinstance(on_step, Report):
             on_step.restore(saved["told"])
-    networks = ensemble.networks()
+    trunk, networks = ensemble.parts
     by_ladder = config.batch_kind == "per-ladder"
     ladders = needed(origins, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
     states = TrainingStates(
@@ -121,6 +126,8 @@ def fit(
         grey=config.augment != "none",
         context=config.augment == "grey-context",
         jitter=config.jitter,
+        trunk=trunk,
+        frozen=ensemble.frozen,
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
@@ -175,7 +182,7 @@ class _Round:
         weights = [config.class_weight_negative, config.class_weight_positive]
         self.class_weights = torch.tensor(weights, dtype=torch.float32, device=states.device)
         self.optimiser = torch.optim.Adam(
-            [weight for network in self.networks for weight in network.parameters()],
+            [*states.shared, *(weight for network in self.networks for weight in network.parameters())],
             lr=config.learning_rate,
             weight_decay=config.l2_weight,
             fused=True,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import NUMBERS, PICTURE, Observations, Standard, standard_of, standardised
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, Pixels, RamLocaliser, fit_localiser
 
@@ -18,29 +21,40 @@ CHUNK = 1024  # states at once: so many crops are gathered from whole images at 
 
 
 class FullView(nn.Module):
-    """All of an observation, as it is: the paper's view."""
+    """All of an observation: a picture as it is, the paper's view; of no picture each number by its ``standard``."""
 
     needs_positions = False
+    mean: Tensor
+    deviation: Tensor
 
-    def __init__(self, observation_shape: tuple[int, ...]):
+    def __init__(self, observation_shape: tuple[int, ...], standard: Standard | None = None):
         super().__init__()
-        self.shape = observation_shape
+        self.shape, self.dtype = observation_shape, NUMBERS if standard else PICTURE
+        for name, values in zip(("mean", "deviation"), standard or (), strict=False):
+            self.register_buffer(name, torch.from_numpy(values.copy()))
+
+    @property
+    def standard(self) -> Standard | None:
+        """Mean and deviation, (*shape), of numbers."""
+        return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if self.dtype == NUMBERS else None
 
     def see(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
-    ) -> NDArray[np.uint8]:
-        """The observations."""
+        self, observations: Observations, positions: NDArray[np.int64] | None = None, *, margin: int = 0
+    ) -> Observations:
+        """The observations (N, *shape)."""
         assert not margin, "all of it has nothing around it"
-        return observations
+        return standardised(observations, *self.standard) if self.standard else observations
 
 
 class AgentView(nn.Module):
     """A window around the agent, whom the localiser finds; what is outside the image is 0.
 
     The same window for every frame of a stack, around where the agent is in the last. Its ``shape`` is (height, width,
-    C), in pixels, of observations (H, W, C). ``needs_positions`` says whether the localiser reads positions, which no
+    C), in pixels, of pictures (H, W, C). ``needs_positions`` says whether the localiser reads positions, which no
     policy may see: an oracle.
     """
+
+    dtype, standard = PICTURE, None
 
     def __init__(self, observation_shape: tuple[int, ...], height: int, width: int, localiser: Localiser):
         super().__init__()
@@ -49,7 +63,7 @@ class AgentView(nn.Module):
         self.needs_positions = localiser.needs_positions
 
     def see(
-        self, observations: NDArray[np.uint8], positions: NDArray[np.int64] | None = None, *, margin: int = 0
+        self, observations: Any, positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> NDArray[np.uint8]:
         """Windows uint8 (N, height, width, C) of uint8 (N, H, W, C), with ``margin`` pixels more on every side.
 
@@ -103,8 +117,8 @@ def needed(origins: Origins | None, names: tuple[str, ...], why: str) -> Origins
 
 
 def view_of(
-    observations: NDArray[np.uint8],
-    unlabelled: NDArray[np.uint8],
+    observations: Any,
+    unlabelled: Any,
     config: EnsembleConfig,
     seed: int,
     origins: Origins | None,
@@ -113,8 +127,13 @@ def view_of(
     *,
     fitted: bool,
 ) -> FullView | AgentView:
-    """What the members are to see; a localiser that learns is trained here, or where not ``fitted`` to be loaded."""
+    """What the members are to see; what learns of it is trained here, or where not ``fitted`` to be loaded."""
     shape = observations.shape[1:]
+    if observations.dtype == NUMBERS:
+        for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
+            if (given := getattr(config, name)) != value:
+                raise UserError("these observations are no pictures", f"{name}={given}", f"Set {name}={value}.")
+        return FullView(shape, standard_of(shape, *([observations, unlabelled] if fitted else [])))
     if config.view == "full":
         if config.jitter:
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")

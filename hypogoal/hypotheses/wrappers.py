@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any, SupportsFloat, SupportsIndex, TypeAlias
 
 import gymnasium
-import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import as_number
-from hypogoal.domains.gymnasium_engine import as_image, stepped, with_channels
+from hypogoal.domains.gymnasium_engine import Look, look_of, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -19,13 +17,14 @@ By: TypeAlias = str | SupportsIndex
 RULES = ("any", "vote", "all", "mean")
 
 
-def require_observations(env: Env, shape: tuple[int, ...]) -> None:
-    """Refuse (``UserError``) an environment whose observations are not those that networks were trained on."""
-    space = env.observation_space
-    if space.shape is None or with_channels(space.shape) != shape or space.dtype != np.uint8:
-        given = f"{space.dtype} {space.shape}, not uint8 {shape}"
+def require_observations(env: Env, ensemble: Ensemble) -> Look:
+    """How to read an environment's observations; a ``UserError`` where they are not those that the ensemble knows."""
+    look, dtype, shape = look_of(env), ensemble.view.dtype, ensemble.observation_shape
+    if (look.shape, look.dtype) != (shape, dtype):
+        given = f"{look.dtype} {look.shape}, not {dtype} {shape}"
         do = "Use the environment they were trained on, with its wrappers."
         raise UserError("the environment's observations are not those that these members know", given, do)
+    return look
 
 
 class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -35,7 +34,7 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         asked = by if isinstance(by, str) else as_number(by)
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, ensemble=ensemble, by=asked, **arguments)
         gymnasium.Wrapper.__init__(self, env)
-        require_observations(env, ensemble.observation_shape)
+        self._look = require_observations(env, ensemble)
         if ensemble.needs_positions:
             do = "Train it with localiser=learned."
             raise UserError("the ensemble needs the agent's positions (localiser=ram)", None, do)
@@ -44,9 +43,9 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise UserError("who is to say that the sub-goal holds?", f"by={by!r}", do)
         self.ensemble, self.by = ensemble, asked
 
-    def holds(self, observation: NDArray[np.uint8]) -> bool:
-        """Whether the sub-goal holds in an observation (H, W, C), or (H, W), by the members asked."""
-        observation = as_image(self.env, observation, self.ensemble.observation_shape)
+    def holds(self, observation: Any) -> bool:
+        """Whether the sub-goal holds in an observation of the environment, by the members asked."""
+        observation = self._look.read(self.env, observation)
         if self.by == "mean":
             return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
         verdicts = self.ensemble.verdicts(observation[None])[0]

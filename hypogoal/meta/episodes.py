@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.training import ONE_LAYOUT, assemble
@@ -21,7 +22,7 @@ REPLAY = 1_000  # nothing is learned: a small one
 class Frame:
     """One state of an episode."""
 
-    observation: NDArray[np.uint8]  # (H, W, C)
+    observation: Observations  # (*obs)
     step: int  # of the episode
     option: int  # that runs in this state, or ended in it
     says_yes: bool  # its own classifier's verdict on the state
@@ -33,7 +34,7 @@ class Frame:
 class Episode:
     """T steps."""
 
-    observations: NDArray[np.uint8]  # (T + 1, *obs), the last one that of the state it ended in
+    observations: Observations  # (T + 1, *obs), the last one that of the state it ended in
     actions: NDArray[np.int64]  # (T,), primitive ones
     options: NDArray[np.int64]  # (T,), which option ran
     rewards: NDArray[np.float32]  # (T,)

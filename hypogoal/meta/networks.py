@@ -5,15 +5,17 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hypogoal.options.networks import CellEmbedding, LightNetwork
+from hypogoal.dataset import Standard
+from hypogoal.options.networks import WIDTH, CellEmbedding, LightNetwork, NumberEmbedding
 
 
 class LightMetaNetwork(LightNetwork):
-    """Cells, two dense layers, actor and critic."""
+    """Cells, or numbers where there is a ``standard`` of them, two dense layers, actor and critic."""
 
-    def __init__(self, observation_shape: tuple[int, ...], options: int, width: int = 128):
-        super().__init__(CellEmbedding(observation_shape), width)
-        self.outputs = nn.Linear(width, options + 1)
+    def __init__(self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None):
+        cells = NumberEmbedding(observation_shape, standard) if standard else CellEmbedding(observation_shape)
+        super().__init__(cells)
+        self.outputs = nn.Linear(WIDTH, options + 1)
         _quiet_start(self.outputs)
 
     def head(self, features: Tensor) -> Tensor:
@@ -27,8 +29,9 @@ class PaperMetaNetwork(nn.Module):
     The paper gives no sizes; 16, 32 and 32 channels with kernel 3 and stride 2, dense 256, are ours.
     """
 
-    def __init__(self, observation_shape: tuple[int, ...], options: int):
+    def __init__(self, observation_shape: tuple[int, ...], options: int, standard: Standard | None = None):
         super().__init__()
+        assert standard is None, "pictures only"
         height, width, depth = observation_shape
         self.features = nn.Sequential(
             nn.Conv2d(depth, 16, 3, stride=2), nn.ReLU(),
@@ -109,7 +112,7 @@ class GaussianHead(Head):
 
 
 HEADS: dict[str, Callable[[int], Head]] = {"categorical": CategoricalHead, "gaussian": GaussianHead}
-NETWORKS: dict[str, Callable[[tuple[int, ...], int], nn.Module]] = {
+NETWORKS: dict[str, Callable[[tuple[int, ...], int, Standard | None], nn.Module]] = {
     "light": LightMetaNetwork,
     "paper": PaperMetaNetwork,
 }

@@ -38,7 +38,8 @@ class MetaPolicy(Chooser):
         self.device = torch.device(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "meta-weights"))
-            self.network = NETWORKS[config.meta_network](engine.observation_shape, options).to(self.device)
+            network = NETWORKS[config.meta_network](engine.observation_shape, options, engine.standard)
+            self.network = network.to(self.device)
             self.head = HEADS[config.head](options).to(self.device)
         self.policy = nn.ModuleDict({"network": self.network, "head": self.head})
         self._flat = FlatParameters(self.policy)

@@ -17,6 +17,7 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import save_tensors
+from hypogoal.dataset import PICTURE, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
@@ -60,14 +61,18 @@ def assemble(
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = columns_of(domain, sub_goals) if oracle else []
     options = len(sub_goals) * (1 if oracle else about["members"])
-    arguments = domain.world(played_world(domain, about, config)) | start_arguments(domain, config, options, seed)
+    world = domain.world(played_world(domain, about["domain_config"], config.world))
+    arguments = world | start_arguments(domain, config, options, seed)
     if layouts:
         arguments["layouts"] = layouts
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
-    if config.cap:
-        if (shortest := engine.shortest_path()) is None:
-            raise UserError("there is no one shortest path, or nobody knows it", f"cap={config.cap:g}", "Give cap=0.")
-        engine.max_steps = math.ceil(config.cap * shortest)
+    cut(engine, config.cap)
+    if engine.observation_dtype != PICTURE:
+        for name in ("network", "meta_network"):
+            if getattr(config, name, "") == "paper":
+                raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
+        view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
+        engine.standard = view.standard if view else standard_of(engine.observation_shape)
     if ends:
         terminations = ends(engine)
     elif oracle:
@@ -132,14 +137,22 @@ def nearness(
     return near
 
 
-def played_world(domain: Domain, about: Mapping[str, Any], config: PlayConfig) -> dict[str, Any]:
-    """The domain's settings that an ensemble's states were collected with, but for what ``config.world`` changes."""
-    changed = parse_assignments(config.world)
+def cut(engine: Engine, cap: float) -> None:
+    """End episodes after ``cap`` times the layout's shortest path; 0 leaves them as long as they are."""
+    if cap:
+        if (shortest := engine.shortest_path()) is None:
+            raise UserError("nobody knows this layout's shortest path", f"cap={cap:g}", "Give cap=0.")
+        engine.max_steps = math.ceil(cap * shortest)
+
+
+def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence[str]) -> dict[str, Any]:
+    """The domain's settings that states were collected with, but for ``changes``, the setting ``world``."""
+    changed = parse_assignments(changes)
     for name in changed:
         if name not in domain.engine_settings:
             known = ", ".join(domain.engine_settings) or "none"
             raise UserError(f"{domain.name} has no such setting of its world", f"world={name}", f"It has {known}.")
-    return about["domain_config"] | domain.world(changed)
+    return {**collected, **domain.world(changed)}
 
 
 def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
@@ -265,7 +278,7 @@ def description(
         "sub_goals": about["sub_goals"],
         "members": loop.terminations.options // len(about["sub_goals"]),
         "domain": about["domain"],
-        "domain_config": played_world(domain, about, config),
+        "domain_config": played_world(domain, about["domain_config"], config.world),
         **more,
         "setting": config.network,
     }

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import as_number
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import load_domain
-from hypogoal.domains.gymnasium_engine import as_image, begun, stepped
+from hypogoal.domains.gymnasium_engine import begun, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.initiation import Narrowing
@@ -71,18 +72,18 @@ class Options:
         """For example ``open-red-door/2``."""
         return f"{self.sub_goals[option // self.members]}/{option % self.members}"
 
-    def verdicts(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def verdicts(self, observation: Observations) -> NDArray[np.bool_]:
         """Which options' sub-goals hold in one observation (*obs): bool (G*K,)."""
         return np.concatenate([ensemble.verdicts(observation[None])[0] for ensemble in self.ensembles])
 
-    def offered(self, observation: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def offered(self, observation: Observations) -> NDArray[np.bool_]:
         """Spec D6, D7: which options may start in an observation (*obs): bool (G*K,)."""
         offered: NDArray[np.bool_] = np.ones(self.count, dtype=np.bool_)
         if self.mask_reached:
             offered = offered_options(self.verdicts(observation)[None])[0]
         return offered if self.initiation is None else self.initiation(observation, offered)
 
-    def holds(self, option: int, observation: NDArray[np.uint8]) -> bool:
+    def holds(self, option: int, observation: Observations) -> bool:
         """Whether one option's own sub-goal holds in an observation (*obs)."""
         ensemble = self.ensembles[option // self.members]
         return bool(ensemble.verdicts(observation[None])[0, option % self.members])
@@ -122,15 +123,15 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gymnasium.Env[Any, Any], options: Options, gamma: float = 1.0):
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma)
         gymnasium.Wrapper.__init__(self, env)
-        self.options, self.gamma, self._shape = options, gamma, tuple(options.ensembles[0].observation_shape)
-        require_observations(env, self._shape)
+        self.options, self.gamma = options, gamma
+        self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
-        self._image: NDArray[np.uint8] | None = None
+        self._image: Observations | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """As the environment's own."""
         observation, info = begun(self.env, seed=seed, options=options)
-        self._image = as_image(self.env, observation, self._shape)
+        self._image = self._look.read(self.env, observation)
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -153,7 +154,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         info: dict[str, Any] = {}
         while not ended:
             observation, reward, terminated, truncated, info = stepped(self.env, act(image))
-            image = as_image(self.env, observation, self._shape)
+            image = self._look.read(self.env, observation)
             total += self.gamma**duration * reward
             duration += 1
             held = held + 1 if self.options.holds(option, image) else 0
@@ -163,7 +164,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         info = info | {"duration": duration, "reached": reached, "option": self.options.name(option)}
         return observation, total, terminated, truncated, info
 
-    def _current(self) -> NDArray[np.uint8]:
+    def _current(self) -> Observations:
         if self._image is None:
             raise UserError("the environment was not reset", None, "Call reset() first.")
         return self._image

@@ -19,10 +19,11 @@ from hypogoal.core.compute import tensor
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import gradient_norm
 from hypogoal.options.config import OptionConfig
-from hypogoal.options.networks import LightQNetwork, apply_to_states
+from hypogoal.options.networks import LightQNetwork, apply_to_states, standard_in
 
 NAME, PREFIX = "initiation.safetensors", "network."
 KEPT = 8_192  # last executions; options change while they learn, so older ones are forgotten
@@ -30,7 +31,7 @@ FEWEST = 100  # executions of an option before it is ever held back
 BATCH, EXECUTIONS_PER_UPDATE, LEARNING_RATE = 128, 32, 1e-3
 
 # From an observation (*obs) and what is offered in it, bool (O,), to what may start there.
-Narrowing = Callable[[NDArray[np.uint8], NDArray[np.bool_]], NDArray[np.bool_]]
+Narrowing = Callable[[Observations, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
 def _narrowed(
@@ -50,14 +51,15 @@ class Narrowed:
     """
 
     def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float):
-        make = partial(LightQNetwork, shape, options, actions=1)
-        self.network = load_fitting(make, below(PREFIX, state), NAME)
+        weights = below(PREFIX, state)
+        make = partial(LightQNetwork, shape, options, 1, standard_in(weights, shape))
+        self.network = load_fitting(make, weights, NAME)
         others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
         check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
         self.executions, self.threshold = state["executions"].numpy(), threshold
 
     @torch.no_grad()
-    def __call__(self, observation: NDArray[np.uint8], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def __call__(self, observation: Observations, offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Of what is offered in an observation (*shape), bool (O,), a part."""
         chances = self.network(torch.from_numpy(observation[None]))[:, :, 0].sigmoid().numpy()
         return _narrowed(offered[None], chances, self.executions, self.threshold)[0]
@@ -79,7 +81,7 @@ class Initiation(Resumable):
         self.rng = rng_for(seed, "initiation")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "initiation-weights"))
-            self.network = LightQNetwork(engine.observation_shape, options, actions=1).to(self.device)
+            self.network = LightQNetwork(engine.observation_shape, options, 1, engine.standard).to(self.device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=LEARNING_RATE, fused=True)
         self.states, self.option = np.zeros((2, KEPT), dtype=np.int64)
         self.reached = np.zeros(KEPT, dtype=np.bool_)

@@ -1,6 +1,7 @@
 """Q-networks of the intra-option policies (Spec D2): the paper's conv-GRU and a small one on cells."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,10 +10,13 @@ from torch import Tensor, nn
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.views import FullView
 from hypogoal.options.windows import AgentWindows
 
 CELL = 8  # pixels
+WIDTH = 128  # of dense layers
 SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
 
@@ -76,8 +80,34 @@ class PictureEmbedding(nn.Module):
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
-def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | PictureEmbedding:
-    """Cells where whole ones fill the image, else convolutions over it; a ``UserError`` where it is too small."""
+class NumberEmbedding(FullView):
+    """Observations that are no pictures: each number's deviations from a mean."""
+
+    @property
+    def features(self) -> int:
+        """How many."""
+        return self.mean.numel()
+
+    def forward(self, observations: Tensor) -> Any:
+        """float32 (N, *shape) -> float32 (N, features)."""
+        return standardised(observations, self.mean, self.deviation).flatten(1)
+
+
+def standard_in(weights: Mapping[str, Tensor], shape: tuple[int, ...]) -> Standard | None:
+    """One that a light network's weights are to replace; None where they are of one that sees pictures."""
+    return standard_of(shape) if "cells.mean" in weights else None
+
+
+Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding
+
+
+def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None) -> Embedding:
+    """Numbers where they have a ``standard``; else cells where whole ones fill the image, or convolutions over it.
+
+    Where that is too small it is a ``UserError``.
+    """
+    if standard is not None:
+        return NumberEmbedding(observation_shape, standard)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:
@@ -87,15 +117,15 @@ def embedding_for(observation_shape: tuple[int, ...]) -> CellEmbedding | Picture
 
 
 class LightNetwork(nn.Module):
-    """An embedding of images and two dense layers; where the images are made of cells, it takes tile codes as well."""
+    """An embedding of what is seen and two dense layers; where that is made of cells, it takes tile codes as well."""
 
-    def __init__(self, cells: CellEmbedding | PictureEmbedding, width: int = 128):
+    def __init__(self, cells: Embedding):
         super().__init__()
         self.cells = cells
-        self.trunk = nn.Sequential(nn.Linear(cells.features, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.trunk = nn.Sequential(nn.Linear(cells.features, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU())
 
     def forward(self, images: Tensor) -> Tensor:
-        """What :meth:`head` gives for uint8 (N, H, W, C); see also :class:`Pixels`."""
+        """What :meth:`head` gives for observations (N, *obs); see also :class:`Pixels`."""
         return self.head(self.trunk(self.cells(images)))
 
     def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
@@ -111,10 +141,12 @@ class LightNetwork(nn.Module):
 class LightQNetwork(LightNetwork):
     """One trunk and a head per member (Spec D8): values float32 (N, members, actions) of every member's policy."""
 
-    def __init__(self, observation_shape: tuple[int, ...], members: int, actions: int, width: int = 128):
-        super().__init__(embedding_for(observation_shape), width)
+    def __init__(
+        self, observation_shape: tuple[int, ...], members: int, actions: int, standard: Standard | None = None
+    ):
+        super().__init__(embedding_for(observation_shape, standard))
         self.members, self.actions = members, actions
-        self.heads = nn.Linear(width, members * actions)
+        self.heads = nn.Linear(WIDTH, members * actions)
 
     def head(self, features: Tensor) -> Tensor:
         """float32 (N, members, actions)."""

@@ -11,14 +11,15 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below, load_fitting
+from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.options.exploration import actions_of
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork
+from hypogoal.options.networks import LightQNetwork, PaperQNetwork, standard_in
 from hypogoal.options.windows import SIDE, around_agent, localiser_of
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
-Policies = Callable[[int], Callable[[NDArray[np.uint8]], int]]
+Policies = Callable[[int], Callable[[Observations], int]]
 
 
 def make_policies(
@@ -62,16 +63,17 @@ class LightPolicies:
     ):
         self.localiser = localiser
         shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
-        make = partial(LightQNetwork, shape, options, len(actions))
-        self.network = load_fitting(make, below("online.", weights), "options.safetensors")
+        weights = below("online.", weights)
+        make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape))
+        self.network = load_fitting(make, weights, "options.safetensors")
         self.actions = actions
 
-    def __call__(self, option: int) -> Callable[[NDArray[np.uint8]], int]:
+    def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
         return partial(self._act, option)
 
     @torch.no_grad()
-    def _act(self, option: int, observation: NDArray[np.uint8]) -> int:
+    def _act(self, option: int, observation: Any) -> int:
         if self.localiser:
             observation = around_agent(self.localiser, observation[None])[0]
         values = self.network(_as_batch(observation))[0, option]
@@ -92,7 +94,7 @@ class PaperPolicies:
             self._networks[option] = load_fitting(make, weights, "options.safetensors").eval()
         return self._networks[option]
 
-    def __call__(self, option: int) -> Callable[[NDArray[np.uint8]], int]:
+    def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
         return _Execution(self.network(option), self.actions)
 
@@ -109,11 +111,11 @@ class _Execution:
         self.hidden: Tensor | None = None
 
     @torch.no_grad()
-    def __call__(self, observation: NDArray[np.uint8]) -> int:
+    def __call__(self, observation: Observations) -> int:
         """The action in an observation."""
         values, self.hidden = self.network(self.network.embed(_as_batch(observation))[:, None], self.hidden)
         return int(self.actions[int(values[0, 0].argmax())])
 
 
-def _as_batch(observation: NDArray[np.uint8]) -> Tensor:
+def _as_batch(observation: Observations) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(observation[None]))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine, Step
 from hypogoal.learners.episodes import Episodes
 from hypogoal.options.choosers import Outcome
@@ -51,7 +52,7 @@ class Recorder(Resumable):
         self.choices: list[tuple[int, int, int, int, float, int, int]] = []
         self.stops: list[deque[int]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
         self.executions: list[deque[Execution]] = [deque(maxlen=EXECUTIONS_KEPT) for _ in range(options)]
-        self._pictures: list[deque[NDArray[np.uint8]]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
+        self._pictures: list[deque[Observations]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
         self._states: list[list[int]] = [[] for _ in range(engine.count)]  # that running executions came to
         self._window_start = 0
         self._window = np.zeros((options, len(CHOICE_COLUMNS) - 2))  # but for step and option

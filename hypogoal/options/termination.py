@@ -16,6 +16,7 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import AGAIN
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
@@ -34,7 +35,8 @@ class Terminations(Resumable):
 
     Args:
         classify: state ids (n,) -> log-odds float32 (n, O), or verdicts, bool (n, O).
-        classify_one: state ids (n,) and an option -> (n,), where that costs less; None, where it does not.
+        classify_one: state ids (n,) and an option -> (n, ``together``), where that costs less; None, where it does not.
+        together: how many options on end it judges at once, of which the option given is the first.
         thresholds: float32 (O,), the log-odds above which it is a yes; 0 where None, which fits verdicts, too.
     """
 
@@ -49,7 +51,9 @@ class Terminations(Resumable):
         thresholds: NDArray[np.float32] | None = None,
         environments: int = 0,
         length: int = 0,
+        together: int = 1,
     ):
+        self.together = together
         self.classify, self.options, self.classify_one = classify, options, classify_one
         self.thresholds = np.zeros(options, dtype=np.float32) if thresholds is None else thresholds
         self.environments, self.length = environments, length
@@ -77,10 +81,12 @@ class Terminations(Resumable):
         if self.classify_one is None:
             self.of(ids)
         unknown = np.isnan(self._log_odds[ids, options])
-        for option in np.unique(options[unknown]):
+        firsts = options - options % self.together
+        for first in np.unique(firsts[unknown]):
             assert self.classify_one is not None
-            fresh = np.unique(ids[unknown & (options == option)])
-            self._log_odds[fresh, option] = self.classify_one(fresh, int(option))
+            fresh = np.unique(ids[unknown & (firsts == first)])
+            judged = self.classify_one(fresh, int(first)).reshape(len(fresh), self.together)
+            self._log_odds[fresh, first : first + self.together] = judged
         return self._log_odds[ids, options]
 
     def nearness(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -229,8 +235,9 @@ def learned_terminations(
     stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
     networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
     members = len(ensembles[0])
+    shared = ensembles[0].trunk is not None  # all members cost little more than one
 
-    def seen(ids: NDArray[np.int64], needs_positions: bool) -> tuple[NDArray[np.uint8], NDArray[np.int64] | None]:
+    def seen(ids: NDArray[np.int64], needs_positions: bool) -> tuple[Observations, NDArray[np.int64] | None]:
         if needs_positions and not engine.position_names:
             what = "the ensemble needs the agent's positions (localiser=ram)"
             raise UserError(what, None, "Train it with localiser=learned.")
@@ -244,6 +251,8 @@ def learned_terminations(
 
     def classify_one(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
         ensemble = ensembles[option // members]
+        if shared:
+            return ensemble.log_odds(*seen(ids, ensemble.needs_positions))
         views = ensemble.see(*seen(ids, ensemble.needs_positions))
         with torch.inference_mode():
             logits = networks[option](as_input(tensor(views, ensemble.thresholds.device)))
@@ -258,4 +267,5 @@ def learned_terminations(
         np.concatenate([ensemble.thresholds_as_log_odds() for ensemble in ensembles]),
         engine.count,
         length,
+        members if shared else 1,
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected, States, write_dataset
+from hypogoal.dataset import Collected, Observations, States, write_dataset
 from hypogoal.domains.base import Domain, Engine
 
 VISITED = "visited.h5"
@@ -32,7 +32,7 @@ class Visited(Resumable):
         self._forgets = engine.memory is not None  # and gives every step a new id
         self._known = np.zeros(1024, dtype=np.bool_)
         self._before = np.full(engine.count, -1, dtype=np.int64)
-        self._kept: dict[int, tuple[NDArray[np.uint8], NDArray[np.int64]]] = {}
+        self._kept: dict[int, tuple[Observations, NDArray[np.int64]]] = {}
         self._worst: list[int] = []  # a heap of the hashes kept, negative: the largest first
 
     def see(
@@ -66,7 +66,7 @@ class Visited(Resumable):
         """What is kept of where states come from."""
         return (*ORIGINS, *(self.engine.position_names or ("layout_seed",)))
 
-    def _offer(self, picture: NDArray[np.uint8], origin: NDArray[np.int64]) -> None:
+    def _offer(self, picture: Observations, origin: NDArray[np.int64]) -> None:
         digest = int.from_bytes(blake2b(picture.tobytes(), digest_size=7, key=self._key).digest(), "little")
         if digest in self._kept or (len(self._kept) == self.most and digest > -self._worst[0]):
             return
@@ -78,7 +78,9 @@ class Visited(Resumable):
     def states(self) -> States:
         """The states kept, in the order of their hashes; their labels are not known."""
         kept = [self._kept[digest] for digest in sorted(self._kept)]
-        pictures = np.array([picture for picture, _ in kept], np.uint8).reshape(-1, *self.engine.observation_shape)
+        pictures = self.engine.room_for(len(kept), None)
+        for row, (picture, _) in enumerate(kept):
+            pictures[row] = picture
         columns = np.array([origin for _, origin in kept], np.int64).reshape(-1, len(self.origins)).T
         return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.origins, columns, strict=True)))
 
@@ -86,8 +88,7 @@ class Visited(Resumable):
         """``visited.h5`` into ``folder``: a data file whose states are all unlabelled; ``about`` is the ensemble's
         configuration.
         """
-        nothing = np.zeros((0, *self.engine.observation_shape), np.uint8)
-        none = States(nothing, np.zeros((0, len(domain.sub_goals)), np.bool_))
+        none = States(self.engine.room_for(0, None), np.zeros((0, len(domain.sub_goals)), np.bool_))
         collected = Collected(self.engine.observation_shape, domain.sub_goals, none, self.states(), none)
         named = {"domain": about["domain"], "config": about["domain_config"]}
         write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)

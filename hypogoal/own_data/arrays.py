@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
-from hypogoal.dataset import Dataset
-from hypogoal.own_data.parts import Parts, as_images, require_memory
+from hypogoal.dataset import NUMBERS, Dataset, Observations
+from hypogoal.own_data.parts import Parts, as_observations, require_memory
 
 NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
-NAMES = "sub_goals"
-KNOWN = (*NEEDED, *OPTIONAL, NAMES)
+NAMES = ("sub_goals", "features")
+KNOWN = (*NEEDED, *OPTIONAL, *NAMES)
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others make gigabytes of a kilobyte
 ENCRYPTED = 1  # among the flags of an entry
 DAMAGED = (
@@ -30,7 +30,7 @@ DAMAGED = (
 
 def read_arrays(path: Path) -> Parts:
     """Arrays by name, of a ``.npz`` file or a folder of ``.npy`` files: ``NEEDED``, where given ``OPTIONAL`` and
-    ``sub_goals`` (G texts).
+    ``sub_goals`` (G texts) and ``features``.
 
     Missing, damaged, of other names, larger than memory, or Python objects, which would be code: a ``UserError``.
     """
@@ -41,27 +41,27 @@ def read_arrays(path: Path) -> Parts:
         raise UserError(f"no array {missing[0]!r}", path, do)
     if ("heldout_observations" in arrays) != ("heldout_labels" in arrays):
         raise UserError("held-out states need observations and labels", path, f"Give {' and '.join(OPTIONAL)}.")
-    named: tuple[str, ...] = ()
-    if NAMES in arrays:
-        if arrays[NAMES].dtype.kind != "U":
-            raise UserError(f"{NAMES} are no texts but {arrays[NAMES].dtype}", path, "Give numpy.array of str.")
-        named = tuple(map(str, arrays[NAMES].ravel()))
-    return Parts(**{name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}, sub_goals=named)
+    for name in NAMES:
+        if name in arrays and arrays[name].dtype.kind != "U":
+            raise UserError(f"{name} are no texts but {arrays[name].dtype}", path, "Give numpy.array of str.")
+    named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
+    given: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
+    return Parts(**given, **named)
 
 
-def read_states(path: Path) -> NDArray[np.uint8]:
-    """The states (N, H, W, C) of a ``.npz`` file without labels: ``unlabelled``, or else ``observations``."""
+def read_states(path: Path) -> Observations:
+    """The states (N, *obs) of a ``.npz`` file without labels: ``unlabelled``, or else ``observations``."""
     arrays = _file(path)
     for name in ("unlabelled", "observations"):
         if name in arrays:
-            return as_images(arrays[name], f"the array {name!r}")
-    raise UserError("no array 'unlabelled' or 'observations'", path, "Give one, uint8 (N, H, W, C).")
+            return as_observations(arrays[name], f"the array {name!r}")
+    raise UserError("no array 'unlabelled' or 'observations'", path, "Give one (N, ...).")
 
 
 def write_arrays(path: Path, dataset: Dataset) -> None:
     """A data file's states as :func:`read_arrays` takes them; a ``UserError`` where its sub-goals do not share them."""
     columns: dict[str, list[NDArray[np.bool_]]] = {"labelled": [], "heldout": []}
-    first: dict[str, NDArray[np.uint8]] = {}
+    first: dict[str, Observations] = {}
     for split, labels in columns.items():
         for goal in dataset.sub_goals:
             found = getattr(dataset, split)(goal)
@@ -74,7 +74,8 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
         "unlabelled": dataset.unlabelled(),
         "heldout_observations": first["heldout"],
         "heldout_labels": np.stack(columns["heldout"], axis=1),
-        NAMES: np.array(dataset.sub_goals),
+        "sub_goals": np.array(dataset.sub_goals),
+        **({"features": np.array(dataset.features())} if dataset.observation_dtype == NUMBERS else {}),
     }
     with path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)

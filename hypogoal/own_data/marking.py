@@ -20,7 +20,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, replacing, sync
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import open_dataset
-from hypogoal.domains.gymnasium_engine import as_image, begun, make_checked, shape_of, stepped
+from hypogoal.domains.gymnasium_engine import begun, look_of, make_checked, stepped
 from hypogoal.own_data.arrays import read_states
 from hypogoal.own_data.images import image_files, read_image, size_text
 
@@ -327,6 +327,8 @@ class Played(Source):
 
     def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
         self._env = make_checked(make)
+        self._look = look_of(self._env)
+        _require_images(self._look.dtype, self._env.observation_space)
         self._names = action_names(self._env)
         self._layout = layout_seed
         self.help = (*action_help(self._names), "r: begin again, l: next layout")
@@ -337,7 +339,7 @@ class Played(Source):
         self._show(observation, 0, over=False)
 
     def _show(self, observation: Any, steps: int, *, over: bool) -> None:
-        self.state = as_image(self._env, observation, shape_of(self._env))
+        self.state = self._look.read(self._env, observation)
         self._steps, self._over = steps, over
         ended = "; the episode is over, any action begins another" if over else ""
         self.note = f"layout seed {self._layout}, step {steps}{ended}"
@@ -399,10 +401,15 @@ def action_help(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(", ".join(told[first : first + 3]) for first in range(0, len(told), 3))
 
 
-def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]] | NDArray[np.uint8]:
+def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]]:
     """The unlabelled states of a data file or of a ``.npz`` file, or the images of a folder; else a ``UserError``."""
     if path.is_dir():
         return [read_image(file) for file in image_files(path)]
-    if path.suffix == ".npz":
-        return read_states(path)
-    return open_dataset(path).unlabelled()
+    states: Any = read_states(path) if path.suffix == ".npz" else open_dataset(path).unlabelled()
+    _require_images(states.dtype, path)
+    return states
+
+
+def _require_images(dtype: np.dtype[Any], where: object) -> None:
+    if dtype != np.uint8:
+        raise UserError("observations must be images to be looked at", where, "Label states by functions: collect.")

@@ -1,6 +1,7 @@
 """Minari datasets: episodes whose states a function labels, and episodes of agents. The package is not needed."""
 
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array, size_of
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import write_observations
+from hypogoal.dataset import PICTURE, write_observations
 from hypogoal.meta.episodes import Episode
 from hypogoal.own_data.parts import Parts, require_memory
 
@@ -29,7 +30,7 @@ Label = Callable[[NDArray[Any]], bool]  # from an observation to whether the sub
 def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: int = 0) -> Parts:
     """The observations of a dataset's episodes, each episode's either labelled, unlabelled or held out, by ``seed``.
 
-    ``folder`` is the one with ``data/`` in it, ``key`` which part of observations that are dictionaries is the image.
+    ``folder`` is the one with ``data/`` in it, ``key`` which part of observations that are dictionaries is meant.
     No such dataset, another storage format, too few episodes, or a label function that fails is a ``UserError``.
     """
     if not labels:
@@ -98,13 +99,13 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
     ``name`` is its id, such as ``doorkey/options-v0``, ``actions`` how many primitive ones there are. ``infos/option``
     says which option led to a state, -1 at the start.
     """
-    shape: tuple[int, ...] = ()
+    seen: Any = None
     total = count = 0
     (folder / MAIN_FILE).parent.mkdir(parents=True)
     with create_hdf5(folder / MAIN_FILE) as file:
         for episode in episodes:
             group, steps = file.create_group(f"episode_{count}"), len(episode.actions)
-            shape = episode.observations.shape[1:]
+            seen = episode.observations
             group.attrs["id"], group.attrs["total_steps"] = count, steps
             write_observations(group, episode.observations)
             last = np.arange(steps) == steps - 1
@@ -112,9 +113,10 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
             group["terminations"], group["truncations"] = last & episode.terminated, last & (not episode.terminated)
             group["infos/option"] = np.concatenate([[-1], episode.options])
             total, count = total + steps, count + 1
+    shape, bounds = seen.shape[1:], (0, 255) if seen.dtype == PICTURE else (-math.inf, math.inf)
     spaces = {
-        "observation_space": {"type": "Box", "dtype": "uint8", "shape": list(shape)}
-        | {bound: np.full(shape, value).tolist() for bound, value in (("low", 0), ("high", 255))},
+        "observation_space": {"type": "Box", "dtype": str(seen.dtype), "shape": list(shape)}
+        | {bound: np.full(shape, value).tolist() for bound, value in zip(("low", "high"), bounds, strict=True)},
         "action_space": {"type": "Discrete", "dtype": "int64", "start": 0, "n": actions},
     }
     about = {

@@ -21,12 +21,13 @@ COPIES = 4  # of the states, all held in memory at once while they are compared 
 class Parts:
     """States as they were found, not yet looked at. Where none are held out, a share of the labelled ones is."""
 
-    observations: NDArray[Any]  # (N, H, W, C) or (N, H, W), with labels
+    observations: NDArray[Any]  # (N, H, W, C) or (N, H, W), or (N, *shape) of no pictures, with labels
     labels: NDArray[Any]  # (N,) or (N, G)
-    unlabelled: NDArray[Any]  # (M, H, W, C) or (M, H, W)
+    unlabelled: NDArray[Any]  # (M, ...) of as many
     heldout_observations: NDArray[Any] | None = None  # as the first two
     heldout_labels: NDArray[Any] | None = None
     sub_goals: tuple[str, ...] = ()  # their names, where they were found with them
+    features: tuple[str, ...] = ()  # those of the numbers, where they are no pictures
 
 
 def collected_of(
@@ -38,13 +39,19 @@ def collected_of(
     each class is, by ``seed``. What cannot be used, or a missing class, is a ``UserError``.
     """
     warned: list[str] = []
-    images = as_images(parts.observations, "the labelled observations")
+    images = as_observations(parts.observations, "the labelled observations")
+    if images.dtype == np.float32 and images.ndim == 4:
+        do = "of pictures in 0..1 give (255 * x).round().astype('uint8')"
+        warned.append(f"float32 {images.shape[1:]} are taken for numbers, not for a picture: {do}")
+    if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
+        given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
+        raise UserError("there are not as many names of features as numbers", given, "Give one for each.")
     shape = images.shape[1:]
     labels = as_labels(parts.labels, len(images), "the labels")
     goals = named(sub_goals or parts.sub_goals, labels.shape[1])
-    unlabelled = as_images(parts.unlabelled, "the unlabelled observations", shape)
+    unlabelled = as_observations(parts.unlabelled, "the unlabelled observations", images)
     if parts.heldout_observations is not None and parts.heldout_labels is not None:
-        heldout = as_images(parts.heldout_observations, "the held-out observations", shape)
+        heldout = as_observations(parts.heldout_observations, "the held-out observations", images)
         told = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
         do = "Hold out others, of other contexts."
         test = _apart(States(heldout, told), (images, unlabelled), "held-out", "to learn from", do, warned)
@@ -72,7 +79,7 @@ def collected_of(
     unknown = np.zeros((len(unlabelled), len(goals)), np.bool_)
     sets = [States(images, labels), States(unlabelled, unknown), test]
     numbered = [replace(states, origins={"row": np.arange(len(states.labels), dtype=np.int64)}) for states in sets]
-    return Collected(tuple(shape), goals, *numbered), warned
+    return Collected(tuple(shape), goals, numbered[0], numbered[1], numbered[2], parts.features), warned
 
 
 def require_memory(size: int, where: Path) -> None:
@@ -83,9 +90,7 @@ def require_memory(size: int, where: Path) -> None:
         raise UserError(what, where, "Give fewer states.")
 
 
-def _apart(
-    states: States, others: Sequence[NDArray[np.uint8]], kind: str, of: str, do: str, warned: list[str]
-) -> States:
+def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, of: str, do: str, warned: list[str]) -> States:
     """States of a ``kind`` that look like none of the others, which are ``of`` another; none left: a ``UserError``."""
     kept = leave_out(states, *others)
     count = len(states.labels)
@@ -97,29 +102,33 @@ def _apart(
     return kept
 
 
-def as_images(values: NDArray[Any], what: str, shape: tuple[int, ...] | None = None) -> NDArray[np.uint8]:
-    """Observations uint8 (N, H, W, C), of ``shape`` (H, W, C) where given; else, or of none, a ``UserError``."""
+def as_observations(values: NDArray[Any], what: str, like: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Pictures uint8 (N, H, W, C), of whole numbers (N, H, W, C) or (N, H, W); else numbers, float32 (N, *shape).
+
+    What is neither, none at all, or of another kind than those that they are to be ``like`` is a ``UserError``.
+    """
     found = f"{values.dtype} {values.shape}"
-    if values.dtype.kind == "f":
-        do = "Where 0..1, give (255 * x).round().astype('uint8')."
-        raise UserError(f"{what} are no bytes", found, do)
-    if values.dtype.kind in "iu" and values.dtype != np.uint8 and len(values):
-        low, high = int(values.min()), int(values.max())
+    if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
+        do = "Give images (N, height, width, channels), or numbers (N, ...)."
+        raise UserError(f"{what} are no observations", found, do)
+    if values.dtype.kind in "iu" and values.ndim in (3, 4):
+        low, high = (int(values.min()), int(values.max())) if len(values) else (0, 0)
         if low < 0 or high > 255:
-            raise UserError(f"{what} do not fit bytes ({low} to {high})", found, "Scale them to 0..255, uint8.")
-        values = values.astype(np.uint8)
-    if values.dtype != np.uint8:
-        raise UserError(f"{what} are no bytes", found, "Give uint8.")
-    if values.ndim == 3:
-        values = values[..., None]
-    if values.ndim != 4 or 0 in values.shape[1:]:
-        raise UserError(f"{what} are no images", found, "Give (N, height, width, channels) or (N, height, width).")
-    if channels_first(values.shape[1:]):
-        raise UserError(f"{what} have their channels first", found, "Give x.transpose(0, 2, 3, 1).")
+            do = "Scale them to 0..255, uint8; where they are no images, give float32."
+            raise UserError(f"{what} do not fit bytes ({low} to {high})", found, do)
+        values = values.astype(np.uint8, copy=False)
+        values = values[..., None] if values.ndim == 3 else values
+        if channels_first(values.shape[1:]):
+            raise UserError(f"{what} have their channels first", found, "Give x.transpose(0, 2, 3, 1).")
+    else:
+        values = values.astype(np.float32, copy=False)
+        if not np.isfinite(values).all():
+            raise UserError(f"{what} have numbers that are not finite", found, "Give finite ones.")
     if not len(values):
         raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")
-    if shape is not None and values.shape[1:] != shape:
-        raise UserError(f"{what} are of another shape than the labelled ones", f"{values.shape[1:]}, not {shape}")
+    if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
+        given = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
+        raise UserError(f"{what} are of another shape or type than the labelled ones", given)
     return np.ascontiguousarray(values)
 
 

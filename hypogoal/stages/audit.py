@@ -43,19 +43,20 @@ def audit(
 ) -> dict[str, Any]:
     """Train a policy against a classifier, beside it one against the mended one; write ``out``, return its audit.json.
 
-    The classifier is a ``member`` of an ensemble artefact, or ``module:function`` from observations uint8 (N, *obs) to
+    The classifier is a ``member`` of an ensemble artefact, or ``module:function`` from observations (N, *obs) to
     probabilities (N,). The truth is that of the domain's ``sub_goal``.
     """
     device, world = prepare(device), load_domain(domain)
     [column] = columns_of(world, [sub_goal], "Give another --sub-goal.")
     lived: dict[str, Any] = {}
-    inputs, threshold = [], config.threshold or THRESHOLD
+    inputs, threshold, standard = [], config.threshold or THRESHOLD, None
     if ":" in classifier and not Path(classifier).is_dir():
         classify = own_classifier(classifier)
     else:
         source = open_artefact(Path(classifier), "ensemble").whole()
         ensemble = read_ensemble(source.path, source.config, sub_goal).to(device)
         classify, inputs = member_of(ensemble, member), [source.path]
+        standard = ensemble.view.standard
         threshold = config.threshold or float(ensemble.thresholds[member])
         lived = source.config["domain_config"] if source.config["domain"] == domain else lived
     edges = np.array([threshold, config.mend] if config.mend else [threshold])
@@ -74,6 +75,7 @@ def audit(
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
             return np.repeat(classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
 
+        engine.standard = standard or engine.standard
         rule, length = rule_of(config.termination)
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 

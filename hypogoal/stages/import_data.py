@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError, printable
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.terminal import say
-from hypogoal.dataset import open_dataset, write_dataset
+from hypogoal.dataset import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays, write_arrays
 from hypogoal.own_data.images import read_images
@@ -38,7 +38,7 @@ def import_data(
 
     ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
     ``sub_goals`` are names in the order of the labels' columns; of a Minari dataset ``labels`` has by sub-goal
-    ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is the image.
+    ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is meant.
     ``share`` of the labelled states, by ``seed``, is held out where no held-out ones are given. ``domain`` is what they
     are of, for later stages. Errors: see ``hypogoal.own_data``.
     """
@@ -54,7 +54,7 @@ def import_data(
     else:
         parts = read_arrays(source)
     collected, warned = collected_of(parts, sub_goals, share=share, seed=seed)
-    warned += _too_small(domain, collected.observation_shape)
+    warned += _too_small(domain, collected)
     for line in warned:
         say(f"hypogoal: {line}", err=True)
     config = {"source": printable(source.name), **({"labels": dict(labels)} if labels else {})}
@@ -62,15 +62,16 @@ def import_data(
     return open_dataset(out).counts()
 
 
-def _too_small(domain: str, shape: tuple[int, ...]) -> list[str]:
+def _too_small(domain: str, states: Collected) -> list[str]:
     """What ``train-ensemble`` will say of such images, unless it is given another network."""
     from hypogoal.hypotheses.config import EnsembleConfig
-    from hypogoal.hypotheses.networks import build_network
+    from hypogoal.hypotheses.networks import build_network, network_for
 
     name = defaults_of(domain, "train-ensemble", given=True).get("network", EnsembleConfig().network)
+    name = network_for(name, states.labelled.observations.dtype)
     try:
         with own_code.vouched(name):  # by the domain
-            build_network(name, shape, torch_generator(0, "import"))
+            build_network(name, states.observation_shape, torch_generator(0, "import"))
     except UserError as error:
         return [str(error)]
     return []

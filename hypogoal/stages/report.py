@@ -5,34 +5,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
 from hypogoal.core.errors import UserError
+from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
 
 KINDS = ("svg", "pdf", "png")
+MOST_BYTES = 2_000_000  # of a film on the page
 
 
-def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = False) -> Path:
-    """Draw an evaluated run, see ``evaluation.run.read_evaluation``, with so many ``videos``: :func:`draw_videos`.
+def report(run: Path, *, videos: int | None = None, force: bool = False, resume: bool = False) -> Path:
+    """Draw an evaluated run, see ``evaluation.run.read_evaluation``, with so many ``videos``: :func:`play_films`.
 
-    Returns the page, ``run/report/index.html``. Beside it are ``figures/*.svg``, ``figures/*.png`` and
-    ``videos/*.gif``. A run that was not evaluated, a damaged evaluation, a report that exists, or videos where there is
-    no agent are a ``UserError``.
+    None: one, where the run has an agent that can be played. Returns the page, ``run/report/index.html``, which shows
+    the first of them. Beside it are ``figures/*.svg``, ``figures/*.png`` and ``videos/*.gif``. A run that was not
+    evaluated, a damaged evaluation, a report that exists, or videos where there is no agent are a ``UserError``.
     """
-    from hypogoal.evaluation.page import Material
+    from hypogoal.evaluation.page import Material, film
     from hypogoal.evaluation.plots import to_png
     from hypogoal.evaluation.questions import render
 
     out = run / "report"
     found = read_evaluation(run)
     claim(out, kind="report", force=force, resume=resume)
-    agents = agents_of(run) if videos else []
-    inputs = [found.source.path, *(agent.path for agent in agents[:videos])]
-    about: dict[str, Any] = {"kind": "report", "config": {"videos": videos}, "seed": 0, "inputs": inputs}
+    films, missing = _films(run, videos)
+    inputs = [found.source.path, *dict.fromkeys(one.agent.path for one in films)]
+    about: dict[str, Any] = {"kind": "report", "config": {"videos": len(films)}, "seed": 0, "inputs": inputs}
     with create_artefact(out, **about, force=force, resume=resume) as folder:
-        material = Material(found.metrics, found.arrays)
+        metrics = {**found.metrics, "missing": [*found.metrics["missing"], *missing]}
+        shown = [film(one.gif, one.caption) for one in films[:1] if len(one.gif) <= MOST_BYTES]
+        material = Material(metrics, found.arrays, films=shown)
         with fitting(found.source.path):
             page = render(material, versions().get("hypogoal", "unknown"))
         (folder / "index.html").write_text(page, encoding="utf-8")
@@ -40,9 +44,31 @@ def report(run: Path, *, videos: int = 0, force: bool = False, resume: bool = Fa
         for name, figure in material.figures.items():
             (folder / "figures" / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
             (folder / "figures" / f"{name}.png").write_bytes(to_png(figure))
-        if videos:
-            draw_videos(agents, run, folder / "videos", videos)
+        for one in films:
+            (folder / "videos").mkdir(exist_ok=True)
+            (folder / "videos" / one.name).write_bytes(one.gif)
     return out / "index.html"
+
+
+class Film(NamedTuple):
+    """An episode of an agent."""
+
+    agent: Artefact
+    name: str  # of its file
+    caption: str
+    gif: bytes
+
+
+def _films(run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
+    """Those that were asked for; where nobody asked, one where there can be one, and a line where it cannot be."""
+    if videos is not None:
+        return (play_films(agents_of(run), run, videos) if videos else []), []
+    try:
+        return play_films(agents_of(run), run, 1), []
+    except NoAgent:
+        return [], []
+    except UserError as error:
+        return [], [f"no film of an episode: {error}"]
 
 
 def agents_of(run: Path) -> list[Artefact]:
@@ -54,22 +80,35 @@ def agents_of(run: Path) -> list[Artefact]:
     ]
     if not found:
         needed = "Videos need a meta artefact with learned terminations: train-meta."
-        raise UserError("no agent to make videos of", run, needed)
+        raise NoAgent("no agent to make videos of", run, needed)
     return found
 
 
-def draw_videos(agents: Sequence[Artefact], run: Path, folder: Path, count: int) -> None:
-    """Spec E1: episodes of the agents in turn, played from their saved weights, one GIF each."""
+class NoAgent(UserError):
+    """A run has no agent that learned to choose among members' options."""
+
+
+def play_films(agents: Sequence[Artefact], run: Path, count: int) -> list[Film]:
+    """Spec E1: episodes of the agents in turn, played from their saved weights."""
     from hypogoal.evaluation.pictures import episode_gif
     from hypogoal.meta.episodes import agent_of, play_episode
 
-    folder.mkdir()
+    films = []
     for index in range(count):
         artefact, episode = agents[index % len(agents)], index // len(agents)
-        config, frames = artefact.config, play_episode(agent_of(artefact, seed=episode))
-        name = artefact.path.relative_to(run).as_posix().replace("/", "-")
+        loop, path = agent_of(artefact, seed=episode), artefact.path.relative_to(run).as_posix()
+        if loop.engine.observation_dtype != PICTURE:
+            raise NoAgent("videos need an agent that sees pictures", artefact.path, "Leave --videos out.")
+        config, frames = artefact.config, play_episode(loop)
         gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
-        (folder / f"{name}-episode-{episode}.gif").write_bytes(gif)
+        steps, options = frames[-1].step, sum(bool(frame.ended) for frame in frames)
+        caption = (
+            f"An episode of {path}, layout {config['layout_seed']}: {steps} steps, {options} "
+            f"option{'' if options == 1 else 's'}. Below each state: the option, by sub-goal and hypothesis; what its "
+            "classifier says; its time left."
+        )
+        films.append(Film(artefact, f"{path.replace('/', '-')}-episode-{episode}.gif", caption, gif))
+    return films
 
 
 def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = False) -> tuple[list[Path], list[str]]:

@@ -82,7 +82,7 @@ def plan(
         raise UserError(f"{experiment} has its own preset", preset, f"For another, give {name} with --preset.")
     found = EXPERIMENTS[name] if name in EXPERIMENTS else read_experiment(Path(name))
     if seeds:
-        assignments.append(f"{'seeds' if 'seeds' in found.settings else 'seed'}={seeds}")
+        assignments.insert(0, f"{'seeds' if 'seeds' in found.settings else 'seed'}={seeds}")  # before --set's own
     short = _short(out, wanted=short)
     return make_plan(found, out, assignments, preset=preset or own_preset, device=device, short=short)
 

@@ -1,7 +1,6 @@
 """Spec A7, E7: train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
-from hypogoal.dataset import open_dataset
+from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import Domain, load_domain
 from hypogoal.learners.baselines.settings import BaselineConfig, DQNSettings, hyperparameters
-from hypogoal.meta.training import write_layout
+from hypogoal.meta.training import cut, played_world, write_layout
 from hypogoal.needs import baseline_needs
 
 
@@ -45,13 +44,16 @@ def train_baseline(
     inputs = [data] if data else []
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
-    world = _world_of(data, domain, played) if data else {}
+    world = played_world(played, _world_of(data, domain, played) if data else {}, config.world)
     chosen = hyperparameters(config.agent, config.setting)
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world)
+    cut(engine, config.cap)
+    if data and engine.observation_dtype != PICTURE:
+        engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
     env = EngineEnv(engine)
-    size = math.prod(env.observation_space.shape or (1,))
+    size = env.observation_space.sample().nbytes
     replay = chosen.replay if isinstance(chosen, DQNSettings) else 0
     preflight("train-baseline", out, baseline_needs(size, replay), resume=resume, quiet=quiet)
     about = as_dict(config) | {"domain": domain, "domain_config": world}

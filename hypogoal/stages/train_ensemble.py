@@ -1,6 +1,7 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,12 @@ from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
-from hypogoal.dataset import Dataset, Split, open_dataset
+from hypogoal.dataset import Dataset, Observations, Split, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
-from hypogoal.hypotheses.networks import load_network
+from hypogoal.hypotheses.networks import load_network, network_for
 from hypogoal.hypotheses.scores import best_threshold, halves, member_scores, ranking
 from hypogoal.hypotheses.thresholds import thresholds
 from hypogoal.hypotheses.training import Report, fit
@@ -54,8 +55,9 @@ def train_ensemble(
     """
     device = prepare(device)
     load_objective(config.diversity)
-    load_network(config.network)
     dataset = open_dataset(data)
+    config = replace(config, network=network_for(config.network, dataset.observation_dtype))
+    load_network(config.network)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
         raise UserError("a sub-goal twice", ", ".join(sub_goals), "Name each once.")
@@ -65,6 +67,7 @@ def train_ensemble(
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
     out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
     about = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
+    about |= {"observation_dtype": str(dataset.observation_dtype)}
     about |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, len(sub_goals), workers)
@@ -100,13 +103,14 @@ def unlabelled_file(path: Path, dataset: Dataset) -> Path:
     for what, here, there in (
         ("the domain", found.domain, dataset.domain),
         ("observations of shape", found.observation_shape, dataset.observation_shape),
+        ("observations of type", found.observation_dtype, dataset.observation_dtype),
     ):
         if here != there:
             raise UserError(f"{what} {here}, the data have {there}", file, "Give unlabelled states that fit the data.")
     return file
 
 
-def joined_unlabelled(files: Sequence[Path]) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.int64]]]:
+def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, NDArray[np.int64]]]:
     """The unlabelled states (M, *obs) of some files one after another, and the origins that all of them have."""
     found = [(dataset.unlabelled(), dataset.unlabelled_origins()) for dataset in map(open_dataset, files)]
     names = set.intersection(*(set(origins) for _, origins in found))
@@ -115,7 +119,7 @@ def joined_unlabelled(files: Sequence[Path]) -> tuple[NDArray[np.uint8], dict[st
 
 
 def score_rows(
-    ensemble: Ensemble, split: Split, unlabelled: NDArray[np.uint8], positions: NDArray[np.int64] | None
+    ensemble: Ensemble, split: Split, unlabelled: Observations, positions: NDArray[np.int64] | None
 ) -> Iterator[dict[str, Any]]:
     """What members know of the held-out states, one row a member and scope.
 
@@ -161,7 +165,7 @@ class _Report(Report):
     def score(
         self,
         heldout: Split,
-        unlabelled: NDArray[np.uint8],
+        unlabelled: Observations,
         positions: NDArray[np.int64] | None,
         step: int,
         ensemble: Ensemble,

@@ -20,6 +20,7 @@ from hypogoal.meta.training import assemble, check_fit, description, start_argum
 from hypogoal.needs import play_needs
 
 FIXED = ("network", "termination", "policy_view", "layout_seed", "start", "option_timeout")  # as of the options
+WORLD = ("domain_config", "cap", "max_episode_steps")  # where it differs, episodes of practice are none of the agent's
 
 
 def train_meta(
@@ -57,12 +58,13 @@ def train_meta(
         loop.terminations.load(learned)
         if loop.initiation and "initiation.safetensors" in trained.manifest["files"]:
             loop.initiation.load(load_tensors(trained.path / "initiation.safetensors"))
-        recorder.episodes[:] = read_episodes(trained.path / "episodes.csv")
         recorder.start_at(trained.config.get("ended_at", trained.config["steps"]))
     spent = {"options_steps": trained.config["steps"] if trained else 0}
     if trained and "ended_at" in trained.config:
         spent["options_ended_at"] = recorder.steps
     about = description(loop, domain, source.config, config, **spent)
+    if trained and all(trained.config.get(key, 0.0) == about[key] for key in WORLD):
+        recorder.episodes[:] = read_episodes(trained.path / "episodes.csv")
     with create_artefact(
         out, kind="meta", config=about, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:

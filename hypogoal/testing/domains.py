@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hypogoal.core.config import from_values, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import GET_MORE, Collected, States, hard_to_learn, require_names
+from hypogoal.dataset import GET_MORE, NUMBERS, PICTURE, Collected, States, hard_to_learn, require_names
 from hypogoal.domains.base import Domain, Engine, Step
 from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Test, Verdict, promise, run
@@ -78,7 +78,7 @@ class _Contract:
         for warning in given:
             if not any(text in str(warning.message) for text in GYMNASIUM_SAYS_NOT):
                 warnings.warn(str(warning.message), stacklevel=2)
-        return f"{env.observation_space.shape} {env.observation_space.dtype}, {env.action_space}"
+        return f"{env.observation_space}, {env.action_space}"
 
     def make_engine(self) -> Engine:
         starts = self.domain.starts
@@ -92,7 +92,13 @@ class _Contract:
         shape = tuple(engine.observation_shape)
         text = f"observation_shape is {shape} of the engine, {tuple(self.domain.observation_shape)} of the domain"
         promise(shape == tuple(self.domain.observation_shape), text, "Make them agree.")
-        promise(len(shape) == 3, f"observation_shape is {shape}", "Networks take images (height, width, channels).")
+        dtype = engine.observation_dtype
+        text = f"observations are {dtype} of the engine, {self.domain.observation_dtype} of the domain"
+        promise(dtype == self.domain.observation_dtype and dtype in (PICTURE, NUMBERS), text, "Give uint8 or float32.")
+        given = f"observation_shape is {shape}"
+        promise(len(shape) == 3 or dtype == NUMBERS, given, "Pictures are (height, width, channels).")
+        if len(shape) == 3 and dtype == NUMBERS:
+            warnings.warn(f"{given} of float32: taken for numbers; pictures are uint8", stacklevel=2)
         _array(engine.reset(), np.int64, (COUNT,), "what reset() returns")
         _array(engine.ids, np.int64, (COUNT,), "ids")
         known = bool((engine.ids >= 0).all() and (engine.ids < engine.n_states).all())
@@ -103,11 +109,11 @@ class _Contract:
         engine = self.make_engine()
         shape = (COUNT, *engine.observation_shape)
         images = engine.images(engine.ids)
-        _array(images, np.uint8, shape, "what images() returns")
-        out = np.zeros(shape, np.uint8)
+        _array(images, engine.observation_dtype, shape, "what images() returns")
+        out = np.zeros_like(images)
         engine.images(engine.ids, out)
         promise(np.array_equal(out, images), "images(ids, out) does not fill out", "Write the images into it.")
-        return f"uint8 {tuple(engine.observation_shape)}"
+        return f"{engine.observation_dtype} {tuple(engine.observation_shape)}"
 
     def steps(self) -> str:
         engine = self.make_engine()
@@ -151,7 +157,7 @@ class _Contract:
                 rows.setdefault(image.tobytes(), set()).add(label.tobytes())
         torn = sum(len(labels) > 1 for labels in rows.values())
         if torn:
-            text = f"{torn} of {len(rows)} pictures were met with different labels: no classifier can tell those apart"
+            text = f"{torn} of {len(rows)} observations came with different labels: no classifier can tell those apart"
             warnings.warn(text, stacklevel=2)
         counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, met, strict=True))
         return f"held in random play, of {STEPS * COUNT} states: {counts}"
@@ -191,7 +197,8 @@ class _Contract:
         for name, states in _sets(self.collected):
             count = len(states.observations)
             promise(count > 0, f"there are no {name} states", "Collect some: other seeds, or more steps.")
-            _array(states.observations, np.uint8, (count, *self.domain.observation_shape), f"{name} observations")
+            kind, shape = self.domain.observation_dtype, self.domain.observation_shape
+            _array(states.observations, kind, (count, *shape), f"{name} observations")
             _array(states.labels, np.bool_, (count, goals), f"{name} labels")
             for origin, values in states.origins.items():
                 fits = values.shape == (count,) and values.dtype.kind in "iu"
@@ -228,11 +235,12 @@ class _Contract:
 
     def network(self) -> str:
         from hypogoal.hypotheses.config import EnsembleConfig
-        from hypogoal.hypotheses.networks import build_network
+        from hypogoal.hypotheses.networks import build_network, network_for
 
         name = self.domain.defaults.get("train-ensemble", {}).get("network", EnsembleConfig().network)
+        name = network_for(name, self.domain.observation_dtype)
         build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"))
-        return f"member network {name!r} takes the images"
+        return f"member network {name!r} takes the observations"
 
     def actions(self, engine: Engine) -> Iterator[NDArray[np.int64]]:
         """The same random actions (E,) at every call."""

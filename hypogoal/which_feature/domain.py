@@ -136,7 +136,8 @@ class RoomsDomain(Domain):
         progress.advance()
         parts = [{"layout_seed": np.arange(len(one.factors)) % HELDOUT} for one in sets]
         told = [States(one.observations, one.factors[:, [column]], of) for one, of in zip(sets, parts, strict=True)]
-        return Collected(self.observation_shape, SUB_GOALS, *told)
+        labelled, unlabelled, heldout = told
+        return Collected(self.observation_shape, SUB_GOALS, labelled, unlabelled, heldout)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
         settings = {name: arguments.get(name, getattr(RoomsConfig(), name)) for name in self.engine_settings}

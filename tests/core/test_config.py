@@ -69,7 +69,7 @@ def test_a_domains_defaults_stand_between_the_presets_and_the_general_ones(tmp_p
     assert (config.steps, config.rate, config.kind) == (20, 3.0, "a")
     with pytest.raises(UserError, match="no setting: rates"):
         resolve(Example, stage="example", defaults={"rates": 3.0})
-    assert {row["name"]: row["default"] for row in describe(Example, {"steps": 5})}["steps"] == 5
+    assert {row["name"]: row["default"] for row in describe(Example, ({"steps": 5}, "its own"))}["steps"] == 5
 
 
 def test_texts_become_values() -> None:

@@ -150,7 +150,8 @@ def test_a_policy_collects() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("FLOATS", "observations must be images"),
+        ("WORDY", "observations must be images, uint8 .* or numbers"),
+        ("MIXED", "observations mix pictures with others: image, cell. Wrap it in .*FilterObservation"),
         ("STEERED", "actions must be Discrete"),
         ("LYING", "another observation than its space says"),
         ("NEVER", "on-the-moon never holds"),
@@ -282,3 +283,18 @@ def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: py
 def test_channels_first_are_known_by_their_shape(shape: tuple[int, ...], first: bool) -> None:
     """Spec B6: of any number of channels, stacks of colour frames too, and never an image that is only low."""
     assert channels_first(shape) == first
+
+
+def test_pictures_are_resized() -> None:
+    """Spec B6: for all that is made of a domain; areas are averaged, and a dictionary's picture is taken out of it."""
+    engine = corridor_env.DOMAIN.make_engine(0, 1, 30)
+    [full] = engine.images(engine.ids)
+    for env in (CorridorEnv, corridor_env.Framed, corridor_env.Grey):
+        seen = full[..., : 1 if env is corridor_env.Grey else 3]
+        for side, wanted in ((24, seen.reshape(24, 2, 24, 2, -1).mean((1, 3))), (96, seen.repeat(2, 0).repeat(2, 1))):
+            domain = GymnasiumDomain(env, SUB_GOALS, resize=side)
+            assert domain.observation_shape == domain.make_env().observation_space.shape == (side, *wanted.shape[1:])
+            engine = domain.make_engine(0, 1, 30)
+            assert np.abs(engine.images(engine.ids)[0] - wanted).max() <= 0.5
+    with pytest.raises(UserError, match=r"only pictures can be resized: .*place.* Leave out resize\."):
+        GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, resize=84).make_env()

@@ -5,7 +5,6 @@ import pytest
 
 from hypogoal.evaluation.hypotheses import sub_goal_metrics
 from hypogoal.evaluation.pictures import overlay
-from hypogoal.evaluation.saliency import pick_examples
 from hypogoal.evaluation.selection import preference
 from hypogoal.hypotheses.scores import (
     best_mean_worst,
@@ -106,15 +105,6 @@ def test_the_most_and_the_least_preferred_member():
     assert most_and_least(np.array([1.0, 2.0])) == (1, 0)
     assert most_and_least(np.array([np.nan, 3.0])) == (1, 1)
     assert most_and_least(np.array([np.nan])) == (None, None)
-
-
-def test_examples_show_every_kind():
-    """Spec F7: disagreement, error and agreement, each with the state that shows it best."""
-    probabilities = np.array([[0.9, 0.1], [0.6, 0.4], [0.8, 0.9], [0.99, 0.97], [0.1, 0.2], [0.45, 0.7]], np.float32)
-    labels = np.array([YES, YES, NO, YES, NO, NO])
-    assert pick_examples(probabilities, probabilities > 0.5, labels) == [
-        (0, "disagree"), (5, "disagree"), (2, "wrong"), (3, "right yes"), (4, "right no"),
-    ]  # fmt: skip
 
 
 def test_overlay_keeps_what_is_shared():

@@ -7,7 +7,17 @@ import torch
 from torch import nn
 
 from hypogoal.dataset import Split
-from hypogoal.evaluation.deep_lift import Attributions, attributable, deep_lift, explanation, mean_state
+from hypogoal.evaluation.deep_lift import (
+    DEEP_LIFT,
+    INTEGRATED,
+    Attributions,
+    attributable,
+    attributed,
+    deep_lift,
+    explanation,
+    mean_state,
+    method_of,
+)
 from hypogoal.evaluation.judging import Case, Judged, Judgement, Unlabelled, Work
 from hypogoal.evaluation.pictures import attribution_png
 from hypogoal.evaluation.run import Contents
@@ -59,6 +69,49 @@ def test_a_relu_by_hand():
     member = nn.Sequential(nn.Flatten(), first, nn.ReLU(), dense([1.0]))
     found = deep_lift(Members(member), states([1, 1]), states([0, 0])[0])
     np.testing.assert_allclose(found.values.ravel(), [0.5, 0.5], atol=1e-7)
+
+
+class Product(nn.Module):
+    """Two pixels -> their product."""
+
+    def forward(self, images):
+        return images.flatten(1).prod(1, keepdim=True)
+
+
+def test_integrated_gradients_by_hand():
+    """Spec F2: on the way from (0, 0) to (1, .8) each pixel's gradient grows to the other; half of the product each.
+
+    At the end of the way the gradients are .8 and 1, which do not add up to it.
+    """
+    member = nn.Sequential(Product(), dense([3.0]))
+    assert method_of(member) == INTEGRATED
+    found = attributed(Members(member), states([1, 0.8]), states([0, 0])[0])
+    np.testing.assert_allclose(found.values.ravel(), [1.2, 1.2], atol=1e-5)
+    np.testing.assert_allclose(found.log_odds, [[2.4]], atol=1e-6)
+    assert found.method == INTEGRATED and found.completeness_error().max() < 1e-5
+
+
+TWICE = nn.ReLU()
+CHAINS = [
+    ([nn.Conv2d(1, 2, 1), nn.ReLU(), nn.MaxPool2d(2, 1), nn.AdaptiveMaxPool2d(1), nn.Flatten()], DEEP_LIFT),
+    ([nn.Conv2d(1, 2, 1), nn.GELU(), nn.Flatten()], INTEGRATED),
+    ([nn.Conv2d(1, 2, 1), nn.ReLU(), nn.MaxPool2d(2, 1, padding=1), nn.Flatten()], INTEGRATED),
+    ([nn.Conv2d(1, 2, 1), TWICE, nn.Conv2d(2, 2, 1), TWICE, nn.Flatten()], INTEGRATED),
+]
+
+
+@pytest.mark.parametrize(("layers", "method"), CHAINS)
+def test_deep_lift_explains_what_its_rules_hold_for(layers, method):
+    """Spec F2: else integrated gradients; both say which they are, and add up."""
+    torch.manual_seed(0)
+    member = nn.Sequential(*layers, nn.LazyLinear(2))
+    member(torch.zeros(1, 1, 2, 2))
+    for weight in member.parameters():
+        nn.init.uniform_(weight, 0.1, 0.9)
+    state = np.array([[[9], [200]], [[30], [90]]], np.uint8)
+    found = attributed(Members(member), state[None], 0 * state)
+    assert method_of(member) == found.method == method
+    assert found.completeness_error().max() < 0.02 * np.abs(found.values).sum() > 1e-4
 
 
 def test_overlapping_windows_by_hand():
@@ -163,7 +216,7 @@ def test_attributions_are_to_what_members_see(tmp_path):
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
         here = Here(tmp_path, "down", tmp_path, {})
         work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None, shown=0)
-        look(work, Judgement(0, here, split, Unlabelled(observations[2:], None), (), judged))
+        look(work, Judgement(0, here, split, Unlabelled(observations[2:], None), None, judged))
         (found,) = work.looked["saliency"]
         group = arrays["saliency/down"]
         assert group["observations"].shape == (2, 1, 3, 1)

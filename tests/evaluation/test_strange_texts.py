@@ -53,7 +53,8 @@ MADE_BY = (
 COMPARED_BY = r"sub_goal$|domain$"
 UNSEEN = re.compile(  # what no page has
     r"^(?!metrics\.quantities).*\.(unit|interval_over)$|inputs\.\*\.|agents\.\*\.kind|runs\.\*\.(path|ensemble)"
-    r"|ensembles\.\*\.method|distance\.options|explorer\.baseline|selection\.\*\.name|false_positives|arrays\.saliency.*kinds|attributes\.versions"
+    r"|comparisons\.agents"  # of three runs and more; drawn as those of hypotheses
+    r"|ensembles\.\*\.(method|name)|states\.\*\.method|distance\.(options|by_ladder)|explorer\.baseline|selection\.\*\.name|false_positives|arrays\.saliency.*kinds|attributes\.versions"
     r"|^manifests\.[^.]*\.sha256"  # the sum of the others, made anew
 )
 
@@ -256,7 +257,7 @@ def everything(run):
     """All texts of an evaluation: those of its numbers and those in its arrays."""
     arrays = read_evaluation(run).arrays
     lists = {name: json.loads(arrays[name].item()) for name in arrays if name.endswith(("/kinds", "/places"))}
-    assert len(lists) == 6
+    assert len(lists) == 4
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     metrics["distance"]["shown"][0]["groups"] = "a text in place of a number"
     return {"metrics": metrics, "arrays": lists}
@@ -350,7 +351,7 @@ def test_names_that_are_none_are_refused(changed, run, name, command, tmp_path, 
     assert "has a name that is none" in line
 
 
-@pytest.mark.parametrize("part", ["ensembles", "explorer", "saliency"])
+@pytest.mark.parametrize("part", ["ensembles", "explorer"])
 def test_paths_that_fit_nothing_are_one_line(changed, part, capsys):
     """Spec G2: an evaluation that is not of one piece is damaged, whichever of its parts says so first."""
     path = changed / "evaluation" / "metrics.json"

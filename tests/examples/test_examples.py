@@ -6,13 +6,17 @@ import ast
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 from test_docs import blocks, commands
 
+from hypogoal import OptionEnv, load_ensemble, load_options
 from hypogoal.cli import main
 from hypogoal.dataset import open_dataset
+from hypogoal.evaluation import explorer
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_LINES = 30
@@ -21,7 +25,7 @@ MOST_LINES = 30
 @pytest.fixture(autouse=True)
 def in_the_examples_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(EXAMPLES)  # modules of the current folder are found
-    monkeypatch.setenv("HYPOGOAL_TRUST", "unlock_pickup:DOMAIN,freeway:DOMAIN")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "unlock_pickup:DOMAIN,freeway:DOMAIN,vector_goals:DOMAIN")
 
 
 def code_lines(path: Path) -> int:
@@ -110,6 +114,86 @@ def test_the_audits_page_audits_its_classifier(tmp_path: Path) -> None:
     fooled = [f"{row['layout']:.0f}" for row in rows if row["fooled"] == 100]
     assert f"On layouts {', '.join(fooled[:-1])} and {fooled[-1]} every" in page.read_text(encoding="utf-8")
     assert sum(row["there"] for row in rows) == 1_600 and {row["mended_there"] for row in rows} == {100}
+
+
+def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B6: observations that are a dictionary of numbers; what is of pictures only is left out, or refused."""
+    example = EXAMPLES / "vector_goals.py"
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= 40
+    run = tmp_path / "run"
+    data, ensemble, options, meta = (str(run / name) for name in ("data.h5", "ensemble", "options", "meta"))
+    play = settings("steps=2500", "environments=4", "warm_up=200", "layout_seed=0")
+    few = settings("unlabelled_seeds=1", "heldout_seeds=2")
+    for words in (
+        ["collect", "vector_goals:DOMAIN", "--out", data, *few],
+        ["train-ensemble", data, "--out", ensemble, *settings("members=2", "workers=1")],
+        ["train-options", ensemble, "--out", options, *play, *settings("initiation=learned", "save_visited=50")],
+        ["train-meta", ensemble, "--out", meta, "--options", options, *play, *settings("initiation=learned")],
+        ["train-baseline", "vector_goals:DOMAIN", "--out", str(run / "ppo"), "--data", data, *settings("steps=600")],
+        ["evaluate", str(run)],
+        ["report", str(run)],
+    ):
+        assert main([*words, "-q"] if words[0] != "report" else words) == 0, words
+    assert main(["verify", str(run)]) == 0
+    config = json.loads((run / "ensemble" / "manifest.json").read_text(encoding="utf-8"))["config"]
+    assert [config[key] for key in ("network", "observation_shape", "observation_dtype")] == ["mlp", [6], "float32"]
+    page = (run / "report" / "index.html").read_text(encoding="utf-8")
+    assert all(text in page for text in ("position[0]", "held[1]", "What members go by: at-exit"))
+    assert not any(text in page for text in ("Explore the hypotheses", "laid over each other"))
+    assert open_dataset(run / "options" / "visited.h5").unlabelled().dtype == "float32"
+    policies = load_options(options)
+    env = OptionEnv(policies.make_env(), policies)
+    observation, _ = env.reset(seed=0)
+    assert set(observation) == {"position", "key", "held"} and env.action_masks().shape == (4,)
+    assert 1 <= env.step(0)[4]["duration"] <= 20
+    capsys.readouterr()
+    for words in (["report", str(run), "--videos", "1", "--force"], ["show", data, "--pictures", str(tmp_path)]):
+        assert main(words) == 2 and "pictures" in capsys.readouterr().err
+    for words in (["vector_goals:DOMAIN"], [data]):
+        assert main(["label", *words, "--out", str(tmp_path / "marked")]) == 2
+        assert "observations must be images to be looked at" in capsys.readouterr().err
+    for setting in ("network=paper", "meta_network=paper"):
+        assert main(["train-meta", ensemble, "--out", str(tmp_path / "m"), "-q", *settings(setting)]) == 2
+        assert f"see pictures only: {setting}" in capsys.readouterr().err
+    minari = tmp_path / "played-v0"
+    assert main(["export", meta, "--out", str(minari), "--episodes", "2", "-q"]) == 0
+    space = json.loads(json.loads((minari / "data" / "metadata.json").read_text())["observation_space"])
+    assert (space["dtype"], space["shape"]) == ("float32", [6])
+    again = tmp_path / "again.npz"
+    assert main(["export", data, "--out", str(again)]) == 0
+    assert main(["import", str(again), "--out", str(tmp_path / "again.h5"), "-q"]) == 0
+    assert open_dataset(tmp_path / "again.h5").features() == open_dataset(run / "data.h5").features()
+
+
+def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A1-A8, B6, C5, F2: the example's own commands; the page's lines rebuild a member without hypogoal."""
+    example = EXAMPLES / "frozen_backbone.py"
+    text = example.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 40
+    (tmp_path / example.name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYPOGOAL_TRUST")
+    lines = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", "").splitlines()
+    monkeypatch.setattr(explorer, "MOST_INTEGRATED", 2)
+    two = settings("sub_goals=collect-red-key,open-red-door")
+    few = {**SHORT, "collect": settings("unlabelled_seeds=1", "heldout_layouts=1")}
+    few["train-ensemble"] = [*SHORT["train-ensemble"], *two]
+    for words in (line.split() for line in lines):
+        if words[:1] == ["export"]:
+            monkeypatch.setenv(*words[1].split("="))
+        elif words[:1] == ["hypogoal"]:
+            assert main([*words[1:], *few.get(words[1], ())]) == 0, words
+    run = tmp_path / "runs" / "backbone"
+    metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    states = [state for goal in metrics["saliency"]["sub_goals"] for state in goal["states"]]
+    assert states and all(state["method"] == "integrated gradients" for state in states)
+    worst = max(member["completeness_error"] for state in states for member in state["members"])
+    assert worst < 1e-3
+    assert "Attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    found: dict[str, Any] = {}
+    exec(compile(blocks(EXAMPLES.parent / "docs" / "formats.md", "python")[4], "formats.md", "exec"), found)
+    logits = load_ensemble(run / "ensemble", "collect-red-key").logits(found["images"].numpy())[:, 0]
+    np.testing.assert_allclose(found["logits"].detach().numpy(), logits, atol=1e-5)
 
 
 @pytest.mark.atari

@@ -23,7 +23,7 @@ def grid_world(count: int, cells: int, seed: int = 0, channels: int = 3) -> NDAr
     return tiles[grid].transpose(0, 1, 3, 2, 4, 5).reshape(count, cells * 8, cells * 8, channels)
 
 
-@pytest.mark.parametrize("name", sorted(NETWORKS))
+@pytest.mark.parametrize("name", sorted({*NETWORKS} - {"mlp"}))
 @pytest.mark.parametrize("training", [True, False])
 def test_it_is_the_plain_network(name: str, training: bool) -> None:
     """Spec C5: in double precision the two agree to rounding, with a repeated image in the batch."""
@@ -36,7 +36,7 @@ def test_it_is_the_plain_network(name: str, training: bool) -> None:
     compare(plain, expected, tabled, found)
 
 
-@pytest.mark.parametrize("name", sorted(NETWORKS))
+@pytest.mark.parametrize("name", sorted({*NETWORKS} - {"mlp"}))
 @pytest.mark.parametrize("counted", [True, False])
 def test_groups_pass_together_and_batchnorm_sees_them_apart(name: str, counted: bool) -> None:
     """Spec C5: labelled and unlabelled states at once are two passes of the plain network."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from gymnasium import spaces
 
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Step
 from hypogoal.learners.baselines.agents import epsilon, train
@@ -189,3 +191,17 @@ def test_global_randomness_is_given_back():
     torch.manual_seed(5)
     train(EngineEnv(Corridor(4)), hyperparameters("ppo", "paper"), steps=100, seed=0)
     assert torch.rand(1) == expected
+
+
+def test_it_plays_in_the_agents_world(tmp_path):
+    """A wrong key ends the episode, and so does 1.5 times the shortest path, as for agents with options."""
+    config = BaselineConfig(steps=1_280, layout_seed=70105, world=("wrong_key=ends",), cap=1.5, random_episodes=0)
+    train_baseline("doorkey", config, tmp_path / "a", quiet=True)
+    assert open_artefact(tmp_path / "a", "baseline").config["domain_config"] == {"wrong_key": "ends"}
+    shortest = json.loads((tmp_path / "a" / "layout.json").read_text())["shortest_path"]
+    rows = list(csv.DictReader((tmp_path / "a" / "episodes.csv").read_text().splitlines()))
+    lengths = {int(row["length"]) for row in rows if row["succeeded"] == "0"}
+    assert max(lengths) == math.ceil(1.5 * shortest)
+    assert min(lengths) < shortest  # a wrong key
+    with pytest.raises(UserError, match="no such setting"):
+        train_baseline("doorkey", BaselineConfig(world=("draws=3",)), tmp_path / "b", quiet=True)

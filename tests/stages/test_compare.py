@@ -4,14 +4,13 @@ import json
 import re
 import shutil
 
-import numpy as np
 import pytest
 from toy_data import fill, reseal
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.compare import labels_of, on_grid
+from hypogoal.evaluation.compare import labels_of
 from hypogoal.options.recording import write_table
 from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate
@@ -145,12 +144,6 @@ def test_labels_tell_runs_apart():
     """Spec F7: as short as that can be."""
     assert labels_of(["/a/one", "/a/two"]) == ["one", "two"]
     assert labels_of(["/a/run", "/b/run"]) == ["a/run", "b/run"]
-
-
-def test_curves_on_another_grid():
-    """Spec F5: the last value known, nothing before the first and past the end."""
-    found = on_grid(np.array([[1.0, 2.0, 3.0]]), np.array([10, 20, 30]), np.array([0, 10, 15, 30, 40]))
-    np.testing.assert_array_equal(found, [[np.nan, 1, 1, 3, np.nan]])
 
 
 def test_rewards_of_any_size_are_seen(runs, compared):

@@ -72,6 +72,10 @@ def test_options_that_fit_are_continued(run: Path, tmp_path: Path, monkeypatch: 
     before = (run / "options/episodes.csv").read_text()
     after = (out / "episodes.csv").read_text()
     assert after.startswith(before) and int(after.splitlines()[-1].split(",")[0]) > 200
+    shorter = [*command[: -len(FEW)][:-1], str(tmp_path / "shorter"), *FEW, "--set", "max_episode_steps=7"]
+    assert main(shorter) == 0
+    steps = [int(row.split(",")[0]) for row in (tmp_path / "shorter/episodes.csv").read_text().splitlines()[1:]]
+    assert min(steps) > 200, "episodes of practice in a world of longer episodes are none of the agent's"
 
 
 def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(
@@ -85,7 +89,7 @@ def test_practice_that_succeeds_ends_and_the_meta_policy_counts_its_steps(
     for name, changes in (("early", ("--set", "steps=4000")), ("late", ("--set", "steps=40"))):
         command = ["train-options", str(run / "ensemble"), "--out", str(tmp_path / name), *few, *changes]
         assert main(command) == 0
-        said[name] = capsys.readouterr().out.splitlines()[-2]
+        said[name] = capsys.readouterr().out.splitlines()[-3]
         assert main([*command, "--resume"]) == 0, "it is complete"
         capsys.readouterr()
     assert said["early"].endswith("ended by until=0.3") and said["late"].endswith(

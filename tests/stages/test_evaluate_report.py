@@ -37,6 +37,7 @@ from hypogoal.stages.train_options import train_options
 QUIET = {"quiet": True}
 SMALL = {"members": 2, "workers": 1}
 SHORT = {"max_episode_steps": 64, "random_episodes": 20, "layout_seed": 100}
+FIGURES = {"reward", "length", "members"}
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +185,7 @@ def test_metrics_are_written_as_returned(run, metrics):
 
 def test_what_is_missing_is_named(run, metrics, tmp_path):
     """Spec F: no silent absence, in the metrics, on the page and in an evaluation of a run with a baseline only."""
-    assert metrics["missing"] == [f"no agent '{name}'" for name in ("PPO paper", "DQN tuned", "DQN paper")]
+    assert metrics["missing"] == [], "what nobody asked for is not missed"
     train_baseline("doorkey", BaselineConfig(steps=640, **SHORT), tmp_path / "only" / "ppo", **QUIET)
     alone = evaluate(tmp_path / "only", tmp_path / "only" / "evaluation", **QUIET)
     assert alone["missing"][0] == "no ensemble"
@@ -218,8 +219,9 @@ def test_hypotheses_alone_are_told_in_the_terminal(run, tmp_path, capsys, monkey
     (line,) = (line for line in told.splitlines() if "open-red-door" in line)
     assert [cell.strip() for cell in line.split("│")[3:6]] == numbers
     assert "dbat, K=2" in told and "no diversity, K=2" in told
-    *lines, where = told.splitlines()
+    *lines, then, where = told.splitlines()
     assert max(map(len, lines)) <= 80 and where == str(tmp_path / "evaluation")
+    assert then == f"next: hypogoal report {tmp_path}"
     assert metrics["missing"] == ["no agents"] and "PPO" not in told and "last 100" not in told
     for path in (tmp_path, tmp_path / "evaluation"):
         assert main(["show", str(path)]) == 0
@@ -294,7 +296,9 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
     assert found.stack == []
     assert len(found.ids) == len(set(found.ids))
     inside = {f"#{identity}" for identity in found.ids}
-    assert all(link.startswith("data:image/png;base64,") or link in inside for link in found.links)
+    assert all(
+        link.startswith(("data:image/png;base64,", "data:image/gif;base64,")) or link in inside for link in found.links
+    )
     assert not {"link", "iframe", "object"} & set(found.tags)
     assert not re.search(r"fetch\(|XMLHttpRequest|import\(|https?://(?!www\.w3\.org/)", "".join(found.scripts))
     assert not re.search(r"url\((?!#)|@import", page)
@@ -304,20 +308,37 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
 def test_the_page_shows_all_of_it(run, page):
     """Spec F5, F6, F7: curves, hypotheses, examples, overlays, choices, provenance, with seeds in the captions."""
     for title in (
-        "Summary", "Learning curves", "Hypotheses", "Explore the hypotheses", "Example states", "Where options stop",
-        "Which hypotheses are chosen", "What members look at", "Data, settings, provenance",
+        "Summary", "Hypotheses", "Explore the hypotheses",
+        "Which hypotheses are chosen, and where they stop", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
-    assert "is the question below, &#39;What choosing is worth&#39;" in page.split("<h2>What choosing is worth</h2>")[0]
-    assert page.count("<figure") == 3
-    assert page.count("<h3>Seed by seed: ") == 2
+    drawn = {path.name.rpartition(".")[0] for path in (run / "report" / "figures").iterdir()}
+    assert {*FIGURES, "figure7", "figure8"} <= drawn
+    assert page.count("<figure") == 1 + len(drawn) and page.count("data:image/gif;base64,") == 1
+    assert re.search(r"An episode of meta, layout 100: \d+ steps", page)
+    assert page.count("<h3>Seed by seed: ") == 1, "one run of an agent is no table of pairs"
     assert "1 run: layout seed 100, run seed 0" in page
     assert "Figure 6 of the paper" in page
-    assert "no agent &#39;DQN tuned&#39;" in page
+    assert "Missing in this run" not in page
     assert page.count("data:image/png;base64,") >= 15
-    assert sorted(path.name for path in (run / "report" / "figures").iterdir()) == sorted(
-        f"{name}.{kind}" for name in ("reward", "length", "members") for kind in ("svg", "png")
-    )
+    assert {path.name for path in (run / "report" / "figures").iterdir()} == {
+        f"{name}.{kind}" for name in drawn for kind in ("svg", "png")
+    }
+    assert all(name.startswith(("figure", "terminations-")) for name in drawn - FIGURES)
+
+
+def test_a_run_whose_agent_cannot_play_has_a_page_without_a_film(run, page, tmp_path):
+    """Spec E1, F7: where nobody asked for one, a line says why there is none; where somebody did, it is an error."""
+    (kept,) = (path for path in (run / "report" / "videos").iterdir() if path.suffix == ".gif")
+    assert kept.name == "meta-episode-0.gif"
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    (copy / "meta" / "options.safetensors").unlink()
+    text = report(copy, force=True).read_text(encoding="utf-8")
+    assert "no film of an episode: " in text and "image/gif" not in text
+    with pytest.raises(UserError, match=r"options\.safetensors"):
+        report(copy, videos=1, force=True)
+    assert "image/gif" not in report(run, videos=0, force=True).read_text(encoding="utf-8")
 
 
 def test_the_report_is_the_same_each_time(run, page):
@@ -342,7 +363,7 @@ def test_the_papers_figures_as_files(run, metrics, tmp_path):
     assert all(path.read_bytes().startswith(b"%PDF") for path in files)
     captions = (tmp_path / "figures" / "captions.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (.*)$", captions, re.M) == [path.name for path in files]
-    assert "bands: ± one standard error over runs. options (learned members): 1 run: layout seed 100" in captions
+    assert "mean of the last 100 at each step. options (learned members): 1 run: layout seed 100" in captions
     assert [line.partition(":")[0] for line in missing] == ["Figure 3", "Figure 4", "Figure 5"]
     assert all("It needs" in line and line in captions for line in missing)
     with pytest.raises(UserError, match="exists already"):
@@ -368,7 +389,6 @@ def test_arrays_say_what_the_report_draws(run, metrics):
         assert grid[-1] == 1_024 + 3_072
         for index, agent in enumerate(metrics["agents"]):
             assert arrays[f"curves/{index}/reward"].shape == (len(agent["runs"]), len(grid))
-        assert set(arrays["examples"]) == set(SUB_GOALS)
         some = next(iter(arrays["terminations/meta"].values()))
         assert some.shape == (64, 64, 3)
 

@@ -64,7 +64,13 @@ def test_the_states_are_those_of_the_ensemble_that_was_used(run, metrics, data):
     assert (metrics["explorer"]["ensemble"], metrics["explorer"]["seed"]) == ("ensemble/seed-1", 1)
     split = open_dataset(run / "data.h5").heldout(GOAL)
     about = next(goal for goal in metrics["explorer"]["sub_goals"] if goal["sub_goal"] == GOAL)
-    assert about == {"sub_goal": GOAL, "states": len(split.labels), "shown": 30, "explained": 2}
+    assert about == {
+        "sub_goal": GOAL,
+        "states": len(split.labels),
+        "shown": 30,
+        "explained": 2,
+        "reading": DOMAIN.reading,
+    }
     with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
         group = arrays[f"explorer/{GOAL}"]
         rows = group["rows"][()]
@@ -140,6 +146,7 @@ const $ = (id) => document.getElementById(id);
 const tiles = () => document.querySelectorAll("#explorer-tiles button");
 const choose = (id, value) => { $(id).value = value; $(id).dispatchEvent(new Event("change")); };
 const told = [];
+const at_first = $("explorer-members").value;
 for (const filters of FILTERS) {
   $("explorer-reset").click();
   choose("explorer-goal", GOAL);
@@ -151,8 +158,16 @@ tiles()[0].click();
 tiles()[0].dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
 const second = document.activeElement.getAttribute("data-state");
 document.querySelectorAll("#explorer-detail button")[1].click();
+tiles()[0].click();
+const height = (tile) => tile.getBoundingClientRect().top;
+const columns = [...tiles()].filter((tile) => height(tile) === height(tiles()[0])).length;
+tiles()[0].dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowDown", bubbles: true }));
+const below = Number(document.activeElement.getAttribute("data-state")) === columns && columns > 1;
+tiles()[0].click();
+tiles()[0].dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
+document.querySelectorAll("#explorer-detail button")[1].click();
 document.title = JSON.stringify({
-  told, second, hash: location.hash,
+  told, at_first, below, second, hash: location.hash,
   pressed: [...document.querySelectorAll("#explorer-tiles [aria-pressed=true]")].map((b) => b.dataset.state),
   heading: $("explorer-member").querySelector("h3").textContent,
   focused: document.activeElement.textContent,
@@ -172,6 +187,8 @@ def test_the_filters_in_a_browser(page, data, tmp_path):
     counts = [expected(data, **filters) for filters in FILTERS]
     assert found["told"] == [[f"{count} of 30 states", count] for count in counts]
     assert len(set(counts)) > 3
+    apart = any(expected({GOAL: goal}, members="disagree") for goal in data.values())
+    assert found["at_first"] == ("disagree" if apart else "") and found["below"]
     assert found["second"] == "1" and found["pressed"] == ["1"]
     assert found["hash"] == f"#explorer?goal={GOAL}&state=1&member=1"
     assert found["heading"] == found["focused"] == f"Member 1 of {GOAL}"
@@ -189,3 +206,24 @@ def test_the_address_holds_the_filters(page, data, tmp_path):
     assert document.count('class="tile"') == count
     assert f"Member 1 of {GOAL}" in document
     assert 'role="status" aria-live="polite"' in document
+
+
+@pytest.mark.browser
+@needs_browser
+def test_the_page_begins_with_states_on_which_members_disagree(page, tmp_path):
+    """Spec F7: of the first sub-goal that has any; 'clear' shows all."""
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'(?<=id="explorer-data">).*?(?=</script>)', text, re.S)
+    goals = json.loads(found[0])
+    for goal in goals["goals"]:
+        for index, state in enumerate(goal["states"]):
+            state["says"] = [True, goal["name"] != GOAL or index >= 3]
+    copy = tmp_path / "apart.html"
+    copy.write_text(text.replace(found[0], json.dumps(goals).replace("<", "\\u003c")), encoding="utf-8")
+    script = """
+    const told = () => document.getElementById("explorer-count").textContent;
+    const first = [document.getElementById("explorer-goal").value, told()];
+    document.getElementById("explorer-reset").click();
+    document.title = JSON.stringify([...first, told()]);
+    """
+    assert json.loads(title_of(document_of(copy, "", tmp_path, script))) == [GOAL, "3 of 30 states", "30 of 30 states"]

@@ -26,7 +26,7 @@ from hypogoal.meta.episodes import Frame, agent_of, play_episode
 from hypogoal.options.bandits import BANDITS
 from hypogoal.options.initiation import Initiation
 from hypogoal.stages.collect import collect
-from hypogoal.stages.report import agents_of, draw_videos
+from hypogoal.stages.report import agents_of, play_films
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_meta import train_meta
 
@@ -86,14 +86,13 @@ def test_verdicts_are_those_of_the_member_that_runs(run, frames):
         assert says.tolist() == [frame.says_yes for frame in own]
 
 
-def test_videos_are_files_of_the_agents_that_choose(run, tmp_path):
+def test_videos_are_of_the_agents_that_choose(run):
     """Spec E1, F7: of the one that learned to choose, not of the random chooser; a frame for each of the episode's."""
     agents = agents_of(run)
     assert [artefact.path.name for artefact in agents] == ["meta"]
-    draw_videos(agents, run, tmp_path / "videos", 2)
-    files = sorted((tmp_path / "videos").iterdir())
-    assert [path.name for path in files] == ["meta-episode-0.gif", "meta-episode-1.gif"]
-    with Image.open(files[0]) as video:
+    films = play_films(agents, run, 2)
+    assert [film.name for film in films] == ["meta-episode-0.gif", "meta-episode-1.gif"]
+    with Image.open(io.BytesIO(films[0].gif)) as video:
         assert video.format == "GIF"
         assert 2 < video.n_frames <= 2 * CAP + 1
         assert video.size[0] == 320
@@ -123,8 +122,8 @@ def test_options_are_held_back_as_in_training(run, tmp_path, monkeypatch):
         return narrow(self, ids, offered)
 
     monkeypatch.setattr(Initiation, "narrow", watched)
-    draw_videos([artefact], tmp_path, tmp_path / "videos", 1)
-    assert asked and [path.suffix for path in (tmp_path / "videos").iterdir()] == [".gif"]
+    (film,) = play_films([artefact], tmp_path, 1)
+    assert asked and film.gif.startswith(b"GIF")
 
 
 @pytest.mark.parametrize("name", BANDITS)

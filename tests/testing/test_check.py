@@ -21,6 +21,7 @@ from hypogoal.diversity import OBJECTIVES as OURS
 from hypogoal.diversity import Objective, dbat, load_objective, none
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.hypotheses.networks import NETWORKS
 from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
 
 TESTS = Path(__file__).parents[1]
@@ -283,17 +284,32 @@ def squeezed(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
     return [nn.Conv2d(channels, 4, 8, 8), nn.Sigmoid()], (8,)
 
 
+def spread(channels: int) -> nn.Module:
+    return nn.Sequential(nn.Conv2d(channels, 4, 8, 8), nn.Flatten(), nn.Softmax(0))
+
+
 def dead(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
     layers = [nn.Conv2d(channels, 4, 8, 8), nn.ReLU()]
     layers[0].weight.requires_grad_(False)  # type: ignore[union-attr]
     return layers, (8,)
 
 
-@pytest.mark.parametrize(("name", "fault"), [("squeezed", "layers"), ("dead", "gradients"), ("missing", "builds")])
+FAULTS = [("spread", "same answers however asked"), ("dead", "gradients"), ("missing", "builds")]
+
+
+@pytest.mark.parametrize(("name", "fault"), FAULTS)
 def test_networks_are_checked(name: str, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec C5: what cannot be explained or learned is named."""
+    """Spec C5: what cannot be asked or learned is named."""
     monkeypatch.setenv("HYPOGOAL_TRUST", f"test_check:{name}")
     assert first_fault(check_network(f"test_check:{name}")).name == fault
+
+
+@pytest.mark.parametrize(("name", "method"), [("squeezed", "integrated gradients"), ("tiles", "DeepLift")])
+def test_networks_are_told_how_they_are_explained(name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5, F2."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", f"test_check:{name}")
+    verdicts = {verdict.name: verdict for verdict in check_network(name if name in NETWORKS else f"test_check:{name}")}
+    assert verdicts["explained"].text == f"by {method}"
 
 
 def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -306,7 +322,13 @@ def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, caps
     assert main(["check", "corridor_env:RESTLESS", *small]) == 2
     told = capsys.readouterr().out.splitlines()
     assert told[-1].startswith("FAIL determinism") and "np_random" in told[-1]
-    assert main(["check", "corridor_env:FLOATS"]) == 2
+    assert main(["check", "corridor_env:SENSED", *small, "--network", "mlp"]) == 0
+    told = capsys.readouterr().out
+    assert "ok   images: float32 (11,)" in told and "FAIL" not in told and told.count("ok   builds") == 1
+    assert main(["check", "corridor_env:SENSED", *small, "--network", "doorkey"]) == 2
+    told = capsys.readouterr().out
+    assert "'doorkey' takes images (H, W, C): observation shape (11,). Give --set network=mlp" in told
+    assert main(["check", "corridor_env:WORDY"]) == 2
     assert "observations must be images" in capsys.readouterr().err
     assert main(["check"]) == 2
     assert "nothing to check" in capsys.readouterr().err

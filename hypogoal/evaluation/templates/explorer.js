@@ -1,4 +1,4 @@
-/* Browses the states of the page (see hypogoal/evaluation/page/explorer.py). The address holds what is shown. */
+/* Browses the states of the page (see hypogoal/evaluation/explorer.py). The address holds what is shown. */
 (() => {
   "use strict";
   const root = document.getElementById("explorer-app");
@@ -41,6 +41,7 @@
     const wrong = one.says[index] !== one.truth;
     return make("span", { class: wrong ? "wrong" : yes(one.says[index]) }, yes(one.says[index]) + (wrong ? " ✗" : ""));
   };
+  const said = (one, index) => make("span", {}, make("small", {}, `${index} `), verdict(one, index));
 
   const tile = (one, index) => {
     const says = one.says.map((said, k) => `member ${k} ${yes(said)}`).join(", ");
@@ -56,7 +57,7 @@
       },
       image(one.png, ""),
       make("span", {}, "truth " + yes(one.truth)),
-      make("span", { class: "says" }, ...one.says.map((_, k) => verdict(one, k))),
+      make("span", { class: "says" }, ...one.says.map((_, k) => said(one, k))),
     );
     button.addEventListener("click", () => {
       state = index;
@@ -178,13 +179,21 @@
     draw();
   });
   at("tiles").addEventListener("keydown", (event) => {
-    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     const buttons = [...at("tiles").querySelectorAll("button")];
+    const top = (button) => Math.round(button.getBoundingClientRect().top);
+    const columns = buttons.filter((button) => top(button) === top(buttons[0])).length;
+    const step = { ArrowRight: 1, ArrowLeft: -1, ArrowDown: columns, ArrowUp: -columns }[event.key];
     const next = buttons[buttons.indexOf(document.activeElement) + step];
+    if (step) event.preventDefault();
     if (step && next) next.click();
   });
   addEventListener("hashchange", () => read() && draw(false));
   const linked = read();
+  const apart = (one) => new Set(one.says).size > 1;
+  if (!linked && goals.some((each) => each.states.some(apart))) {
+    if (!goal().states.some(apart)) at("goal").selectedIndex = goals.findIndex((each) => each.states.some(apart));
+    at("members").value = "disagree"; // what an ensemble is for; "clear" shows all
+  }
   draw(false);
   root.hidden = false;
   if (linked) root.scrollIntoView();

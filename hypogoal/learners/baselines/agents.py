@@ -19,8 +19,9 @@ from hypogoal.core.checkpoints import Checkpoints, optimiser_snapshot, restore_o
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for
+from hypogoal.dataset import PICTURE
 from hypogoal.learners.baselines.engine_env import EngineEnv
-from hypogoal.learners.baselines.networks import CELL, NETWORKS
+from hypogoal.learners.baselines.networks import CELL, FEATURES, NETWORKS
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 
 LOG_INTERVAL = 5_000  # environment steps
@@ -112,19 +113,18 @@ def make_agent(env: EngineEnv, chosen: PPOSettings | DQNSettings, seed: int, dev
     if isinstance(chosen, PPOSettings) and env.num_envs > chosen.rollout:
         what = f"PPO updates every {chosen.rollout} steps, fewer than there are environments"
         raise UserError(what, f"environments={env.num_envs}", f"Give --set environments={chosen.rollout} or fewer.")
-    network = {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL}
+    seen: dict[str, Any] = {"net_arch": [FEATURES, FEATURES]}  # of numbers
+    if env.observation_space.dtype == PICTURE:
+        network = {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL}
+        features = {"features_extractor_class": NETWORKS[chosen.network], "features_extractor_kwargs": network}
+        seen = {**features, "net_arch": []}
     common: dict[str, Any] = {
         "policy": "MlpPolicy",
         "env": env,
         "learning_rate": chosen.learning_rate,
         "batch_size": chosen.batch,
         "gamma": chosen.gamma,
-        "policy_kwargs": {
-            "features_extractor_class": NETWORKS[chosen.network],
-            "features_extractor_kwargs": network,
-            "net_arch": [],
-            "optimizer_kwargs": {"fused": True},
-        },
+        "policy_kwargs": {**seen, "optimizer_kwargs": {"fused": True}},
         "seed": seed_for(seed, "agent") % 2**32,
         "device": device,
     }

@@ -1,5 +1,6 @@
 """An engine as a stable-baselines3 vectorised environment, and the list of episodes played in it."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from hypogoal.dataset import PICTURE, Observations, standardised
 from hypogoal.domains.base import Engine, step_of
 from hypogoal.learners.episodes import Episodes
 
@@ -15,25 +17,31 @@ from hypogoal.learners.episodes import Episodes
 class EngineEnv(VecEnv):
     """All environments of an engine, with its primitive actions and images.
 
-    Observations are the engine's images, uint8 (C, H, W), or, where the engine's images are made of tiles, the cells'
-    tile codes, uint8 (cells,), which say the same in 1/192 of the bytes (see ``networks.CellNetwork``). An episode cut
-    at its step limit is marked as truncated: its last state is not a terminal one. ``episodes`` are those that ended.
+    Observations are the engine's images, uint8 (C, H, W), or its numbers, float32, by its ``standard`` if there is one;
+    where images are made of tiles, the cells' tile codes, uint8 (cells,), which say the same in 1/192 of the bytes (see
+    ``networks.CellNetwork``). An episode cut at its step limit is marked as truncated: its last state is not a terminal
+    one. ``episodes`` are those that ended.
     """
 
     def __init__(self, engine: Engine):
         self.engine = engine
         self.tiles = engine.tiles
-        space = spaces.Box(0, 255, self._observe(engine.ids[:1]).shape[1:], np.uint8)
+        first = self._observe(engine.ids[:1])
+        low, high = (0, 255) if first.dtype == PICTURE else (-math.inf, math.inf)
+        space: Any = spaces.Box(low, high, first.shape[1:], first.dtype.type)
         super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
         self.episodes = Episodes(engine.count)
         self._actions = np.zeros(engine.count, dtype=np.int64)
 
-    def _observe(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def _observe(self, ids: NDArray[np.int64]) -> Observations:
         if self.tiles is not None:
             return self.engine.codes(ids)
-        return self.engine.images(ids).transpose(0, 3, 1, 2)
+        images = self.engine.images(ids)
+        if images.dtype == PICTURE:
+            return images.transpose(0, 3, 1, 2)
+        return standardised(images, *self.engine.standard) if self.engine.standard else images
 
-    def reset(self) -> NDArray[np.uint8]:
+    def reset(self) -> Observations:
         """Put every environment at the start of an episode."""
         return self._observe(self.engine.reset())
 
@@ -41,7 +49,7 @@ class EngineEnv(VecEnv):
         """Take note of the actions (count,) of the next step."""
         self._actions = np.asarray(actions, dtype=np.int64)
 
-    def step_wait(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step every environment; where an episode ended, the observation is that of the next one's start."""
         step = step_of(self.engine, self._actions)
         self.episodes.see(step)

@@ -1,0 +1,183 @@
+"""Figure 6 at the paper's budget: how soon agents solve a layout, in how many steps, and whether they lose it again.
+
+hypogoal sweep examples/figure6.toml --out runs/figure6
+python -m benchmarks.figure6 runs/figure6 docs/results/figure6-doorkey.csv
+python -m benchmarks.figure6 --tables docs/results/figure6-doorkey.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cells import interval, table
+from hypogoal.core.artefacts import Artefact, find_artefacts
+from hypogoal.core.seeding import rng_for
+from hypogoal.evaluation.choosing import ENVIRONMENTS, UNIFORM, play
+from hypogoal.evaluation.curves import WINDOW, Run, read_run, run_numbers
+from hypogoal.meta.episodes import agent_of
+from hypogoal.options.choosers import RandomChooser
+
+METHODS = {
+    "dbat-k3": "D-BAT, K = 3",
+    "none-k3": "no diversity, K = 3",
+    "one": "one classifier, K = 1",
+    "oracle": "true sub-goals",
+    "ppo-tuned": "PPO",
+    "dqn-tuned": "DQN",
+}
+COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
+POINTS = 50_000  # steps between two points of a curve
+
+
+def collect(run: Path, path: Path) -> None:
+    """A row for every number of every finished agent, those that are there first."""
+    there: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                there.setdefault((row["method"], row["layout"]), []).append(row)
+    for kind in ("meta", "baseline"):
+        for artefact in find_artefacts(run, kind):
+            read = read_run(artefact, artefact.path.name)
+            method = (
+                "oracle"
+                if read.config.get("termination") == "oracle"
+                else next(name for name in METHODS if f"-{name}-" in f"-{artefact.path.name}-")
+            )
+            key = (method, str(read.layout["layout_seed"]))
+            if key not in there:
+                about = dict(zip(COLUMNS, (*key, str(read.seed)), strict=False))
+                there[key] = [
+                    about | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"}
+                    for chooser, name, value in _numbers(artefact, read)
+                ]
+    order = list(METHODS)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        for place in sorted(there, key=lambda key: (order.index(key[0]), int(key[1]))):
+            writer.writerows(there[place])
+
+
+def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
+    """Chooser, quantity and value of one agent: of its training, and of frozen play where it chooses options."""
+    shortest = run.layout["shortest_path"]
+    found = run_numbers(run.episodes, shortest)
+    reached = found["steps_to_95"]
+    yield "agent", "steps", float(run.budget)
+    yield "agent", "shortest_path", float(shortest)
+    yield "agent", "steps_to_95", math.inf if reached is None else float(reached)
+    for name in ("success", "length_over_shortest", "near"):
+        yield "agent", name, float(found[name] or 0.0)
+    yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
+    for step in range(POINTS, run.budget + 1, POINTS):
+        seen = run.episodes.at(run.episodes.step <= step)
+        if len(seen.step) >= WINDOW:
+            yield "agent", f"success_at_{step}", float(seen.last().succeeded.mean())
+            yield "agent", f"length_at_{step}", float(seen.last().length.mean())
+    if artefact.kind == "meta":
+        loop = agent_of(artefact, run.seed, ENVIRONMENTS)
+        for who in ("frozen", UNIFORM):
+            if who == UNIFORM:
+                loop.chooser = RandomChooser(rng_for(run.seed, "uniform-choice"))
+            played, _ = play(loop)
+            yield who, "success", played["success"]
+            yield who, "near", played["near"]
+            yield who, "length_over_shortest", played["length"] / float(shortest)
+
+
+def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: float | None) -> float:
+    """The lowest share solved of any ``WINDOW`` consecutive episodes that end after step ``since``; NaN if never."""
+    if since is None:
+        return math.nan
+    sums = np.concatenate([[0], np.cumsum(succeeded.astype(np.int64))])
+    recent = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
+    return float(recent[step[WINDOW - 1 :] >= since].min())
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the rows say, as lines of Markdown."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    methods = [method for method in METHODS if any(row["method"] == method for row in rows)]
+    layouts = sorted({row["layout"] for row in rows}, key=int)
+
+    def of(method: str, quantity: str, chooser: str = "agent") -> NDArray[np.float64]:
+        found = {
+            row["layout"]: float(row["value"])
+            for row in rows
+            if (row["method"], row["quantity"], row["chooser"]) == (method, quantity, chooser)
+        }
+        return np.array([found.get(layout, np.nan) for layout in layouts])
+
+    def known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values[np.isfinite(values)]
+
+    def training(method: str) -> list[str]:
+        reached = of(method, "steps_to_95")
+        ran = int((~np.isnan(reached)).sum())
+        soon = np.sort(reached[~np.isnan(reached)])[ran // 2]
+        lowest = known(of(method, "lowest_after"))
+        return [
+            METHODS[method],
+            f"{np.isfinite(known(reached)).sum()} of {ran}",
+            f"{soon:,.0f}" if np.isfinite(soon) else "never",
+            interval(known(of(method, "success")), 2),
+            interval(known(of(method, "length_over_shortest")), 2),
+            interval(known(of(method, "near")), 2),
+            f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
+        ]
+
+    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts, Student's 95 % interval."
+    yield ""
+    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest", "within 1.5 shortest paths"]
+    yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
+    frozen = [method for method in methods if len(known(of(method, "success", "frozen")))]
+    yield "Played on, frozen: the agent / chance among its own options."
+    yield ""
+    yield from table(
+        ["", "solved", "length / shortest", "within 1.5 shortest paths"],
+        (
+            [
+                METHODS[method],
+                *(
+                    " / ".join(interval(known(of(method, quantity, who)), 2) for who in ("frozen", UNIFORM))
+                    for quantity in ("success", "length_over_shortest", "near")
+                ),
+            ]
+            for method in frozen
+        ),
+    )
+    yield "95 % at, in thousands of steps, layout by layout."
+    yield ""
+    yield from table(
+        ["", *layouts],
+        ([METHODS[method], *(_thousands(steps) for steps in of(method, "steps_to_95").tolist())] for method in methods),
+    )
+
+
+def _thousands(steps: float) -> str:
+    return "-" if math.isnan(steps) else "never" if math.isinf(steps) else f"{steps / 1000:.0f}"
+
+
+def main() -> None:
+    """Take the numbers of a run, or draw the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
+    parser.add_argument("csv", type=Path, help="the file of rows")
+    parser.add_argument("--tables", action="store_true", help="print the tables only")
+    arguments = parser.parse_args()
+    if not arguments.tables:
+        collect(arguments.run, arguments.csv)
+    print("\n".join(tables(arguments.csv)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""Observations that are no pictures, in domains made from Gymnasium environments (Spec B6)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import corridor_env
+import gymnasium
+import h5py
+import numpy as np
+import pytest
+from corridor_env import SENSED, SUB_GOALS, CorridorEnv
+from gymnasium import spaces
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.progress import Progress
+from hypogoal.dataset import DEVIATIONS, NUMBERS, open_dataset, standard_of, standardised, write_dataset
+from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
+from hypogoal.domains.gymnasium_engine import look_of
+
+NAMES = (*(f"layout[{number}]" for number in range(8)), "noise", "place[0]", "place[1]")
+SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
+
+
+class Says(gymnasium.Env[Any, int]):
+    """Gives what it is told to, in this space."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, space: spaces.Space[Any], observation: Any):
+        self.observation_space, self.observation = space, observation
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.observation, {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.observation, 0.0, False, False, {}
+
+
+def read(space: spaces.Space[Any], observation: Any) -> Any:
+    env = Says(space, observation)
+    look = look_of(env)
+    values = look.read(env, observation)
+    assert values.dtype == look.dtype and values.shape == look.shape
+    return values.tolist(), look.features
+
+
+UNIT = spaces.Box(-1, 1, (2,), np.float64)
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "values", "features"),
+    [
+        (UNIT, np.array([0.5, -1.0]), [0.5, -1.0], ("x0", "x1")),
+        (spaces.Box(0, 255, (2,), np.uint8), np.array([3, 4], np.uint8), [3.0, 4.0], ("x0", "x1")),
+        (spaces.Box(0, 9, ()), np.float32(2), [2.0], ("x0",)),
+        (spaces.Box(0, 1, (1, 1, 2)), np.ones((1, 1, 2)), [[[1.0, 1.0]]], ("x0", "x1")),
+        (spaces.Discrete(3), 2, [0.0, 0.0, 1.0], ("x0", "x1", "x2")),
+        (spaces.Discrete(2), np.array(1), [0.0, 1.0], ("x0", "x1")),
+        (spaces.Tuple((UNIT, spaces.Discrete(2))), (np.ones(2), 0), [1.0, 1.0, 1.0, 0.0],
+         ("0[0]", "0[1]", "1[0]", "1[1]")),
+        (spaces.Dict({"b": UNIT, "a": spaces.Dict(c=UNIT)}), {"a": {"c": np.zeros(2)}, "b": np.ones(2)},
+         [0.0, 0.0, 1.0, 1.0], ("a.c[0]", "a.c[1]", "b[0]", "b[1]")),
+    ],
+)  # fmt: skip
+def test_numbers_are_read_in_a_fixed_order(space: Any, observation: Any, values: Any, features: Any) -> None:
+    """Spec B6: as Gymnasium flattens them, each with a name; a box keeps its shape."""
+    assert read(space, observation) == (values, features)
+
+
+@pytest.mark.parametrize("observation", [np.ones(3), np.array([np.nan, 0]), "no", np.array([np.inf, 0], np.float32)])
+def test_what_is_no_such_number_is_one_line(observation: Any) -> None:
+    """Spec G2."""
+    with pytest.raises(UserError, match=r"the environment .*(another observation than|not finite|could not convert)"):
+        read(UNIT, observation)
+
+
+def test_a_picture_alone_in_a_dictionary_is_that_picture() -> None:
+    """Spec B6."""
+    framed, plain = (domain.make_engine(0, 2, 30) for domain in (corridor_env.FRAMED, corridor_env.DOMAIN))
+    assert framed.observation_shape == (48, 48, 3) and framed.observation_dtype == np.uint8
+    np.testing.assert_array_equal(framed.images(framed.ids), plain.images(plain.ids))
+
+
+def test_collected_numbers_are_kept_with_their_names(tmp_path: Any) -> None:
+    """Spec A1, A8: float32, and which is which; a file whose numbers are not finite is refused."""
+    found = SENSED.collect(SMALL, 0, Progress("collect", 1, quiet=True))
+    assert found.observation_shape == (11,) and len(found.labelled.observations) == corridor_env.LENGTH
+    path = tmp_path / "sensed.h5"
+    write_dataset(path, found, domain="own", config={}, seed=0)
+    data = open_dataset(path)
+    assert data.observation_dtype == NUMBERS and data.observation_bytes == 44 and tuple(data.features()) == NAMES
+    np.testing.assert_array_equal(data.unlabelled(), found.unlabelled.observations)
+    place = data.labelled("left-end").observations[:, 9]
+    np.testing.assert_array_equal(data.labelled("left-end").labels, place == 0)
+    found.unlabelled.observations[0, 0] = np.nan
+    write_dataset(path, found, domain="own", config={}, seed=0, force=True)
+    with pytest.raises(UserError, match="not finite"):
+        open_dataset(path).unlabelled()
+
+
+def test_files_from_before_there_were_numbers_hold_pictures(tmp_path: Any) -> None:
+    """Spec A8: without a word of the type it is uint8; a word that says something else is refused."""
+    path = tmp_path / "corridor.h5"
+    found = corridor_env.DOMAIN.collect(SMALL, 0, Progress("collect", 1, quiet=True))
+    write_dataset(path, found, domain="own", config={}, seed=0)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["observation_dtype"]
+    assert open_dataset(path).observation_dtype == np.uint8
+    np.testing.assert_array_equal(open_dataset(path).unlabelled(), found.unlabelled.observations)
+    with h5py.File(path, "r+") as file:
+        file.attrs["observation_dtype"] = np.bytes_("int64")
+    with pytest.raises(UserError, match="not a hypogoal data file"):
+        open_dataset(path)
+
+
+def test_features_may_be_named() -> None:
+    """Spec B6: one name for each number."""
+    named = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=[f"f{number}" for number in range(11)])
+    assert named.look.features[-1] == "f10"
+    with pytest.raises(UserError, match="not as many names of features as numbers: 2 for 11"):
+        _ = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=["a", "b"]).observation_shape
+    with pytest.raises(UserError, match="1 for 0"):
+        _ = GymnasiumDomain(CorridorEnv, SUB_GOALS, features=["a"]).observation_shape
+
+
+class Drifting(CorridorEnv):
+    """No state comes twice."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)  # type: ignore[assignment]
+    steps = 0
+
+    def image(self) -> Any:
+        self.steps += 1
+        return np.array([self.cell, self.steps], np.float32)
+
+
+def test_an_engine_of_states_that_never_repeat_stays_small() -> None:
+    """Spec D2: what was met within the last ``memory`` steps can be drawn, and no more than twice as many are kept."""
+    engine = GymnasiumDomain(Drifting, SUB_GOALS, memory=50).make_engine(0, 2, 30)
+    rng, met = np.random.default_rng(0), []
+    for _ in range(400):
+        step = engine.step(rng.integers(2, size=2))
+        met += list(zip(step.next_ids.tolist(), engine.images(step.next_ids), strict=True))
+        for identity, values in met[-50:]:
+            np.testing.assert_array_equal(engine.images(np.array([identity]))[0], values)
+    assert engine.n_states > 700 and len(engine._ring) == len(engine._ids) == 100
+
+
+def test_numbers_are_standardised_and_cut() -> None:
+    """Spec C2: by mean and deviation of the training data; what never changes is left as far away as it is."""
+    rng = np.random.default_rng(0)
+    data = np.stack([rng.normal(5, 2, 4000), np.full(4000, 7.0)], 1).astype(np.float32)
+    mean, deviation = standard_of((2,), data[:1000], data[1000:])
+    np.testing.assert_allclose(mean, [data[:, 0].mean(), 7], rtol=1e-5)
+    np.testing.assert_allclose(deviation, [data[:, 0].std(), 1], rtol=1e-5)
+    seen = standardised(np.array([[5.0, 7.5], [500.0, 7.0]], np.float32), mean, deviation)
+    assert seen.dtype == NUMBERS and seen[1].tolist() == [DEVIATIONS, 0.0]
+    np.testing.assert_allclose(seen[0], [(5 - mean[0]) / deviation[0], 0.5], rtol=1e-5)
+    assert [part.tolist() for part in standard_of((2,))] == [[0, 0], [1, 1]]

@@ -1,0 +1,267 @@
+"""Encoders of any modules as members: trained, stored, asked and explained (Spec C5, D1, F2, G2)."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import torch_generator
+from hypogoal.diversity import OBJECTIVES
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.evaluation.deep_lift import DEEP_LIFT, INTEGRATED, attributed, mean_state, method_of
+from hypogoal.hypotheses import batches
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
+from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.training import fit
+from hypogoal.options.termination import learned_terminations
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FEW = EnsembleConfig(members=2, steps=3, batch_size=4, diversity_weight=0.1, learning_rate=1e-3)
+
+
+class Block(nn.Module):
+    """A basic block of He et al. 2016: BatchNorm inside, a way around."""
+
+    def __init__(self, channels: int, features: int, stride: int):
+        super().__init__()
+        self.first = nn.Conv2d(channels, features, 3, stride, 1, bias=False)
+        self.second = nn.Conv2d(features, features, 3, 1, 1, bias=False)
+        self.norms = nn.ModuleList(nn.BatchNorm2d(features) for _ in range(2))
+        around = [nn.Conv2d(channels, features, 1, stride, bias=False), nn.BatchNorm2d(features)]
+        self.around = nn.Sequential(*(around if stride > 1 else []))
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.norms[1](self.second(self.norms[0](self.first(x)).relu()))
+        return (y + self.around(x)).relu()
+
+
+class ResNet18(nn.Sequential):
+    """As torchvision's, 11.2 million weights."""
+
+    def __init__(self, channels: int):
+        stem = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)]
+        blocks = [Block(64, 64, 1), Block(64, 64, 1)]
+        for width in (128, 256, 512):
+            blocks += [Block(width // 2, width, 2), Block(width, width, 1)]
+        super().__init__(*stem, *blocks, nn.AdaptiveAvgPool2d(1), nn.Flatten())
+
+
+class Small(nn.Module):
+    """GroupNorm, GELU, attention, LayerNorm and Dropout."""
+
+    def __init__(self, observation_shape: tuple[int, ...]):
+        super().__init__()
+        self.first = nn.Sequential(nn.Conv2d(observation_shape[2], 8, 8, 8), nn.GroupNorm(2, 8), nn.GELU())
+        self.attend, self.norm = nn.MultiheadAttention(8, 2, batch_first=True), nn.LayerNorm(8)
+        self.drop = nn.Dropout(0.1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        x = self.first(images).flatten(2).mT
+        return self.drop(self.norm(x + self.attend(x, x, x)[0])).mean(1)
+
+
+class Whole(nn.Module):
+    """Layers as one module."""
+
+    def __init__(self, *layers: nn.Module):
+        super().__init__()
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.layers(images)
+
+
+@pytest.fixture(autouse=True)
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("ResNet18", "Small", "flat", "whole", "grid", "broken")
+    trusted = ["frozen_backbone:ViT", *(f"test_encoders:{name}" for name in names)]
+    monkeypatch.setenv("HYPOGOAL_TRUST", ",".join(trusted))
+    monkeypatch.setattr(sys, "path", [*sys.path, str(EXAMPLES)])
+
+
+def states(count: int, side: int = 16) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    rng = np.random.default_rng(0)
+    return rng.integers(256, size=(count, side, side, 3), dtype=np.uint8), np.arange(count) % 2 == 0
+
+
+def trained(network: str, config: EnsembleConfig = FEW, side: int = 16, **settings: object) -> Ensemble:
+    images, labels = states(24, side)
+    config = dataclasses.replace(config, network=network, **settings)
+    return fit(images[:12], labels[:12], images[12:], config, 0)
+
+
+@pytest.mark.parametrize(
+    ("network", "encoder", "hidden_width"),
+    [
+        ("test_encoders:ResNet18", "separate", 0),
+        ("test_encoders:ResNet18", "shared", 0),
+        ("frozen_backbone:ViT", "frozen", 32),
+    ],
+)
+def test_large_networks_are_members(network: str, encoder: str, hidden_width: int, tmp_path: Path) -> None:
+    """Spec C5, A8, D1, F2: a ResNet-18 and a frozen ViT-tiny train, store, load, end options and are explained."""
+    engine = DoorKeyEngine(100, 4)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        engine.step(rng.integers(engine.n_actions, size=4))
+    ids = np.arange(min(engine.n_states, 12))
+    images, labels = engine.images(ids), np.arange(len(ids)) % 2 == 0
+    config = dataclasses.replace(FEW, network=network, encoder=encoder, hidden_width=hidden_width)
+    fresh = Ensemble(network, images.shape[1:], 2, torch_generator(0, "weights"), None, encoder, hidden_width).state()
+    half = len(ids) // 2
+    ensemble = fit(images[:half], labels[:half], images[half:], config, 0)
+
+    state = ensemble.state()
+    moved = {name for name, value in state.items() if not torch.equal(value, fresh[name])}
+    learns = {"separate": {"members"}, "shared": {"trunk", "heads"}, "frozen": {"heads"}}[encoder]
+    assert {name.split(".")[0] for name in moved} == learns
+    size = sum(value.numel() for name, value in state.items() if "running" not in name and "num_" not in name)
+    trunks = 2 if encoder == "separate" else 1
+    assert 5.3e6 * trunks < size < 11.3e6 * trunks, "a trunk is stored once"
+
+    write_ensemble(tmp_path, "goal", ensemble)
+    about = {**dataclasses.asdict(config), "observation_shape": list(images.shape[1:]), "sub_goals": ["goal"]}
+    back = read_ensemble(tmp_path, about, "goal")
+    np.testing.assert_array_equal(back.logits(images), ensemble.logits(images))
+
+    back.set_thresholds(np.median(back.predict(images), axis=0) + np.float32(1e-3))
+    asked: list[int] = []
+    if back.trunk is not None:
+        back.trunk[0].register_forward_hook(lambda _, given, __: asked.append(len(given[0])))
+    wanted = np.concatenate([back.verdicts(images)] * 2, axis=1)
+    for running_only in (False, True):
+        asked.clear()
+        ends = learned_terminations(engine, [back], running_only=running_only)
+        options = np.arange(len(ids)) % 2
+        for turn in (options, 1 - options):
+            np.testing.assert_array_equal(ends.of_running(ids, turn), wanted[ids, turn])
+        assert sum(asked) == (0 if back.trunk is None else len(ids)), "the trunk sees each state once for all members"
+
+    found = attributed(back, images[:1], mean_state(images))
+    differences = np.abs(found.log_odds - found.baseline_log_odds)
+    assert found.method == INTEGRATED and found.values.shape == (1, 2, *images.shape[1:])
+    assert (found.completeness_error() < 0.1 * differences + 1e-6).all()
+    assert (np.abs(found.values).sum((0, 2, 3, 4)) > 1e-4).all()
+
+
+def flat(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+    return [nn.Conv2d(channels, 4, 4, 4), nn.BatchNorm2d(4), nn.ReLU()], (6,)
+
+
+def whole(channels: int) -> nn.Module:
+    return Whole(*flat(channels)[0], nn.Flatten())
+
+
+@pytest.mark.parametrize("unlabelled_bn", [True, False])
+@pytest.mark.parametrize("diversity", ["dbat", "none"])
+def test_batchnorm_inside_an_encoder_is_as_outside(unlabelled_bn: bool, diversity: str) -> None:
+    """Spec C5, C6: groups of states apart, and counted where they are to be: the same training, whoever holds it."""
+    settings = {"unlabelled_bn": unlabelled_bn, "diversity": diversity}
+    outside, inside = (
+        trained("test_encoders:flat", **settings).state(),
+        trained("test_encoders:whole", hidden_width=6, **settings).state(),
+    )
+    assert len(outside) == len(inside)
+    for one, other in zip(outside.values(), inside.values(), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+    counted = inside["members.0.0.layers.1.num_batches_tracked"].item()
+    assert counted == (6 if unlabelled_bn else 3)
+
+
+@pytest.mark.parametrize("encoder", ["shared", "frozen"])
+def test_shared_plain_layers_take_every_short_cut(encoder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5: our own networks may be shared; distinct patches, folding and plain passes give the same members."""
+    rng = np.random.default_rng(0)
+    cells = rng.choice([10, 90, 200], size=(PATCHES_FROM + 4, 6, 6, 3), p=(0.9, 0.05, 0.05)).astype(np.uint8)
+    images = cells.repeat(8, axis=1).repeat(8, axis=2)
+    labels = np.arange(len(images)) % 3 == 0
+    config = dataclasses.replace(FEW, network="doorkey", encoder=encoder)
+    ensemble = fit(images[:40], labels[:40], images[40:80], config, 0)
+    with torch.no_grad():
+        inputs = as_input(torch.from_numpy(images))
+        expected = torch.stack([member(inputs) for member in ensemble.members], dim=1).numpy()
+    for count in (len(images), 40, 3):
+        np.testing.assert_allclose(ensemble.logits(images[:count]), expected[:count], atol=1e-5)
+    stacked = StackedMembers([ensemble], repeats=True).log_odds(images[:5])
+    np.testing.assert_allclose(stacked, (expected[..., 1] - expected[..., 0])[:5], atol=1e-5)
+    assert all(method_of(member) == DEEP_LIFT for member in ensemble.members)
+    monkeypatch.setattr(batches.patches, "make_tables", lambda *_: None)
+    slow = fit(images[:40], labels[:40], images[40:80], config, 0)
+    np.testing.assert_allclose(slow.logits(images[:9]), ensemble.logits(images[:9]), atol=1e-3)
+
+
+@pytest.mark.parametrize("diversity", [name for name in OBJECTIVES if name != "none"])
+@pytest.mark.parametrize("encoder", ["separate", "shared", "frozen"])
+def test_every_objective_trains_encoders(diversity: str, encoder: str) -> None:
+    """Spec C2, C4: attention, GELU and layer normalisation under all objectives; a frozen encoder does not move."""
+    config = {"diversity": diversity, "encoder": encoder, "hidden_width": 4, "augment": "grey"}
+    ensemble = trained("test_encoders:Small", **config)
+    fresh = Ensemble("test_encoders:Small", (16, 16, 3), 2, torch_generator(0, "weights"), None, encoder, 4).state()
+    same = {name: torch.equal(value, fresh[name]) for name, value in ensemble.state().items() if name != "thresholds"}
+    assert all(equal == (encoder == "frozen" and name.startswith("trunk.")) for name, equal in same.items())
+    assert not ensemble.training
+    assert ensemble.train().trunk is None or ensemble.trunk[0].drop.training == (encoder == "shared")
+
+
+def test_sequential_members_share_only_what_is_frozen() -> None:
+    """Spec C4, G2."""
+    with pytest.raises(UserError, match="members one after the other cannot share an encoder that learns"):
+        trained("test_encoders:Small", encoder="shared", schedule="sequential")
+    two = trained("test_encoders:Small", encoder="frozen", schedule="sequential").state()
+    one = trained("test_encoders:Small", encoder="frozen", schedule="sequential", members=1).state()
+    assert all(torch.equal(value, two[name]) for name, value in one.items() if name != "thresholds")
+
+
+def grid(channels: int) -> nn.Module:
+    return nn.Conv2d(channels, 4, 8, 8)
+
+
+def broken(observation_shape: tuple[int, ...]) -> nn.Module:
+    return Whole(nn.Linear(observation_shape[0], 3), nn.Flatten(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("grid", r"is an encoder that makes torch.float32 \(1, 4, 2, 2\) of a state.*Make features, float32 \(N, F\)"),
+        ("broken", r"is an encoder that makes torch.float32 \(144,\)"),
+        ("Whole", r"raised TypeError: .*not a Module"),
+    ],
+)
+def test_encoders_that_make_no_features_are_one_clear_line(
+    name: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec G2: with the place in the user's file."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", f"test_encoders:{name}")
+    with pytest.raises(UserError, match=said) as caught:
+        build_network(f"test_encoders:{name}", (16, 16, 3), torch.Generator())
+    assert "test_encoders.py, line" in str(caught.value)
+
+
+def test_layers_of_other_classes_take_no_short_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec C5: a convolution that computes something else is no convolution to fold, stack, look up or explain by."""
+
+    class Halved(nn.Conv2d):
+        def forward(self, input: Tensor) -> Tensor:
+            return super().forward(input) / 2
+
+    def halved(channels: int) -> tuple[list[nn.Module], tuple[int, ...]]:
+        return [Halved(channels, 4, 8, 8), nn.BatchNorm2d(4), nn.ReLU()], (5,)
+
+    monkeypatch.setitem(NETWORKS, "halved", halved)
+    ensemble = Ensemble("halved", (16, 16, 3), 2, torch.Generator()).eval()
+    images = np.repeat(states(4)[0], PATCHES_FROM, axis=0)
+    with torch.no_grad():
+        plain = torch.stack([member(as_input(torch.from_numpy(images))) for member in ensemble.members], 1).numpy()
+    np.testing.assert_allclose(ensemble.logits(images), plain, atol=1e-6)
+    assert not StackedMembers([ensemble]).joined and method_of(ensemble.members[0]) == INTEGRATED

@@ -1,0 +1,128 @@
+"""Members on observations that are no pictures (Spec C2, C5, F2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from hypogoal.core.errors import UserError
+from hypogoal.evaluation.deep_lift import DEEP_LIFT, INTEGRATED, attributed, deep_lift, mean_state
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
+from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.training import fit
+
+FAR = np.array([1e4, 3.0, -0.01, 7.0], np.float32)  # numbers of quite different sizes, the last of which never changes
+
+
+def states(count: int, seed: int, shape: tuple[int, ...] = (4,)) -> tuple[np.ndarray, np.ndarray]:
+    """Positive where the third number is above its mean."""
+    numbers = np.random.default_rng(seed).normal(FAR, [500, 0.1, 0.002, 0], (count, 4)).astype(np.float32)
+    return numbers.reshape(count, *shape), numbers[:, 2] > FAR[2]
+
+
+def trained(shape: tuple[int, ...] = (4,), seed: int = 0, **settings: Any) -> Ensemble:
+    (seen, labels), (others, _) = states(300, 1, shape), states(200, 2, shape)
+    config = EnsembleConfig(**{"members": 2, "diversity_weight": 0.0, **settings})  # type: ignore[arg-type]
+    return fit(seen, labels, others, config, seed)
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 2), (2, 1, 2)])
+def test_members_learn_numbers_of_any_size_and_shape(shape: tuple[int, ...], tmp_path: Path) -> None:
+    """Spec C5, A8: by default in the steps that pictures take; stored and read they say the same."""
+    ensemble, (seen, labels) = trained(shape), states(1000, 3, shape)
+    assert ensemble.network == "mlp" and "float32" in repr(ensemble)
+    assert ((ensemble.verdicts(seen) == labels[:, None]).mean(0) > 0.93).all()
+    np.testing.assert_array_equal(ensemble.predict(seen.astype(np.float64)), ensemble.predict(seen))
+    write_ensemble(tmp_path, "up", ensemble)
+    about = {"sub_goals": ["up"], "network": "mlp", "members": 2, "observation_shape": list(shape)}
+    again = read_ensemble(tmp_path, {**about, "observation_dtype": "float32"}, "up")
+    np.testing.assert_array_equal(again.predict(seen), ensemble.predict(seen))
+    with pytest.raises(UserError, match="the weights do not fit"):
+        read_ensemble(tmp_path, about, "up")
+    with pytest.raises(UserError, match=r"Give float32 \(N, "):
+        ensemble.predict(seen.astype(np.uint8))
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 2), (2, 1, 2)])
+def test_all_members_at_once_say_the_same(shape: tuple[int, ...]) -> None:
+    """Spec D1: of ensembles that standardise otherwise, too; of one, and of pictures that a plain network sees."""
+    ensembles = [trained(shape, steps=5, seed=seed) for seed in (0, 1)]
+    ensembles[1].view.mean += 1.0
+    seen, _ = states(20, 4, shape)
+    stacked = StackedMembers(ensembles)
+    assert stacked.joined
+    alone = np.concatenate([ensemble.log_odds(seen) for ensemble in ensembles], axis=1)
+    np.testing.assert_allclose(stacked.log_odds(seen), alone, atol=1e-5)
+    np.testing.assert_allclose(StackedMembers(ensembles[:1]).log_odds(seen), alone[:, :2], atol=1e-5)
+    images = np.random.default_rng(0).integers(256, size=(9, 6, 6, 3), dtype=np.uint8)
+    plain = Ensemble("mlp", (6, 6, 3), 3, torch.Generator().manual_seed(0)).eval()
+    np.testing.assert_allclose(StackedMembers([plain]).log_odds(images), plain.log_odds(images), atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 1, 2)])
+def test_attributions_to_numbers_are_complete(shape: tuple[int, ...]) -> None:
+    """Spec F2: they add up to the difference in log-odds; the number that decides gets the most."""
+    ensemble, (seen, _) = trained(shape), states(50, 5, shape)
+    baseline = mean_state(ensemble.see(seen))
+    assert baseline.shape == shape and baseline.dtype == np.float32
+    found = deep_lift(ensemble, ensemble.see(seen), baseline)
+    assert found.values.shape == (50, 2, *shape) and found.completeness_error().max() < 1e-9
+    mean = np.abs(found.values).mean(0).reshape(2, 4)
+    assert (mean.argmax(1) == 2).all() and (mean[:, 3] == 0).all()
+
+
+@pytest.mark.parametrize("settings", [{"view": "agent-crop"}, {"augment": "grey"}, {"jitter": 2}])
+def test_what_needs_pictures_is_refused(settings: dict[str, Any]) -> None:
+    """Spec G2."""
+    [name] = settings
+    with pytest.raises(UserError, match=f"these observations are no pictures: {name}=.* Set {name}="):
+        trained(**settings)
+
+
+def test_a_network_for_pictures_is_refused() -> None:
+    """Spec G2."""
+    with pytest.raises(UserError, match=r"'montezuma' takes images \(H, W, C\): .* Give --set network=mlp"):
+        trained(network="montezuma")
+
+
+class Reader(nn.Module):
+    """Of four numbers, in an order of their own, what is above their mean."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mix = nn.Linear(4, 16)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.mix(x.flatten(1)))
+
+
+def reader(channels: int) -> nn.Module:
+    return Reader()
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 1, 2)])
+@pytest.mark.parametrize(("network", "encoder"), [("test_standard_view:reader", "separate"), ("mlp", "shared")])
+@pytest.mark.parametrize("frozen", [False, True])
+def test_numbers_may_have_an_encoder(
+    network: str, encoder: str, frozen: bool, shape: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec C5, F2: any module, of each member, of all, or frozen; stored, read, asked at once, and explained."""
+    monkeypatch.setenv("HYPOGOAL_TRUST", network)
+    settings = {"network": network, "encoder": "frozen" if frozen else encoder}
+    ensemble, (seen, labels) = trained(shape, learning_rate=0.01, **settings), states(200, 3, shape)
+    assert ((ensemble.verdicts(seen) == labels[:, None]).mean(0) > 0.8).all()
+    write_ensemble(tmp_path, "up", ensemble)
+    about = {"sub_goals": ["up"], "members": 2, "observation_shape": list(shape), "observation_dtype": "float32"}
+    log_odds = ensemble.log_odds(seen)
+    np.testing.assert_array_equal(read_ensemble(tmp_path, about | settings, "up").log_odds(seen), log_odds)
+    np.testing.assert_allclose(StackedMembers([ensemble]).log_odds(seen), log_odds, atol=1e-5)
+    found = attributed(ensemble, ensemble.see(seen[:20]), mean_state(ensemble.see(seen)))
+    assert found.method == (DEEP_LIFT if network == "mlp" else INTEGRATED)
+    assert found.values.shape == (20, 2, *shape) and found.completeness_error().max() < 0.05
+    assert (np.abs(found.values).mean(0).reshape(2, 4).argmax(1) == 2).all()
