@@ -22,7 +22,6 @@ from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
 from hypogoal.evaluation.numbers import (
     ORACLE,
-    PICKED,
     Metrics,
     Rows,
     by_method,
@@ -235,18 +234,6 @@ UNSEEN = (
     page.number("acc., all", "scores.all.accuracy.best", page.deviation, 2),
     page.number("seeds", "ensembles"),
 )
-SUMMARY = (
-    METHOD,
-    N,
-    *(
-        page.number(f"unseen: {which}", f"scored.scores.unseen.balanced_accuracy.{which}", page.deviation, 2)
-        for which in PICKED
-    ),
-    page.number("all: best acc.", "scored.scores.all.accuracy.best", page.deviation, 2),
-    page.number("distance: best", "distance.best", page.deviation, 1),
-    page.number("mean", "distance.mean", page.deviation, 1),
-    page.number("at base: best", "distance.reached_base.mean", page.percent),
-)
 
 
 def summary(metrics: Metrics) -> list[Table]:
@@ -263,7 +250,7 @@ def sections(material: Material) -> list[Block]:
 
 
 def ladders_section(material: Material) -> Block:
-    """The question, the answer in two sentences, and the headline table."""
+    """The question, and the answer in two sentences."""
     metrics = material.metrics
     asked = (
         "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
@@ -272,23 +259,8 @@ def ladders_section(material: Material) -> Block:
     )
     alone = not metrics["agents"]
     identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
-    rows, stops = metrics["rooms"], metrics["distance"]["over_ladders"]
-    scored, stopped = ({itemgetter(*CELL)(row): row for row in each} for each in (rows, stops))
-    headline = page.table(
-        SUMMARY,
-        [
-            {"method": key[0], "groups": key[1], "scored": scored.get(key), "distance": stopped.get(key)}
-            for key in dict.fromkeys([*scored, *stopped])
-        ],
-        tight=True,
-        caption="Unseen: balanced accuracy on rooms that no training state came from, of the best, the validated and "
-        "the mean member. All: accuracy of the best member on all held-out rooms, training rooms included: the paper's "
-        "Figure 3. Distance, in units of position: where options stop, from the nearest true base, mean over ladders, "
-        "of the best member (the paper's Figure 4, lower is better) and of the mean one; and the share of the best "
-        "one's executions that got to a base. Mean over seeds ± standard deviation; N: labelled ladder groups.",
-    )
-    answer = " ".join(filter(None, [_scored(rows), _stopped(stops)]))
-    return page.section(identity, title, [asked, answer], [headline], metrics["missing"] if alone else [])
+    answer = " ".join(filter(None, [_scored(metrics["rooms"]), _stopped(metrics["distance"]["over_ladders"])]))
+    return page.section(identity, title, [answer, asked], [], metrics["missing"] if alone else [])
 
 
 def _scored(rows: Sequence[Entry]) -> str:
