@@ -17,6 +17,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "hypotheses-ladders": ladders.tables,
     "labels-doorkey": labels.tables,
     "options-that-hold": ladder_options.tables_that_hold,
+    "preference-doorkey": choosing.tables,
     "thresholds-doorkey": thresholds.tables,
     "which-feature": which_feature.tables,
     "which-feature-bandits": bandits.tables,
