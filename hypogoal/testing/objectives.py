@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,9 +17,13 @@ AGREED = ((1, 0), (1, 1), (0, 0))
 
 def check_objective(objective: Objective) -> Iterator[Verdict]:
     """Whether a diversity objective, see :func:`hypogoal.diversity.load_objective`, keeps what training relies on."""
-    loss: Any = objective.pair_loss or objective.ensemble_loss
-    laws: tuple[Callable[[Any], str], ...] = OF_PAIRS if objective.pair_loss else OF_ENSEMBLES
-    return run((law.__name__.replace("_", " ").removeprefix("ensemble "), lambda law=law: law(loss)) for law in laws)  # type: ignore[misc]
+    laws: list[tuple[Callable[[Any], str], Any]] = [(law, objective) for law in OF_ALL]
+    if objective.pair_loss:
+        laws = [(shape, objective.pair_loss), *laws, *((law, objective.pair_loss) for law in OF_PAIRS)]
+    else:
+        laws = [(ensemble_shape, objective.ensemble_loss), *laws]
+        laws += [(law, objective.ensemble_loss) for law in OF_ENSEMBLES]
+    return run((law.__name__.replace("_", " ").removeprefix("ensemble "), partial(law, of)) for law, of in laws)
 
 
 def confident(*classes: int, gap: float = 6.0) -> Tensor:
@@ -36,15 +41,6 @@ def shape(pair_loss: PairLoss) -> str:
     alone = torch.allclose(loss[2], pair_loss(a[2], b[2]))
     promise(alone, "a pair's loss depends on the others in the batch", "Treat leading axes one by one.")
     return "(..., N, 2) gives (...,)"
-
-
-def empty_sets(pair_loss: PairLoss) -> str:
-    """No unlabelled states."""
-    a, b = torch.zeros(3, 0, 2, requires_grad=True), torch.zeros(3, 0, 2, requires_grad=True)
-    loss = pair_loss(a, b)
-    nothing = loss.shape == (3,) and bool((loss == 0).all())
-    promise(nothing, f"no states give {loss.tolist()}", "Give 0 there: divide by max(N, 1).")
-    return "no states give 0"
 
 
 def disagreement_lowers_it(pair_loss: PairLoss) -> str:
@@ -71,19 +67,6 @@ def descent_parts_members(pair_loss: PairLoss, steps: int = 400) -> str:
     text = f"after {steps} steps of descent members disagree with probability {after:.3f}, {before:.3f} before"
     promise(after > before + 0.02, text, "Its gradient must push agreeing members apart.")
     return f"disagreement rises from {before:.2f} to {after:.2f}"
-
-
-def order_does_not_matter(pair_loss: PairLoss) -> str:
-    """Neither that of the members nor that of the states."""
-    generator = torch.Generator().manual_seed(4)
-    a, b = torch.randn(2, 7, 2, generator=generator, dtype=torch.float64) * 4
-    loss = pair_loss(a, b)
-    symmetric = torch.allclose(loss, pair_loss(b, a))
-    promise(symmetric, "the loss changes when the members change places", "Make it symmetric, for example by a mean.")
-    order = torch.randperm(7, generator=generator)
-    any_order = torch.allclose(loss, pair_loss(a[order], b[order]))
-    promise(any_order, "the loss depends on the order of the states", "Use a mean over states.")
-    return "members and states are interchangeable"
 
 
 def finite_at_extreme_logits(pair_loss: PairLoss) -> str:
@@ -117,15 +100,7 @@ def gradient_does_not_vanish(pair_loss: PairLoss, gap: float = 10.0) -> str:
     return f"{largest:.2g} where sure members agree"
 
 
-OF_PAIRS = (
-    shape,
-    empty_sets,
-    disagreement_lowers_it,
-    descent_parts_members,
-    order_does_not_matter,
-    finite_at_extreme_logits,
-    gradient_does_not_vanish,
-)
+OF_PAIRS = (disagreement_lowers_it, descent_parts_members, finite_at_extreme_logits, gradient_does_not_vanish)
 
 
 def context_of(
@@ -178,22 +153,24 @@ def ensemble_shape(ensemble_loss: EnsembleLoss) -> str:
     return "one number for 1 to 3 members, frozen ones among them"
 
 
-def ensemble_empty_sets(ensemble_loss: EnsembleLoss) -> str:
+def empty_sets(objective: Objective) -> str:
     """No unlabelled states."""
     context = context_of(states=0)
-    loss = ensemble_loss(context)
+    loss = objective.losses(context).sum()
     _differentiate(loss, context)
-    promise(bool(loss.isfinite()), f"no unlabelled states give {loss.item()}", "Divide by max(N, 1).")
+    fits = loss == 0 if objective.pair_loss else loss.isfinite()
+    promise(bool(fits), f"no unlabelled states give {loss.item()}", "Divide by max(N, 1).")
     return f"no unlabelled states give {loss.item():.3g}"
 
 
-def ensemble_order_does_not_matter(ensemble_loss: EnsembleLoss) -> str:
+def order_does_not_matter(objective: Objective) -> str:
     """Neither that of the members nor that of the states."""
     context, none = context_of(), torch.arange(3)
-    loss = ensemble_loss(context)
-    same = torch.allclose(loss, ensemble_loss(rearranged(context, torch.tensor([2, 0, 1]), torch.arange(7))))
+    loss = objective.losses(context).sum()
+    same = torch.allclose(loss, objective.losses(rearranged(context, torch.tensor([2, 0, 1]), torch.arange(7))).sum())
     promise(same, "the loss changes when the members change places", "Make it symmetric, for example by a mean.")
-    same = torch.allclose(loss, ensemble_loss(rearranged(context, none, torch.tensor([3, 6, 0, 5, 1, 2, 4]))))
+    other = rearranged(context, none, torch.tensor([3, 6, 0, 5, 1, 2, 4]))
+    same = torch.allclose(loss, objective.losses(other).sum())
     promise(same, "the loss depends on the order of the states", "Use a mean over states.")
     return "members and states are interchangeable"
 
@@ -228,10 +205,5 @@ def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
     return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in both]
 
 
-OF_ENSEMBLES = (
-    ensemble_shape,
-    ensemble_empty_sets,
-    ensemble_order_does_not_matter,
-    ensemble_finite_at_extreme_logits,
-    ensemble_gradient_does_not_vanish,
-)
+OF_ALL = (empty_sets, order_does_not_matter)
+OF_ENSEMBLES = (ensemble_finite_at_extreme_logits, ensemble_gradient_does_not_vanish)
