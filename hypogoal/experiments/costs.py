@@ -12,7 +12,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import human
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
-from hypogoal.learners.baselines.settings import DQNSettings, hyperparameters
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings
 from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
 from hypogoal.settings import configuration
 
@@ -91,7 +91,7 @@ class Estimates:
             cores = min(config.workers or goals, goals)
             return Cost(seconds, ensemble_process(taught, count), ensemble_disk(goals, count), cores)
         if cell.stage == "train-baseline":
-            chosen = hyperparameters(config.agent, config.setting)
+            chosen = HYPERPARAMETERS[config.agent, config.setting]
             kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
             return Cost(seconds, *baseline_needs(domain.observation_bytes, kept))

@@ -14,7 +14,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import Domain, load_domain
-from hypogoal.learners.baselines.settings import BaselineConfig, DQNSettings, hyperparameters
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig, DQNSettings
 from hypogoal.meta.training import cut, played_world, write_layout
 from hypogoal.needs import baseline_needs
 
@@ -45,7 +45,7 @@ def train_baseline(
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
     world = played_world(played, _world_of(data, domain, played) if data else {}, config.world)
-    chosen = hyperparameters(config.agent, config.setting)
+    chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
     engine = played.make_engine(config.layout_seed, chosen.environments, config.max_episode_steps, **world)

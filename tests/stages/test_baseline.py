@@ -22,7 +22,6 @@ from hypogoal.learners.baselines.settings import (
     BaselineConfig,
     DQNSettings,
     PPOSettings,
-    hyperparameters,
 )
 from hypogoal.stages.train_baseline import train_baseline
 
@@ -75,7 +74,7 @@ class Corridor:
 @pytest.mark.parametrize(("agent", "setting"), list(HYPERPARAMETERS))
 def test_solves_an_easy_task(agent, setting):
     """Spec E7: every baseline, in either setting, learns a corridor that random play rarely finishes in time."""
-    chosen = hyperparameters(agent, setting)
+    chosen = HYPERPARAMETERS[agent, setting]
     env = EngineEnv(Corridor(chosen.environments))
     trained = train(env, chosen, steps=EASY_STEPS[agent, setting], seed=1)
     assert np.mean([terminated for *_, terminated, _ in env.episodes[:20]]) < 0.8
@@ -145,7 +144,7 @@ def test_block_convolution_is_a_convolution():
 
 def test_epsilon_waits_for_the_first_goal():
     """Spec E7, Table 4: 1 -> 0.01 over 8,000 steps from the start; the tuned one falls from its first goal on."""
-    paper, tuned = hyperparameters("dqn", "paper"), hyperparameters("dqn", "tuned")
+    paper, tuned = HYPERPARAMETERS["dqn", "paper"], HYPERPARAMETERS["dqn", "tuned"]
     assert isinstance(paper, DQNSettings)
     assert isinstance(tuned, DQNSettings)
     assert [round(epsilon(paper, step, None), 3) for step in (0, 4_000, 8_000, 9_000)] == [1.0, 0.505, 0.01, 0.01]
@@ -155,7 +154,7 @@ def test_epsilon_waits_for_the_first_goal():
 
 def test_the_paper_setting_is_the_papers():
     """Spec E3, D3, E7: the numbers of Tables 4 and 5."""
-    ppo, dqn = hyperparameters("ppo", "paper"), hyperparameters("dqn", "paper")
+    ppo, dqn = HYPERPARAMETERS["ppo", "paper"], HYPERPARAMETERS["dqn", "paper"]
     assert isinstance(ppo, PPOSettings)
     assert isinstance(dqn, DQNSettings)
     assert (ppo.rollout, ppo.entropy, ppo.gae_lambda, ppo.batch, ppo.epochs) == (100, 0.01, 0.97, 64, 10)
@@ -189,7 +188,7 @@ def test_global_randomness_is_given_back():
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    train(EngineEnv(Corridor(4)), hyperparameters("ppo", "paper"), steps=100, seed=0)
+    train(EngineEnv(Corridor(4)), HYPERPARAMETERS["ppo", "paper"], steps=100, seed=0)
     assert torch.rand(1) == expected
 
 

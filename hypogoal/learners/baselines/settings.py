@@ -7,7 +7,6 @@ read the two tables as theirs too. Where it is silent the value is stable-baseli
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
-from hypogoal.core.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,8 @@ class DQNSettings:
     gamma: float = setting(0.95, "discount per step", source="ours: at 0.99 it does not learn a corridor")
 
 
-# The paper's settings are the defaults above. Four environments with one update per joint step are its "update interval
-# 4" with a quarter of the overhead. The tuned settings start from a pilot on three-key DoorKey: many environments,
+# By agent and setting; the paper's are the defaults above. Four environments with one update per joint step are its "update
+# interval 4" with a quarter of the overhead. The tuned settings start from a pilot on three-key DoorKey: many environments,
 # larger batches and steps, and a DQN that keeps exploring until it has seen the goal once.
 HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
     ("ppo", "paper"): PPOSettings(),
@@ -64,15 +63,6 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
         epsilon_final=0.05,
     ),
 }
-
-
-def hyperparameters(agent: str, name: str) -> PPOSettings | DQNSettings:
-    """Those of ``agent`` (ppo, dqn) in setting ``name`` (paper, tuned); a ``UserError`` where there are none."""
-    try:
-        return HYPERPARAMETERS[agent, name]
-    except KeyError:
-        known = ", ".join(" ".join(key) for key in HYPERPARAMETERS)
-        raise UserError("unknown baseline", f"{agent} {name}", f"Choose one of {known}.") from None
 
 
 @dataclass(frozen=True)
