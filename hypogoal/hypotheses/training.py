@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterator, Sequence
 from functools import partial
 from itertools import islice
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.checkpoints import Checkpoints, State, optimiser_snapshot, restore_optimiser
+from hypogoal.core.checkpoints import Checkpoints, Resumable, State, optimiser_snapshot, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.dataset import Observations
@@ -28,22 +28,6 @@ from hypogoal.hypotheses.views import Origins, needed, positions_of, view_of
 OnStep = Callable[[int, dict[str, float]], None]
 Look = Callable[[int, Ensemble], None]
 REPORT_EVERY = 10  # steps between reports, and between looks for NaN: a look makes a GPU wait
-
-
-class Report(ABC):
-    """An ``on_step`` that goes on where it was, with the training that it is told of."""
-
-    @abstractmethod
-    def __call__(self, step: int, losses: dict[str, float]) -> None:
-        """See :func:`fit`."""
-
-    @abstractmethod
-    def snapshot(self) -> State:
-        """What it needs to go on."""
-
-    @abstractmethod
-    def restore(self, snapshot: State) -> None:
-        """Go on from a snapshot."""
 
 
 def fit(
@@ -78,7 +62,7 @@ def fit(
             ``action``, ``previous_action`` for localiser=learned.
         agent_pixels: the domain's, for view=agent-crop; None where it does not know.
         device: where to train; the ensemble stays there, in evaluation mode.
-        checkpoints: spec G1; a :class:`Report` is part of them.
+        checkpoints: spec G1; an ``on_step`` that is ``Resumable`` goes on with the training that it is told of.
 
     Raises:
         UserError: labels of one class only, no unlabelled states though members are to differ or thresholds to be set
@@ -94,7 +78,7 @@ def fit(
         what = "members one after the other cannot share an encoder that learns"
         raise UserError(what, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")
     checkpoints = checkpoints or Checkpoints(None)
-    saved = checkpoints.load() or {}
+    saved, report = checkpoints.load() or {}, cast(object, on_step)
     view = view_of(
         observations,
         unlabelled,
@@ -111,8 +95,8 @@ def fit(
     ).to(device)
     if saved:
         ensemble.load_state_dict(saved["ensemble"])
-        if isinstance(on_step, Report):
-            on_step.restore(saved["told"])
+        if isinstance(report, Resumable):
+            report.restore(saved["told"])
     trunk, networks = ensemble.parts
     by_ladder = config.batch_kind == "per-ladder"
     ladders = needed(origins, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
@@ -132,7 +116,7 @@ def fit(
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
     def state(number: int, part: _Round | None) -> State:
-        told = {"told": on_step.snapshot()} if isinstance(on_step, Report) else {}
+        told = {"told": report.snapshot()} if isinstance(report, Resumable) else {}
         return {"round": number, "part": part.snapshot() if part else {}, "ensemble": ensemble.state_dict(), **told}
 
     first = saved.get("round", 0)
@@ -265,9 +249,6 @@ class _Round:
         self.losses.clear()
         for row, column in (~losses.isfinite()).nonzero().tolist():
             step = self.before + self.done - len(losses) + row + 1
-            raise NumericalError(f"{self._names()[column]} is {losses[row, column].item()} at step {step}")
-
-    def _names(self) -> list[str]:
-        """Of the losses, in their order."""
-        names = [f"the labelled loss of member {member}" for member in self.members]
-        return names + (self.objective.terms(self.members, self.members[0]) if self.objective else [])
+            names = [f"the labelled loss of member {member}" for member in self.members]
+            names += self.objective.terms(self.members, self.members[0]) if self.objective else []
+            raise NumericalError(f"{names[column]} is {losses[row, column].item()} at step {step}")

@@ -1,6 +1,6 @@
 """Spec A2: train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
-from hypogoal.core.checkpoints import FOLDER, checkpoints_of
+from hypogoal.core.checkpoints import FOLDER, Resumable, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
@@ -27,7 +27,7 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, network_for
 from hypogoal.hypotheses.scores import best_threshold, halves, member_scores, ranking
 from hypogoal.hypotheses.thresholds import thresholds
-from hypogoal.hypotheses.training import Report, fit
+from hypogoal.hypotheses.training import fit
 from hypogoal.hypotheses.views import positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
@@ -151,7 +151,7 @@ def score_rows(
             yield {"scope": scope, "member": member, **counts, **numbers}
 
 
-class _Report(Report):
+class _Report(Resumable):
     """Writes the losses of a sub-goal's ensemble down as they come, and remembers the last ones; its scores too."""
 
     def __init__(self, sub_goal: str, log: MetricsLog, scores: MetricsLog):
@@ -177,7 +177,7 @@ class _Report(Report):
     def snapshot(self) -> dict[str, Any]:
         return {"log": self.log.snapshot(), "scores": self.scores.snapshot(), "numbers": self.numbers}
 
-    def restore(self, snapshot: dict[str, Any]) -> None:
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
         self.log.restore(snapshot["log"])
         self.scores.restore(snapshot["scores"])
         self.numbers = snapshot["numbers"]
