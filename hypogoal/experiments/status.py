@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import MANIFEST, Artefact, check_files, find_input, open_artefact, sha256_of
+from hypogoal.core.artefacts import MANIFEST, check_files, find_input, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.run import find
@@ -214,8 +214,7 @@ def _fault(cell: Cell) -> str:
     for entry in artefact.manifest["inputs"]:
         if find_input(artefact.path, entry)[1].startswith("changed"):
             return f"its input {entry['path']} was changed since"
-    others = cell.stage == "evaluate" and not _of_all(artefact, Path(cell.arguments[1]))
-    return "it is of other artefacts" if others else ""
+    return "it is of other artefacts" if cell.stage in DERIVED and not is_current(cell) else ""
 
 
 def is_current(cell: Cell) -> bool:
@@ -230,10 +229,3 @@ def is_current(cell: Cell) -> bool:
         return read.issuperset(sha256_of(path / MANIFEST) for path in sources)
     except (UserError, OSError):
         return False
-
-
-def _of_all(evaluation: Artefact, run: Path) -> bool:
-    """Whether an evaluation read every artefact that it would read now."""
-    entries = [entry for entry in evaluation.manifest["inputs"] if entry["kind"] != "data"]
-    read = {path for entry in entries if (path := find_input(evaluation.path, entry)[0]) is not None}
-    return read == {artefact.path.resolve() for artefact in find(run).everything()}
