@@ -6,8 +6,8 @@ from typing import Any
 
 from hypogoal.core import own_code
 from hypogoal.core.artefacts import ARRAYS, DATA, claim
-from hypogoal.core.drafts import put_in_place
 from hypogoal.core.errors import UserError, printable
+from hypogoal.core.files import replacing
 from hypogoal.core.own_code import load_own
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.terminal import say
@@ -84,9 +84,5 @@ def export_data(data: Path, out: Path, *, force: bool = False) -> None:
     out = claim(out, kind=ARRAYS, inputs=[data], force=force)
     dataset = open_dataset(data)
     out.parent.mkdir(parents=True, exist_ok=True)
-    made = out.with_name(f".{out.name}.new")
-    try:
+    with replacing(out) as made:
         write_arrays(made, dataset)
-        put_in_place(made, out)
-    finally:
-        made.unlink(missing_ok=True)
