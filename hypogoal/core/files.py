@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn, TypeGuard
+from typing import Any, TypeGuard
 
 from hypogoal.core.errors import UserError, printable
 
@@ -103,9 +103,9 @@ def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> An
 def parse_json(text: str, where: object, what: str, do: str) -> Any:
     """JSON whose numbers are finite, ``MAX_JSON_DEPTH`` deep at most, its texts printable; else a ``UserError``."""
     try:
-        value = json.loads(text, parse_constant=_no_number)
+        value = json.loads(text)
         _check_depth(value)
-        json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, 1e999
+        json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, NaN, 1e999
     except (ValueError, RecursionError):
         raise UserError(f"{what} not valid JSON", where, do) from None
     return value
@@ -122,10 +122,6 @@ def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
         return table
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
-
-
-def _no_number(name: str) -> NoReturn:
-    raise ValueError(name)
 
 
 def _check_depth(value: Any) -> None:
