@@ -100,11 +100,9 @@ class MontezumaConfig:
 
 
 class _Task(NamedTuple):
-    """``wanted`` states of a room for the set ``name``, from index ``begin`` on: gathered, kept till all are there."""
+    """States of a room for the set ``name``: gathered, kept till all are there."""
 
     name: str
-    begin: int
-    wanted: int
     gather: Callable[[], RoomStates]
     kept: Checkpoints
 
@@ -124,10 +122,6 @@ def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
     labelled = labelled_rooms(config.groups)
     left = [room for room in UNLABELLED_LADDER_ROOMS if room not in labelled]
     return (left[0], UNLABELLED_OTHER_ROOMS[0]) if left else UNLABELLED_OTHER_ROOMS
-
-
-def _states_of(states: RoomStates) -> States:
-    return States(states.observations, labels_of(states.ram)[:, None], origins_of(states))
 
 
 class MontezumaDomain(Domain):
@@ -191,41 +185,40 @@ class MontezumaDomain(Domain):
         """
         labelled, unlabelled = labelled_rooms(config.groups), unlabelled_rooms(config)
         tasks: list[_Task] = []
-        whole: dict[str, RoomStates] = {}
+        expected = 0
         for name, rooms, wanted, stream, play in (
             ("labelled", labelled, config.states_per_room, (), "expert"),
             ("unlabelled", unlabelled, config.unlabelled_per_room, (), config.unlabelled_from),
             ("heldout", range(ROOMS), config.heldout_per_room, (config.heldout_seed,), "expert"),
         ):
             draw = partial(gather, play=play, held_out=name == "heldout", runs_on=name == "unlabelled")
-            for number, room in enumerate(rooms):
+            for room in rooms:
                 job = partial(draw, room, wanted, seed, ("montezuma", name, *stream))
-                place = kept(f"{name}-{room}") if kept else Checkpoints(None)
-                tasks.append(_Task(name, number * wanted, wanted, job, place))
-            whole[name] = RoomStates.empty(wanted * len(rooms))
+                tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None)))
+            expected += wanted * len(rooms)
+        progress.expect(expected)
+        there = {number: RoomStates(**states) for number, task in enumerate(tasks) if (states := task.kept.load())}
+        for loaded in there.values():
+            progress.advance(len(loaded.ram))
+        left = [number for number in range(len(tasks)) if number not in there]
 
-        def put(task: _Task, states: RoomStates) -> None:
-            whole[task.name].put(task.begin, states)
-            progress.advance(task.wanted)
+        def done(place: int, states: RoomStates) -> None:
+            tasks[left[place]].kept.save(vars(states))
+            there[left[place]] = states
+            progress.advance(len(states.ram))
 
-        def done(number: int, states: RoomStates) -> None:
-            left[number].kept.save(vars(states))
-            put(left[number], states)
+        in_processes([tasks[number].gather for number in left], allowed(config.workers), done)
 
-        progress.expect(sum(task.wanted for task in tasks))
-        left: list[_Task] = []
-        for task in tasks:
-            if states := task.kept.load():
-                put(task, RoomStates(**states))
-            else:
-                left.append(task)
-        in_processes([task.gather for task in left], allowed(config.workers), done)
-        heldout = _states_of(whole["heldout"])
+        def all_of(name: str) -> States:
+            rooms = [vars(there.pop(number)) for number, task in enumerate(tasks) if task.name == name]
+            whole = RoomStates(*(np.concatenate([room[field] for room in rooms]) for field in rooms[0]))
+            return States(whole.observations, labels_of(whole.ram)[:, None], origins_of(whole))
+
+        learnt, others, heldout = map(all_of, ("labelled", "unlabelled", "heldout"))
         seen = np.full(len(heldout.labels), SEEN_NOWHERE)
         seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
         seen[np.isin(heldout.origins["room"], labelled)] = SEEN_LABELLED
         heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
-        learnt, others = _states_of(whole["labelled"]), _states_of(whole["unlabelled"])
         return Collected(OBSERVATION_SHAPE, SUB_GOALS, learnt, others, heldout)
 
     def make_engine(

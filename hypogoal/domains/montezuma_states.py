@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import cycle
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -23,7 +23,6 @@ from hypogoal.domains.montezuma_emulator import (
     LEFT_EDGE,
     N_ACTIONS,
     NOOP,
-    OBSERVATION_SHAPE,
     ON_LADDER,
     RAM,
     RIGHT,
@@ -54,7 +53,6 @@ from hypogoal.domains.montezuma_ladders import (
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DYING, ELSEWHERE = range(len(KINDS))
-RAM_BYTES = 128
 NEAR = 12  # of a base, in the RAM's units, in x and in y
 LADDER_POSES = (ON_LADDER, 0)  # climbing, holding still; on ropes they are 14 and 4
 ON_GROUND = 255  # what the RAM says of the jump when there is none
@@ -98,18 +96,6 @@ class RoomStates:
     observations: NDArray[np.uint8]  # (n, 84, 84, 4)
     ram: NDArray[np.uint8]  # (n, 128), the console's memory
     actions: NDArray[np.int64]  # (n, 2), the last one and the one before it
-
-    @classmethod
-    def empty(cls, count: int) -> Self:
-        """Room for ``count`` states, to be ``put`` there."""
-        shapes = OBSERVATION_SHAPE, (RAM_BYTES,)
-        observations, ram = (np.zeros((count, *shape), np.uint8) for shape in shapes)
-        return cls(observations, ram, np.zeros((count, 2), np.int64))
-
-    def put(self, begin: int, states: Self) -> None:
-        """Write other states here, from index ``begin`` on."""
-        part = slice(begin, begin + len(states.ram))
-        self.observations[part], self.ram[part], self.actions[part] = states.observations, states.ram, states.actions
 
 
 def positions_of(ram: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -184,9 +170,10 @@ def gather(
     of ladders that run on through the floor. A room that does not show so many different states is a ``UserError``.
     """
     rng = rng_for(seed, *stream, room)
-    bases = [(index, ladder.base) for index, ladder in enumerate(LADDERS) if ladder.base.room == room]
-    counted = [index for index, _ in bases if play == "expert" and (runs_on or not LADDERS[index].runs_on)]
-    positives = dict.fromkeys(counted, 0)
+    bases = [
+        index for index, ladder in enumerate(LADDERS) if ladder.base.room == room and (runs_on or not ladder.runs_on)
+    ]
+    positives = dict.fromkeys(bases if play == "expert" else (), 0)
 
     def enough() -> bool:
         if len(pool) < SPARE * wanted:
@@ -203,10 +190,8 @@ def gather(
         if looks in met or may_be_held_out(looks) != held_out:
             continue
         met.add(looks)
-        x, y = int(shown.ram[RAM["x"]]), int(shown.ram[RAM["y"]])
-        at = (index for index, base in bases if abs(x - base.x) <= REACH and abs(y - base.y) <= REACH)
-        ladder = next(at, None)
-        if ladder is not None and LADDERS[ladder].runs_on and not runs_on:
+        ladder = int(ladders_of(positions_of(shown.ram[None]))[0])
+        if ladder >= 0 and LADDERS[ladder].runs_on and not runs_on:
             continue
         pool.append(shown)
         if ladder in positives and shown.ram[RAM["dying"]] == 0:
