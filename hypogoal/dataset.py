@@ -244,11 +244,7 @@ class Dataset:
         known = dtype == str(self.observation_dtype)
         if not (sizes and names and known and self.observation_shape and isinstance(self.domain, str)):
             raise foreign
-
-    @property
-    def observation_bytes(self) -> int:
-        """Of one observation."""
-        return prod(self.observation_shape) * self.observation_dtype.itemsize
+        self.observation_bytes = prod(self.observation_shape) * self.observation_dtype.itemsize  # of one
 
     def features(self) -> list[str]:
         """Names of the numbers of an observation that is no picture, in their order; ``x0``, ... where it has none."""

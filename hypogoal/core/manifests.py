@@ -108,12 +108,8 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("crop_height", "crop_width"), _size),
     **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), _count),
     **dict.fromkeys(("ended_at", "options_ended_at", "hidden_width"), _count),
-    "encoder": _is_text,
-    **dict.fromkeys(
-        ("domain", "network", "setting", "agent", "termination", "chooser", "start", "view", "localiser", "diversity"),
-        _is_text,
-    ),
-    "layouts": _is_text,
+    **dict.fromkeys(("domain", "network", "setting", "agent", "termination", "chooser", "start"), _is_text),
+    **dict.fromkeys(("view", "localiser", "diversity", "encoder", "layouts"), _is_text),
 }
 
 

@@ -106,7 +106,7 @@ class TrainingStates:
         sizes, seen = [len(group) for group in groups], self._seen(groups, changes)
         if self._trunk is not None and self._features is None:
             seen = _forward(self._trunk, seen, sizes, counted)
-        features = [_forward(_hidden(network), seen, sizes, counted) for network in networks]
+        features = [_forward(nn.Sequential(*list(network)[:-1]), seen, sizes, counted) for network in networks]
         logits = [network[-1](hidden) for network, hidden in zip(networks, features, strict=True)]
         return Seen(*([list(rows.split(sizes)) for rows in of_networks] for of_networks in (logits, features)))
 
@@ -263,11 +263,6 @@ def _uncounted(layer: nn.Module, norms: Sequence[_BatchNorm], inputs: Tensor) ->
     for norm, tracks in zip(norms, tracked, strict=True):
         norm.track_running_stats = tracks
     return made
-
-
-def _hidden(network: nn.Sequential) -> nn.Sequential:
-    """All layers but the last, which makes logits of features."""
-    return nn.Sequential(*list(network)[:-1])
 
 
 def _up_to_last_norm(network: nn.Sequential) -> nn.Sequential:
