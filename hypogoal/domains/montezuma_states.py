@@ -15,28 +15,8 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import digest
-from hypogoal.domains.montezuma_emulator import (
-    DOWN,
-    EDGE_Y,
-    FRAME_SKIP,
-    LEFT,
-    LEFT_EDGE,
-    N_ACTIONS,
-    NOOP,
-    ON_LADDER,
-    RAM,
-    RIGHT,
-    RIGHT_EDGE,
-    SPRITE_HEIGHT,
-    SPRITE_LEFT,
-    SPRITE_TOP,
-    SPRITE_WIDTH,
-    UP,
-    Emulator,
-    Position,
-    Snapshot,
-    picture,
-)
+from hypogoal.domains import montezuma_emulator as game
+from hypogoal.domains.montezuma_emulator import RAM, Emulator, Position
 from hypogoal.domains.montezuma_ladders import (
     BASES,
     GROUPS,
@@ -54,7 +34,7 @@ from hypogoal.domains.montezuma_ladders import (
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DYING, ELSEWHERE = range(len(KINDS))
 NEAR = 12  # of a base, in the RAM's units, in x and in y
-LADDER_POSES = (ON_LADDER, 0)  # climbing, holding still; on ropes they are 14 and 4
+LADDER_POSES = (game.ON_LADDER, 0)  # climbing, holding still; on ropes they are 14 and 4
 ON_GROUND = 255  # what the RAM says of the jump when there is none
 
 # Of a room's states at least these shares are of these kinds, as far as the rollouts brought them about.
@@ -74,7 +54,7 @@ STARTS = {"base": 0.5, "ladder": 0.15, "top": 0.1, "anywhere": 0.25}  # shares, 
 
 LONGEST_REPEAT = 8  # agent steps of one action
 JITTER = 0.1  # share of the steps on which another action comes in between
-HEADINGS = (DOWN, UP, LEFT, RIGHT)
+HEADINGS = (game.DOWN, game.UP, game.LEFT, game.RIGHT)
 HEADING = 0.7  # share of the actions that are one of the headings; the others are any
 CLOSE = 1  # how far from a base, in the RAM's units, an agent that wants to be there stays where it is
 STEPS_ASIDE = 3  # walked at most from a base or top before a rollout begins
@@ -229,7 +209,7 @@ class Placing(NamedTuple):
 
     x: int
     y: int
-    action: int = NOOP
+    action: int = game.NOOP
     steps: int = 0
     hold: bool = False  # while the stack fills, it goes back to the base that it is near, instead of doing nothing
 
@@ -270,7 +250,7 @@ def random_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iter
     while True:
         emulator.restore(_scene(emulator, room, rng))
         if (begun := _begin(emulator, room, sides[rng.integers(2)])) is not None:
-            yield from _rollout(emulator, room, begun, rng.integers(N_ACTIONS, size=RANDOM_STEPS).tolist())
+            yield from _rollout(emulator, room, begun, rng.integers(game.N_ACTIONS, size=RANDOM_STEPS).tolist())
 
 
 def _rollout(
@@ -289,17 +269,17 @@ def _rollout(
 
 
 def _expert_actions(emulator: Emulator, bases: Sequence[Position], rng: np.random.Generator) -> Iterator[int]:
-    action, left = NOOP, 0
+    action, left = game.NOOP, 0
     homing = rng.random() if bases else 0.0
     for _ in range(ROLLOUT_STEPS):
         if left == 0 and rng.random() < homing:
             action, left = _towards_base(emulator.position(), bases)
         elif left == 0:
             heading = rng.random() < HEADING
-            action = HEADINGS[rng.integers(len(HEADINGS))] if heading else int(rng.integers(N_ACTIONS))
+            action = HEADINGS[rng.integers(len(HEADINGS))] if heading else int(rng.integers(game.N_ACTIONS))
             left = int(rng.integers(1, LONGEST_REPEAT + 1))
         left -= 1
-        yield int(rng.integers(N_ACTIONS)) if rng.random() < JITTER else action
+        yield int(rng.integers(game.N_ACTIONS)) if rng.random() < JITTER else action
 
 
 def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, int]:
@@ -307,14 +287,16 @@ def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, i
     base = min(bases, key=lambda base: abs(position.x - base.x) + abs(position.y - base.y))
     aside = base.x - position.x
     if abs(aside) > CLOSE:
-        return (RIGHT if aside > 0 else LEFT), max(1, round(abs(aside) / STRIDE))
-    return (DOWN if position.y > base.y else NOOP), 1
+        return (game.RIGHT if aside > 0 else game.LEFT), max(1, round(abs(aside) / STRIDE))
+    return (game.DOWN if position.y > base.y else game.NOOP), 1
 
 
-def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> Snapshot:
+def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> game.Snapshot:
     """The room with its enemies at some phase; the agent is put in its place later."""
     while True:
-        scene = emulator.place(room, RIGHT_EDGE, EDGE_Y, phase=int(rng.integers(*PHASES, endpoint=True)), settle=0)
+        scene = emulator.place(
+            room, game.RIGHT_EDGE, game.EDGE_Y, phase=int(rng.integers(*PHASES, endpoint=True)), settle=0
+        )
         if scene is not None:
             return scene
 
@@ -323,11 +305,11 @@ def _begin(emulator: Emulator, room: int, start: Placing, bases: Sequence[Positi
     """Bring the agent to its start and fill the stack: the last two actions, None where it is not alive in the room."""
     emulator.write("x", start.x)
     emulator.write("y", start.y)
-    emulator.frames(start.action, FRAME_SKIP * start.steps)
-    action = previous = NOOP
+    emulator.frames(start.action, game.FRAME_SKIP * start.steps)
+    action = previous = game.NOOP
     for _ in range(SETTLE):
         previous = action
-        action = _towards_base(emulator.position(), bases)[0] if start.hold else NOOP
+        action = _towards_base(emulator.position(), bases)[0] if start.hold else game.NOOP
         emulator.step(action)
     return (action, previous) if emulator.alive() and emulator.position().room == room else None
 
@@ -343,7 +325,7 @@ def _starts(emulator: Emulator, room: int, rng: np.random.Generator) -> dict[str
         x = spot.x + int(rng.integers(-REACH, REACH + 1))
         if rng.random() < held:
             return Placing(x, spot.y, hold=True)
-        return Placing(x, spot.y, (LEFT, RIGHT)[rng.integers(2)], int(rng.integers(STEPS_ASIDE + 1)))
+        return Placing(x, spot.y, (game.LEFT, game.RIGHT)[rng.integers(2)], int(rng.integers(STEPS_ASIDE + 1)))
 
     def climbing(end: Position, action: int, longest: int) -> Placing:
         return Placing(end.x, end.y, action, int(rng.integers(1, longest + 1)))
@@ -366,19 +348,21 @@ def standing_places(emulator: Emulator, room: int) -> NDArray[np.int64]:
     agent's box has to be black, with something under its feet. Room 15 is black nowhere: of it the row in which one
     enters is taken.
     """
-    black = (picture(emulator, room) == 0).all(2)
-    x = np.arange(LEFT_EDGE, RIGHT_EDGE + 1)
+    black = (game.picture(emulator, room) == 0).all(2)
+    x = np.arange(game.LEFT_EDGE, game.RIGHT_EDGE + 1)
     y = np.arange(SHAFT_EXIT, SHAFT_ENTRY + 1)
-    boxes = sliding_window_view(black, (SPRITE_HEIGHT + 1, SPRITE_WIDTH))  # the last row is the one under the feet
-    boxes = boxes[np.ix_(SPRITE_TOP - y, x + SPRITE_LEFT)]
+    boxes = sliding_window_view(
+        black, (game.SPRITE_HEIGHT + 1, game.SPRITE_WIDTH)
+    )  # the last row is the one under the feet
+    boxes = boxes[np.ix_(game.SPRITE_TOP - y, x + game.SPRITE_LEFT)]
     stands = (boxes[:, :, :-1].mean((2, 3)) >= BLACK_SHARE) & boxes[:, :, -1 - FEET : -1].all((2, 3))
     stands &= boxes[:, :, -1].mean(2) <= 0.5
     if room in LAVA_ROOMS:
         stands[y < LAVA_BELOW] = False
     rows, columns = np.nonzero(stands)
     if not len(rows):
-        return np.stack([x, np.full_like(x, EDGE_Y)], axis=1)
-    level = np.where(np.abs(y - EDGE_Y) <= SNAP, EDGE_Y, y)
+        return np.stack([x, np.full_like(x, game.EDGE_Y)], axis=1)
+    level = np.where(np.abs(y - game.EDGE_Y) <= SNAP, game.EDGE_Y, y)
     return np.unique(np.stack([x[columns], level[rows]], axis=1), axis=0)
 
 
@@ -392,7 +376,7 @@ def _climbs(ladder: Ladder) -> list[tuple[Position, int, int]]:
     one_room = ladder.top.room == ladder.base.room
     up = (ladder.top.y if one_room else SHAFT_ENTRY) - ladder.base.y
     down = ladder.top.y - (ladder.base.y if one_room else SHAFT_EXIT)
-    return [(ladder.base, UP, up // STRIDE - 1), (ladder.top, DOWN, down // STRIDE - 1)]
+    return [(ladder.base, game.UP, up // STRIDE - 1), (ladder.top, game.DOWN, down // STRIDE - 1)]
 
 
 PLAYS: dict[str, Callable[[Emulator, int, np.random.Generator], Iterator[Shown]]] = {
