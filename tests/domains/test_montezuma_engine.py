@@ -418,8 +418,6 @@ def test_snapshots_are_exact() -> None:
         assert all(np.array_equal(a, b) for a, b in zip(played(resumed, actions[begin:end]), expected, strict=True))
         everything = np.arange(unbroken.n_states)
         assert np.array_equal(resumed.positions(everything), unbroken.positions(everything))
-    with pytest.raises(ValueError, match="other arguments"):
-        MontezumaEngine("1L", 1, start_states=1).restore(unbroken.snapshot())
 
 
 def test_without_the_emulator_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
