@@ -5,7 +5,6 @@ Nothing outside the folder that was asked for is looked at.
 """
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_end, read_json, read_text
+from hypogoal.core.files import json_lines, read_end, read_json, read_text
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
@@ -51,10 +50,9 @@ def _describe_part(path: Path) -> dict[str, Any]:
 def result_of(path: Path) -> dict[str, float]:
     """The last numbers of an artefact's logs, if any: means over sub-goals, of scores the best member's."""
     last: dict[tuple[str, str], dict[str, Any]] = {}
-    for text in (text for log in (LOG, SCORES) for text in read_end(path / log)):
-        with contextlib.suppress(ValueError, RecursionError):
-            if isinstance(line := json.loads(text), dict) and line.get("scope", "all") == "all":
-                last[str(line.get("sub_goal")), str(line.get("member"))] = line
+    for line in json_lines(text for log in (LOG, SCORES) for text in read_end(path / log)):
+        if line.get("scope", "all") == "all":
+            last[str(line.get("sub_goal")), str(line.get("member"))] = line
     found: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
     for (goal, _), line in last.items():
         for name in RESULTS:
@@ -205,7 +203,8 @@ def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
             yield from _fault(partial(check, artefact.path / name))
     if artefact.kind == "ensemble":
         whole = [name for name in artefact.config["sub_goals"] if f"{name}.safetensors" not in faults]
-        yield from (fault for sub_goal in whole for fault in _member_faults(artefact, sub_goal))
+        for sub_goal in whole:
+            yield from _fault(partial(_check_members, artefact, sub_goal))
     for entry in artefact.manifest["inputs"]:
         fault = find_input(artefact.path, entry, beside=True)[1] if _lies_in(folder, artefact, entry) else ""
         if fault:
@@ -220,17 +219,13 @@ def _lies_in(folder: Path, artefact: Artefact, entry: dict[str, str]) -> bool:
         return False
 
 
-def _member_faults(artefact: Artefact, sub_goal: str) -> Iterator[str]:
-    """Whether weights fit what the manifest says of them, and thresholds are probabilities."""
+def _check_members(artefact: Artefact, sub_goal: str) -> None:
+    """Refuse (``UserError``) weights that do not fit the manifest, and thresholds that are no probabilities."""
     from hypogoal.hypotheses.ensemble import read_ensemble
 
-    try:
-        thresholds = read_ensemble(artefact.path, artefact.config, sub_goal).thresholds
-    except UserError as error:
-        yield str(error)
-        return
+    thresholds = read_ensemble(artefact.path, artefact.config, sub_goal).thresholds
     if not ((thresholds >= 0) & (thresholds <= 1)).all():
-        yield f"{sub_goal}: thresholds that are no probabilities: {thresholds.tolist()}"
+        raise UserError(f"{sub_goal}: thresholds that are no probabilities: {thresholds.tolist()}")
 
 
 def _fault(read: Callable[[], object]) -> Iterator[str]:
@@ -249,10 +244,8 @@ def _read_table(path: Path) -> None:
 def _read_lines(path: Path) -> None:
     """JSON, one object a line; a number that was not there yet may be NaN."""
     for number, line in enumerate(read_text(path, "the log is", AGAIN).splitlines(), 1):
-        with contextlib.suppress(ValueError, RecursionError):
-            if isinstance(json.loads(line), dict):
-                continue
-        raise UserError(f"line {number} is no JSON object", path, AGAIN)
+        if not [*json_lines([line])]:
+            raise UserError(f"line {number} is no JSON object", path, AGAIN)
 
 
 def _read_arrays(path: Path) -> None:

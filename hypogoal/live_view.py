@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import sys
@@ -20,7 +19,7 @@ from hypogoal.core.artefacts import MANIFEST
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError, printable
-from hypogoal.core.files import MOST_INTEGER, inside, plain_name, read_end
+from hypogoal.core.files import MOST_INTEGER, inside, json_lines, plain_name, read_end
 from hypogoal.core.terminal import draw, screen
 
 LOG = "metrics.jsonl"
@@ -122,17 +121,9 @@ def _read(log: Path, run: Path) -> Progressing:
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
-    """The lines of a log that say a step; one that is only half written yet, or damaged, is left out."""
-    found = []
-    for line in read_end(log):
-        try:
-            value = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(value, dict) and plain_name(value.get("sub_goal", "none")):
-            step = value.get("step")
-            found += [value] if type(step) is int and 0 <= step <= MOST_INTEGER else []
-    return found
+    """The lines of a log that say a step."""
+    found = [line for line in json_lines(read_end(log)) if plain_name(line.get("sub_goal", "none"))]
+    return [line for line in found if type(line.get("step")) is int and 0 <= line["step"] <= MOST_INTEGER]
 
 
 def _is_number(value: Any) -> bool:

@@ -111,6 +111,14 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
     return value
 
 
+def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """The objects in lines of a log; what is only half written yet, damaged or none is left out."""
+    for line in lines:
+        with contextlib.suppress(ValueError, RecursionError):
+            if isinstance(value := json.loads(line), dict):
+                yield value
+
+
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
     """TOML, else a ``UserError``; so are keys in hundreds of parts (``a.a.a``), whose time is their number squared."""
     try:
