@@ -65,7 +65,7 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
     table = parse_toml(text, name, "the preset is", "Mend the file.")
     for key in table:
         if tables and key not in (*tables, stage):
-            do = f"{_meant(key, tables)}A preset has tables for {', '.join(tables)}."
+            do = f"{meant(key, tables)}A preset has tables for {', '.join(tables)}."
             raise UserError("no such table in a preset", f"{key} in {name}", do)
     values = table.get(stage, {})
     if not isinstance(values, dict):
@@ -128,12 +128,12 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str) ->
     checked: dict[str, Any] = {}
     for key, value in values.items():
         if key not in fields:
-            raise UserError(f"{stage} has no setting", key, f"{_meant(key, fields)}See 'hypogoal config {stage}'.")
+            raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}See 'hypogoal config {stage}'.")
         checked[key] = _checked(fields[key], kinds[key], value, stage)
     return config_class(**checked)
 
 
-def _meant(word: str, known: Iterable[str]) -> str:
+def meant(word: str, known: Iterable[str]) -> str:
     """A question for whoever wrote ``word`` and may have meant a known one; else empty."""
     near = difflib.get_close_matches(word, [*known], n=1)
     return f"Did you mean {near[0]!r}? " if near else ""

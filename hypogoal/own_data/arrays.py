@@ -1,6 +1,5 @@
 """NumPy arrays: a ``.npz`` file, or a folder of ``.npy`` files with the same names."""
 
-import difflib
 import tokenize
 import zipfile
 import zlib
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.config import meant
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file
 from hypogoal.dataset import NUMBERS, Dataset, Observations
@@ -121,8 +121,7 @@ def _require_known(names: Iterable[str], path: Path) -> None:
     """Refuse (``UserError``) a misspelt array: held-out states that are left out in silence are missed by nobody."""
     for name in names:
         if name not in KNOWN:
-            near = difflib.get_close_matches(name, KNOWN, n=1)
-            do = f"Did you mean {near[0]!r}?" if near else f"Known are {', '.join(KNOWN)}; leave it out."
+            do = meant(name, KNOWN) or f"Known are {', '.join(KNOWN)}; leave it out."
             raise UserError(f"unknown array {name!r}", path, do)
 
 

@@ -1,7 +1,6 @@
 """The contract of a domain, as a test that its author runs (Spec B6; see ``hypogoal.domains.base``)."""
 
 import dataclasses
-import difflib
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.config import from_values, resolve
+from hypogoal.core.config import from_values, meant, resolve
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import GET_MORE, NUMBERS, PICTURE, Collected, States, hard_to_learn, require_names
@@ -59,8 +58,7 @@ class _Contract:
         """Of each stage settings that it has, with values that it takes."""
         known = {"collect": self.domain.config_class, **CONFIGS}
         for stage, values in self.domain.defaults.items():
-            near = difflib.get_close_matches(str(stage), known, n=1)
-            do = f"Did you mean {near[0]!r}?" if near else f"The stages are {', '.join(known)}."
+            do = meant(str(stage), known) or f"The stages are {', '.join(known)}."
             promise(stage in known, f"defaults are of {stage!r}, which is no stage", do)
             kept = isinstance(values, Mapping)
             promise(kept, f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
