@@ -62,7 +62,5 @@ class Episodes(list[tuple[int, int, float, int, int]], Resumable):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        rows = snapshot["rows"]
-        if rows.shape[1] == 4:  # of before ``succeeded`` was kept
-            rows = np.column_stack([rows, (rows[:, 3] > 0) & (rows[:, 2] > 0)])
-        self[:] = [(int(row[0]), int(row[1]), row[2], int(row[3]), int(row[4])) for row in rows.tolist()]
+        rows = snapshot["rows"].tolist()
+        self[:] = [(int(row[0]), int(row[1]), row[2], int(row[3]), int(row[4])) for row in rows]
