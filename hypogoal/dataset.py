@@ -6,6 +6,8 @@ The root's attributes say format version, domain, observation space, arguments a
 last, so a file without it was cut off.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
@@ -56,6 +58,14 @@ class States:
     labels: NDArray[np.bool_]
     origins: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
+    def where(self, kept: NDArray[np.bool_]) -> States:
+        """Those of them that are ``kept``, bool (N,)."""
+        origins = {name: values[kept] for name, values in self.origins.items()}
+        return States(self.observations[kept], self.labels[kept], origins)
+
+
+Split: TypeAlias = States  # those of one sub-goal: labels bool (N,)
+
 
 @dataclass(frozen=True)
 class Collected:
@@ -67,15 +77,6 @@ class Collected:
     unlabelled: States
     heldout: States
     features: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Split:
-    """States of one sub-goal: observations uint8 or float32 (N, *obs), labels bool (N,), origins int (N,) each."""
-
-    observations: Observations
-    labels: NDArray[np.bool_]
-    origins: Mapping[str, NDArray[np.int64]]
 
 
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
@@ -100,9 +101,16 @@ def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
 def leave_out(states: States, *known: Observations) -> States:
     """Spec B3: the states whose observations are none of ``known``, (M, ...) each, which members learn from."""
     seen = {digest(picture) for pictures in known for picture in pictures}
-    kept = np.array([digest(picture) not in seen for picture in states.observations], np.bool_)
-    origins = {name: values[kept] for name, values in states.origins.items()}
-    return States(states.observations[kept], states.labels[kept], origins)
+    return states.where(np.array([digest(picture) not in seen for picture in states.observations], np.bool_))
+
+
+def joined(parts: Sequence[States]) -> States:
+    """States one after another, with the origins of the first."""
+    observations, labels = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("observations", "labels")
+    )
+    origins = {name: np.concatenate([part.origins[name] for part in parts]) for name in parts[0].origins}
+    return States(observations, labels, origins)
 
 
 def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
@@ -121,6 +129,14 @@ def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal of which the held-out labels (N, G) have one class only."""
     of_one = [goal for goal, column in zip(goals, labels.T, strict=True) if len(np.unique(column)) < 2]
     return [f"{goal} has one class only in the held-out states, so it cannot be judged by them" for goal in of_one]
+
+
+def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: object, do: str) -> None:
+    """Refuse (``UserError``) labels (N, G) of labelled states with one class only of some sub-goal."""
+    for goal, column in zip(goals, labels.T, strict=True):
+        if len(np.unique(column)) < 2:
+            lacking = "negatives" if column.any() else "positives"
+            raise UserError(f"{goal} has no {lacking} among {len(labels)} labelled states", where, do)
 
 
 def require_names(sub_goals: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
 LOG, EPISODES, LAYOUT, OPTIONS = "metrics.jsonl", "episodes.csv", "layout.json", "options.safetensors"
 SCORES = "scores.jsonl"
+INPUT = ("path", "relative", "kind", "sha256")
 NUMBERS = "numbers.csv"  # which evaluations of format 1 have not
 
 
@@ -78,12 +79,9 @@ def _count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= MOST_INTEGER
 
 
-def _input(value: Any) -> bool:
-    return isinstance(value, dict) and all(_is_text(value.get(key)) for key in ("path", "relative", "kind", "sha256"))
-
-
-def _files(value: Any) -> bool:
-    return isinstance(value, dict) and all(_is_text(name) and _is_text(digest) for name, digest in value.items())
+def _texts(value: Any, *keys: str) -> bool:
+    """Whether it is an object with texts under these keys, where none is given under all that it has."""
+    return isinstance(value, dict) and all(_is_text(value.get(key)) for key in keys or value)
 
 
 def _size(value: Any) -> bool:
@@ -96,8 +94,8 @@ WANTED: dict[str, Callable[[Any], bool]] = {
     "format": lambda value: type(value) is int,
     "config": lambda value: isinstance(value, dict),
     "seed": _count,
-    "inputs": lambda value: isinstance(value, list) and all(map(_input, value)),
-    "files": _files,
+    "inputs": lambda value: isinstance(value, list) and all(_texts(each, *INPUT) for each in value),
+    "files": lambda value: _texts(value) and all(map(_is_text, value)),
 }
 SETTINGS: dict[str, Callable[[Any], bool]] = {
     "sub_goals": plain_names,

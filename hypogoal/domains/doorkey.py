@@ -5,17 +5,16 @@ The parts: ``doorkey_env`` (the Gymnasium environment and the sub-goals), ``door
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States, leave_out
+from hypogoal.dataset import Collected, States, joined, leave_out, require_classes
 from hypogoal.domains import doorkey_env as env
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
@@ -60,15 +59,6 @@ class DoorKeyConfig:
 Source: TypeAlias = tuple[int, int, env.Layout]  # layout seed, draw (see ``collect``), layout
 
 
-class _Sweep(NamedTuple):
-    """All states of one layout that an expert can bring about (``ids`` of ``engine``), and its origin."""
-
-    layout_seed: int
-    draw: int
-    engine: DoorKeyEngine
-    ids: NDArray[np.int64]
-
-
 def _labelled_layouts(config: DoorKeyConfig, seed: int) -> list[Source]:
     layout = env.layout_of(config.labelled_seed)
     if config.regime == "fixed":
@@ -98,23 +88,13 @@ def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[env.Layout]) -> list
     return chosen
 
 
-def _sweep(config: DoorKeyConfig, layout_seed: int, draw: int, layout: env.Layout, progress: Any) -> _Sweep:
+def _sweep(config: DoorKeyConfig, layout_seed: int, draw: int, layout: env.Layout, progress: Any) -> States:
+    """All states of one layout that an expert can bring about: images, labels and origins."""
     engine = DoorKeyEngine(layout, keyring=config.keyring, door_label=config.door_label, wrong_key=config.wrong_key)
-    sweep = _Sweep(layout_seed, draw, engine, engine.reachable())
+    ids = engine.reachable()
     progress.advance()
-    return sweep
-
-
-def _states_of(sweeps: Sequence[_Sweep]) -> States:
-    """Images, labels and origins of the swept states."""
-    images, labels, origins = [], [], []
-    for layout_seed, draw, engine, ids in sweeps:
-        images.append(engine.images(ids))
-        labels.append(engine.labels(ids))
-        whence = {"layout_seed": np.full(len(ids), layout_seed), "draw": np.full(len(ids), draw)}
-        origins.append(whence | engine.origins(ids))
-    joined = {name: np.concatenate([origin[name] for origin in origins]) for name in origins[0]}
-    return States(np.concatenate(images), np.concatenate(labels), joined)
+    whence = {"layout_seed": np.full(len(ids), layout_seed), "draw": np.full(len(ids), draw)}
+    return States(engine.images(ids), engine.labels(ids), whence | engine.origins(ids))
 
 
 class DoorKeyDomain(Domain):
@@ -154,22 +134,16 @@ class DoorKeyDomain(Domain):
         heldout = _heldout_layouts(config, avoid=[layout for _, _, layout in [*labelled, *unlabelled]])
         sources = labelled, unlabelled, heldout
         progress.expect(sum(map(len, sources)))
-        sweeps = [[_sweep(config, *source, progress) for source in group] for group in sources]
+        learnt, others, test = (joined([_sweep(config, *source, progress) for source in group]) for group in sources)
         if config.regime == "shuffled":
             amount = len(DoorKeyEngine(config.labelled_seed, keyring=config.keyring).reachable())
-            ends = np.cumsum([len(sweep.ids) for sweep in sweeps[0]])
-            kept = np.zeros(ends[-1], np.bool_)
+            kept = np.zeros(len(learnt.labels), np.bool_)
             rng = rng_for(seed, "doorkey", "shuffled-states")
             kept[rng.choice(len(kept), min(amount, len(kept)), replace=False)] = True
-            parts = np.split(kept, ends[:-1])
-            sweeps[0] = [sweep._replace(ids=sweep.ids[part]) for sweep, part in zip(sweeps[0], parts, strict=True)]
-        learnt, others, test = map(_states_of, sweeps)
+            learnt = learnt.where(kept)
         test = leave_out(test, learnt.observations, others.observations)
-        for index, sub_goal in enumerate(env.SUB_GOALS):
-            if len(np.unique(learnt.labels[:, index])) < 2:
-                where = f"labelled_seed={config.labelled_seed}, keyring={config.keyring}"
-                do = "Choose another labelled_seed, or keyring=true."
-                raise UserError(f"the labelled states have no two classes of {sub_goal}", where, do)
+        where = f"labelled_seed={config.labelled_seed}, keyring={config.keyring}"
+        require_classes(learnt.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or keyring=true.")
         return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, learnt, others, test)
 
     def make_engine(

@@ -15,7 +15,7 @@ from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, Observations, States, digest
+from hypogoal.dataset import Collected, Observations, States, digest, require_classes
 from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
 
@@ -162,7 +162,13 @@ class GymnasiumDomain(Domain):
             learnt.update(map(digest, sets[-1].observations))
         env.close()
         labelled, unlabelled, heldout = sets
-        self._require_classes(labelled, unlabelled, heldout, config)
+        where = f"steps={config.steps}"
+        for states, what in ((unlabelled, "unlabelled"), (heldout, "held-out")):
+            if not len(states.observations):
+                do = "Give other seeds, or more steps: states that look like those for learning do not count."
+                raise UserError(f"there are no {what} states", where, do)
+        do = "Give --set steps=N with more steps, other labelled_seeds, or the domain a policy that gets there."
+        require_classes(labelled.labels, self.sub_goals, where, do)
         return Collected(self.look.shape, self.sub_goals, labelled, unlabelled, heldout, self.look.features)
 
     def _play(
@@ -199,18 +205,6 @@ class GymnasiumDomain(Domain):
                 observation, _info = engines.begun(env, seed=layout)
                 episode, step = episode + 1, 0
         return _shared_out(list(groups.values()), config.states, rng)
-
-    def _require_classes(self, labelled: States, unlabelled: States, heldout: States, config: GymnasiumConfig) -> None:
-        for states, what in ((unlabelled, "unlabelled"), (heldout, "held-out")):
-            if not len(states.observations):
-                do = "Give other seeds, or more steps: states that look like those for learning do not count."
-                raise UserError(f"there are no {what} states", f"steps={config.steps}", do)
-        for index, sub_goal in enumerate(self.sub_goals):
-            positives = int(labelled.labels[:, index].sum())
-            if positives in (0, len(labelled.labels)):
-                what = "never" if positives == 0 else "always"
-                do = "Give --set steps=N with more steps, other labelled_seeds, or the domain a policy that gets there."
-                raise UserError(f"{sub_goal} {what} holds in the labelled states", f"steps={config.steps}", do)
 
 
 class _Met(NamedTuple):

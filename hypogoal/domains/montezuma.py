@@ -19,7 +19,7 @@ from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
-from hypogoal.dataset import Collected, States
+from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
 from hypogoal.domains.montezuma_emulator import OBSERVATION_SHAPE, ROOMS, observed_pixel, picture, pixel
 from hypogoal.domains.montezuma_engine import MontezumaEngine
@@ -210,9 +210,8 @@ class MontezumaDomain(Domain):
         in_processes([tasks[number].gather for number in left], allowed(config.workers), done)
 
         def all_of(name: str) -> States:
-            rooms = [vars(there.pop(number)) for number, task in enumerate(tasks) if task.name == name]
-            whole = RoomStates(*(np.concatenate([room[field] for room in rooms]) for field in rooms[0]))
-            return States(whole.observations, labels_of(whole.ram)[:, None], origins_of(whole))
+            rooms = [there.pop(number) for number, task in enumerate(tasks) if task.name == name]
+            return joined([States(room.observations, labels_of(room.ram)[:, None], origins_of(room)) for room in rooms])
 
         learnt, others, heldout = map(all_of, ("labelled", "unlabelled", "heldout"))
         seen = np.full(len(heldout.labels), SEEN_NOWHERE)

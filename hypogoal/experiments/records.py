@@ -112,24 +112,23 @@ def is_running(run: Path, cell: Cell) -> bool:
 def write_plan(run: Path, plan: Plan, factor: float) -> None:
     """Write the plan into the run's folder; ``factor``: how much slower this machine is than that of costs."""
     run.mkdir(parents=True, exist_ok=True)
-    rows = [_row(moved(cell, str(run), RUN)) for cell in plan.cells]
+    rows = [
+        {
+            "name": cell.name,
+            "arguments": list(cell.arguments),
+            "out": str(cell.out),
+            "needs": [str(need) for need in cell.needs],
+            "axes": dict(cell.axes),
+            **cell.cost._asdict(),
+        }
+        for cell in (moved(cell, str(run), RUN) for cell in plan.cells)
+    ]
     about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
     lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
     about |= {"anew": sorted(plan.anew)} if plan.anew else {}
     about |= {"presets": dict(plan.presets)} if plan.presets else {}
     head = json.dumps(about)[:-1]
     replace_text(run / PLAN, f'{head}, "cells": [\n{lines}\n]}}\n')
-
-
-def _row(cell: Cell) -> dict[str, Any]:
-    return {
-        "name": cell.name,
-        "arguments": list(cell.arguments),
-        "out": str(cell.out),
-        "needs": [str(need) for need in cell.needs],
-        "axes": dict(cell.axes),
-        **cell.cost._asdict(),
-    }
 
 
 class LostPlan(UserError):

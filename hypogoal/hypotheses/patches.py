@@ -107,17 +107,12 @@ def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]])
     levels: list[Level] = []
     for kernel, stride in windows:
         distinct = len(levels[-1].parts) if levels else len(colours)
-        levels.append(_level(rows, lines, distinct, kernel, stride))
-        rows, lines = levels[-1].rows, levels[-1].lines
+        # Distinct kernel x kernel windows: strips of ``kernel`` in distinct rows, bands of rows, then strips in bands.
+        strip_rows, strips = _join(_strided(rows, kernel, stride), distinct)
+        lines, bands = _join(_strided(lines, kernel, stride), len(rows))
+        rows, stacks = _join([strip_rows[bands[:, row]] for row in range(kernel)], len(strips))
+        levels.append(Level(strips[stacks].reshape(len(stacks), -1), rows, lines))
     return Tables(torch.from_numpy(colours.astype(np.float32)).div_(255.0), tuple(levels))
-
-
-def _level(rows: NDArray[np.int32], lines: NDArray[np.int32], distinct: int, kernel: int, stride: int) -> Level:
-    """Distinct kernel x kernel windows: strips of ``kernel`` in distinct rows, bands of rows, then strips in bands."""
-    strip_rows, strips = _join(_strided(rows, kernel, stride), distinct)
-    lines, bands = _join(_strided(lines, kernel, stride), len(rows))
-    ids, stacks = _join([strip_rows[bands[:, row]] for row in range(kernel)], len(strips))
-    return Level(strips[stacks].reshape(len(stacks), -1), ids, lines)
 
 
 def _strided(values: NDArray[np.int32], kernel: int, stride: int) -> list[NDArray[np.int32]]:

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import free_memory, human
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, States, digest, hard_to_judge, hard_to_learn, leave_out, require_names
+from hypogoal.dataset import (
+    Collected,
+    States,
+    digest,
+    hard_to_judge,
+    hard_to_learn,
+    leave_out,
+    require_classes,
+    require_names,
+)
 from hypogoal.domains.gymnasium_engine import channels_first
 
 COPIES = 4  # of the states, all held in memory at once while they are compared and written
@@ -70,11 +79,7 @@ def collected_of(
             f"no held-out states were given: {int(chosen.sum())} of the labelled ones are held out, which says nothing "
             "of other contexts"
         )
-    for goal, column in zip(goals, labels.T, strict=True):
-        if len(np.unique(column)) < 2:
-            lacking = "negatives" if column.any() else "positives"
-            what = f"{goal} has no {lacking} among {len(labels)} labelled states"
-            raise UserError(what, None, "Give states of both kinds.")
+    require_classes(labels, goals, None, "Give states of both kinds.")
     warned += hard_to_learn(labels, goals) + hard_to_judge(test.labels, goals)
     unknown = np.zeros((len(unlabelled), len(goals)), np.bool_)
     sets = [States(images, labels), States(unlabelled, unknown), test]

@@ -13,7 +13,7 @@ from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
-from hypogoal.domains.base import Domain, load_domain
+from hypogoal.domains.base import load_domain
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig, DQNSettings
 from hypogoal.meta.training import cut, played_world, write_layout
 from hypogoal.needs import baseline_needs
@@ -44,7 +44,14 @@ def train_baseline(
     inputs = [data] if data else []
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
-    world = played_world(played, _world_of(data, domain, played) if data else {}, config.world)
+    lived: dict[str, Any] = {}
+    if data:
+        dataset = open_dataset(data)
+        if dataset.domain != domain:
+            what = f"these are states of {dataset.domain!r}, not of {domain!r}"
+            raise UserError(what, data, "Name the domain they are of.")
+        lived = played.world(dataset.config)
+    world = played_world(played, lived, config.world)
     chosen = HYPERPARAMETERS[config.agent, config.setting]
     if config.environments:
         chosen = dataclasses.replace(chosen, environments=config.environments)
@@ -71,12 +78,3 @@ def train_baseline(
     episodes = env.episodes
     success = episodes.success() if episodes else 0.0
     return {"steps": episodes.steps, "episodes": len(episodes), "success": success, "length": episodes.length()}
-
-
-def _world_of(data: Path, name: str, domain: Domain) -> dict[str, Any]:
-    """The settings of the world that states are of; a ``UserError`` where they are of another domain."""
-    dataset = open_dataset(data)
-    if dataset.domain != name:
-        what = f"these are states of {dataset.domain!r}, not of {name!r}"
-        raise UserError(what, data, "Name the domain they are of.")
-    return domain.world(dataset.config)

@@ -43,9 +43,9 @@ class DQNSettings:
     gamma: float = setting(0.95, "discount per step", source="ours: at 0.99 it does not learn a corridor")
 
 
-# By agent and setting; the paper's are the defaults above. Four environments with one update per joint step are its "update
-# interval 4" with a quarter of the overhead. The tuned settings start from a pilot on three-key DoorKey: many environments,
-# larger batches and steps, and a DQN that keeps exploring until it has seen the goal once.
+# By agent and setting. The paper's are the defaults above. Four environments with one update per joint step are
+# its "update interval 4" with a quarter of the overhead. The tuned settings start from a pilot on three-key DoorKey:
+# many environments, larger batches and steps, and a DQN that keeps exploring until it has seen the goal once.
 HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
     ("ppo", "paper"): PPOSettings(),
     ("dqn", "paper"): DQNSettings(),
