@@ -5,7 +5,7 @@ between two runs of the same commands is in it: no time, no machine, no path.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +45,34 @@ def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
     for cell in done:
         axes = dict(cell.axes)
         about = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
-        own = evaluated.get(cell.out.relative_to(run).as_posix())
-        for row in (*_logged(cell), *(own or _unevaluated(cell)), *_by_chance(cell)):
+        for row in _of_cell(cell, evaluated.get(cell.out.relative_to(run).as_posix(), [])):
             yield [*about, row.sub_goal, row.member, row.scope, row.quantity, row.value]
+
+
+def _of_cell(cell: Cell, evaluated: Sequence[Row]) -> Iterator[Row]:
+    """How many states were collected; what was logged last of each sub-goal's ensemble; what the evaluation says of a
+    run or of options, or would say: it has not been made, or takes them for a part of others; and how random play does
+    where an agent was trained."""
+    if cell.stage == "collect":
+        yield from _states(cell.out)
+        return
+    artefact = open_artefact(cell.out)
+    if artefact.kind == "ensemble":
+        yield from _losses(artefact)
+    files = artefact.manifest["files"] if artefact.kind in ("options", "meta", "baseline") else {}
+    yield from evaluated
+    if "executions.csv" in files:
+        about = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
+        if not evaluated:
+            found = distance.rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
+            yield from _of_metrics({"distance": {"options": [{**about, **row} for row in found]}})
+    elif "episodes.csv" in files:
+        layout = read_layout(artefact.path / "layout.json")
+        if not evaluated:
+            episodes = read_episodes(artefact.path / "episodes.csv")
+            one = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
+            yield from _of_metrics({"agents": [curves.agent_metrics("", [one])]})
+        yield from rows_of({"random_success": layout["random_success"]})
 
 
 def _of_metrics(metrics: dict[str, Any]) -> Iterator[Row]:
@@ -55,26 +80,6 @@ def _of_metrics(metrics: dict[str, Any]) -> Iterator[Row]:
     metrics = {"ensembles": [], "agents": [], "layouts": [], "distance": {"options": []}, **metrics}
     for rows in (hypotheses.rows, distance.rows, curves.rows):
         yield from rows(metrics, {})
-
-
-def _logged(cell: Cell) -> Iterable[Row]:
-    """How many states were collected; the last that was logged of each sub-goal's ensemble."""
-    if cell.stage == "collect":
-        return _states(cell.out)
-    artefact = open_artefact(cell.out)
-    return _losses(artefact) if artefact.kind == "ensemble" else ()
-
-
-def _by_chance(cell: Cell) -> Iterator[Row]:
-    """How random play does where an agent was trained."""
-    if _has(cell, "episodes.csv") and not _has(cell, "executions.csv"):
-        yield from rows_of({"random_success": read_layout(cell.out / "layout.json")["random_success"]})
-
-
-def _has(cell: Cell, table: str) -> bool:
-    """Whether it is what plays, with such a table."""
-    played = cell.stage in ("train-options", "train-meta", "train-baseline")
-    return played and table in open_artefact(cell.out).manifest["files"]
 
 
 def _states(path: Path) -> Iterator[Row]:
@@ -92,16 +97,3 @@ def _losses(artefact: Artefact) -> Iterator[Row]:
         last[row["sub_goal"]] = row
     for sub_goal, row in last.items():
         yield from rows_of(row, sub_goal=sub_goal)
-
-
-def _unevaluated(cell: Cell) -> Iterator[Row]:
-    """What an evaluation would say of a run or of options: it has not been made, or takes them for a part of others."""
-    artefact = open_artefact(cell.out) if _has(cell, "episodes.csv") or _has(cell, "executions.csv") else None
-    if artefact is not None and _has(cell, "executions.csv"):
-        about = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
-        found = distance.rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
-        yield from _of_metrics({"distance": {"options": [{**about, **row} for row in found]}})
-    elif artefact is not None:
-        episodes, layout = read_episodes(artefact.path / "episodes.csv"), read_layout(artefact.path / "layout.json")
-        run = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
-        yield from _of_metrics({"agents": [curves.agent_metrics("", [run])]})
