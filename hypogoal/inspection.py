@@ -151,40 +151,41 @@ def _hidden(path: Path, run: Path) -> bool:
 def faults_of(path: Path) -> list[str]:
     """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
     try:
-        return [fault for part in _parts(path) for fault in _faults_of_part(part, path)]
+        parts = _parts(path)
     except UserError as error:
         return [str(error)]
+    faults: list[str] = []
+    for part in parts:
+        try:
+            found = _artefact_faults(open_artefact(part), path) if part.is_dir() else _data_faults(part)
+            faults += [f"{part}: {fault}" for fault in found]
+        except UserError as error:  # a manifest that is a folder or a device is a fault of its own
+            faults.append(str(error))
+    return faults
 
 
 def notes_of(path: Path) -> list[str]:
     """One line for each thing in it that is no fault, and that only whoever asks can judge."""
+    notes: list[str] = []
     with contextlib.suppress(UserError):
-        return [note for part in _parts(path) if part.is_dir() for note in _notes_of_part(part, path)]
-    return []
+        for part in filter(Path.is_dir, _parts(path)):
+            with contextlib.suppress(UserError):
+                notes += _notes_of(open_artefact(part), path)
+    return notes
 
 
 def _parts(path: Path) -> list[Path]:
     return parts_of(path) if path.is_dir() and not (path / MANIFEST).is_file() else [path]
 
 
-def _notes_of_part(path: Path, folder: Path) -> Iterator[str]:
-    with contextlib.suppress(UserError):
-        artefact = open_artefact(path)
-        if artefact.manifest["format"] == UNSEALED:
-            yield f"{path}: written by an earlier hypogoal, its manifest has no checksum"
-        yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
-        for entry in artefact.manifest["inputs"]:
-            if not _lies_in(folder, artefact, entry):
-                yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not looked at"
-
-
-def _faults_of_part(path: Path, folder: Path) -> list[str]:
-    """Those of one data file or artefact; a manifest that is a folder or a device is a fault of its own."""
-    try:
-        faults = _artefact_faults(open_artefact(path), folder) if path.is_dir() else _data_faults(path)
-        return [f"{path}: {fault}" for fault in faults]
-    except UserError as error:
-        return [str(error)]
+def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:
+    path = artefact.path
+    if artefact.manifest["format"] == UNSEALED:
+        yield f"{path}: written by an earlier hypogoal, its manifest has no checksum"
+    yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
+    for entry in artefact.manifest["inputs"]:
+        if not _lies_in(folder, artefact, entry):
+            yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not looked at"
 
 
 def _data_faults(path: Path) -> Iterator[str]:
