@@ -93,7 +93,8 @@ def look_of(env: gymnasium.Env) -> Look:
     with UsersCode("the environment", env, failed="has no spaces:"):
         whole = space = env.observation_space
     parts, key = list(_parts(space)), ""
-    if any(map(_is_picture, dict(parts).values())):
+    boxes = [part for _, part in parts if isinstance(part, spaces.Box)]
+    if any(box.dtype == np.uint8 and len(box.shape) in (2, 3) for box in boxes):
         if len(parts) > 1 or not isinstance(space, spaces.Box | spaces.Dict):
             do = "Wrap it in gymnasium.wrappers.FilterObservation, and keep the picture alone, or all but pictures."
             raise UserError("observations mix pictures with others", ", ".join(name for name, _ in parts), do)
@@ -136,10 +137,6 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
             yield from _parts(part, f"{name}.{key}" if name else str(key))
     else:
         yield name, space
-
-
-def _is_picture(space: Any) -> bool:
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3)
 
 
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:

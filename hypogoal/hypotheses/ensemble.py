@@ -135,7 +135,14 @@ class Ensemble(nn.Module):
             raise UserError(NO_OBSERVATIONS, "they differ in shape", f"Give {self.view.dtype} (N, ...).") from None
         if self.view.dtype == NUMBERS and observations.dtype == np.float64:
             observations = observations.astype(NUMBERS)
-        self._check(observations, positions)
+        if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
+            given = f"{observations.dtype} {observations.shape}"
+            wanted = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
+            raise UserError(NO_OBSERVATIONS, given, f"Give {wanted}.")
+        if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
+            given = "none" if positions is None else f"{positions.dtype} {positions.shape}"
+            do = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
+            raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", given, do)
         return np.ascontiguousarray(self.view.see(observations, positions))  # flipped pictures are no tensors
 
     def verdicts(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
@@ -232,16 +239,6 @@ class Ensemble(nn.Module):
             return cls(network, observation_shape, members, torch.Generator(), view, **settings)
 
         return load_fitting(make, state, where, own=network not in NETWORKS).eval()
-
-    def _check(self, observations: Observations, positions: NDArray[np.int64] | None) -> None:
-        if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
-            given = f"{observations.dtype} {observations.shape}"
-            wanted = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
-            raise UserError(NO_OBSERVATIONS, given, f"Give {wanted}.")
-        if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
-            given = "none" if positions is None else f"{positions.dtype} {positions.shape}"
-            do = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
-            raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", given, do)
 
 
 def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:

@@ -162,18 +162,6 @@ class _Report(Resumable):
         self.numbers.update(losses)
         self.log.write(sub_goal=self.sub_goal, step=step, **losses)
 
-    def score(
-        self,
-        heldout: Split,
-        unlabelled: Observations,
-        positions: NDArray[np.int64] | None,
-        step: int,
-        ensemble: Ensemble,
-    ) -> None:
-        """Write :func:`score_rows` down after so many steps."""
-        for row in score_rows(ensemble, heldout, unlabelled, positions):
-            self.scores.write(sub_goal=self.sub_goal, step=step, **row)
-
     def snapshot(self) -> dict[str, Any]:
         return {"log": self.log.snapshot(), "scores": self.scores.snapshot(), "numbers": self.numbers}
 
@@ -202,9 +190,13 @@ def _train_one(
     if not checkpoints.saved:
         report.log.restore(0)
         report.scores.restore(0)
-    look, steps = None, config.steps * (config.members if config.schedule == "sequential" else 1)
-    if config.score_every:
-        look = partial(report.score, dataset.heldout(sub_goal), unlabelled, positions_of(origins))
+    steps = config.steps * (config.members if config.schedule == "sequential" else 1)
+    heldout = dataset.heldout(sub_goal) if config.score_every else None
+
+    def look(step: int, ensemble: Ensemble) -> None:
+        for row in score_rows(ensemble, heldout, unlabelled, positions_of(origins)) if heldout else ():
+            report.scores.write(sub_goal=sub_goal, step=step, **row)
+
     domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
     ensemble = fit(
         split.observations,

@@ -142,7 +142,7 @@ def test_states_that_can_hardly_train_are_told(tmp_path: Path, capsys: pytest.Ca
 def test_a_policy_collects() -> None:
     """Spec B7: without exploration a policy that goes right never sees the left end, and that is said."""
     right = GymnasiumDomain(CorridorEnv, SUB_GOALS, policy=lambda env, observation, rng: 1)
-    with pytest.raises(UserError, match="left-end has no positives among .* labelled states"):
+    with pytest.raises(UserError, match=r"left-end has no positives among .* labelled states"):
         collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=80, explore=0.0))
     assert collected(right, GymnasiumConfig(heldout_seeds=(4,), steps=800, explore=0.6)).labelled.labels[:, 0].any()
 
