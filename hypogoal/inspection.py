@@ -15,7 +15,7 @@ from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import json_lines, read_end, read_json, read_text
+from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, visible
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
@@ -137,15 +137,11 @@ def parts_of(run: Path) -> list[Path]:
     """The data files and artefacts of a run; a ``UserError`` where there is none."""
     if not run.is_dir():
         raise UserError("no such file or folder", run, "Check the path.")
-    artefacts = [manifest.parent for manifest in sorted(run.rglob(MANIFEST)) if not _hidden(manifest, run)]
-    data = [file for file in sorted(run.rglob("*.h5")) if file.parent not in artefacts and not _hidden(file, run)]
+    artefacts = [manifest.parent for manifest in visible(run, MANIFEST)]
+    data = [file for file in visible(run, "*.h5") if file.parent not in artefacts]
     if not artefacts and not data:
         raise UserError("no artefact and no data file here", run, "Give what a stage wrote.")
     return [*data, *artefacts]
-
-
-def _hidden(path: Path, run: Path) -> bool:
-    return any(part.startswith(".") for part in path.relative_to(run).parts)
 
 
 def faults_of(path: Path) -> list[str]:
@@ -184,7 +180,7 @@ def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:
         yield f"{path}: written by an earlier hypogoal, its manifest has no checksum"
     yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
     for entry in artefact.manifest["inputs"]:
-        if not _lies_in(folder, artefact, entry):
+        if not lies_in(folder, artefact.path / entry["relative"]):
             yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not looked at"
 
 
@@ -207,17 +203,13 @@ def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
         for sub_goal in whole:
             yield from _fault(partial(_check_members, artefact, sub_goal))
     for entry in artefact.manifest["inputs"]:
-        fault = find_input(artefact.path, entry, beside=True)[1] if _lies_in(folder, artefact, entry) else ""
+        fault = (
+            find_input(artefact.path, entry, beside=True)[1]
+            if lies_in(folder, artefact.path / entry["relative"])
+            else ""
+        )
         if fault:
             yield f"its input {entry['path']} ({entry['kind']}) is {fault}"
-
-
-def _lies_in(folder: Path, artefact: Artefact, entry: dict[str, str]) -> bool:
-    """Whether the place beside the artefact that an input is to have lies in the folder, links followed."""
-    try:
-        return (artefact.path / entry["relative"]).resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # links that lead in a circle
-        return False
 
 
 def _check_members(artefact: Artefact, sub_goal: str) -> None:

@@ -18,7 +18,7 @@ from typing import Any, Self
 from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json
+from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json, visible
 from hypogoal.core.hdf5 import Busy, open_hdf5
 from hypogoal.core.manifests import (
     AGAIN,
@@ -273,12 +273,8 @@ def find_artefacts(run: Path, kind: str) -> list[Artefact]:
     """All complete artefacts of ``kind`` below ``run`` (and ``run`` itself), sorted by path."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'hypogoal run' wrote.")
-    found = []
-    for manifest in sorted(run.rglob(MANIFEST)):
-        parts = manifest.relative_to(run).parts
-        if len(parts) <= DEPTH + 1 and not any(part.startswith(".") for part in parts):
-            found.append(open_artefact(manifest.parent))
-    return [artefact for artefact in found if artefact.kind == kind]
+    near = [path.parent for path in visible(run, MANIFEST) if len(path.relative_to(run).parts) <= DEPTH + 1]
+    return [artefact for artefact in map(open_artefact, near) if artefact.kind == kind]
 
 
 def check_files(artefact: Artefact) -> list[str]:

@@ -233,7 +233,18 @@ def inside(folder: Path, name: object) -> Path | None:
     if not isinstance(name, str) or not name or not all(path_part(part) for part in name.split("/")):
         return None
     path = folder / PurePosixPath(name)
+    return path if lies_in(folder, path) else None
+
+
+def lies_in(folder: Path, path: Path) -> bool:
+    """Whether a path lies in a folder, links followed."""
     try:
-        return path if path.resolve().is_relative_to(folder.resolve()) else None
+        return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # links that lead in a circle
-        return None
+        return False
+
+
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """The paths below a folder that fit a pattern, sorted, but for what is hidden, as drafts are."""
+    found = ((path, path.relative_to(folder).parts) for path in folder.rglob(pattern))
+    return sorted(path for path, parts in found if not any(part.startswith(".") for part in parts))
