@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hypogoal.core.artefacts import MANIFEST, open_artefact
-from hypogoal.core.errors import UserError
-from hypogoal.core.tensors import AGAIN, load_tensors
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
@@ -77,9 +76,6 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     if INITIATION in artefact.manifest["files"]:
         learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
         initiation = Narrowed(learned, shape, len(goals) * members, config["initiation_threshold"])
-    masked = config["mask_reached"]
-    if not isinstance(masked, bool):
-        raise UserError("the manifest's setting 'mask_reached' is malformed", artefact.path / MANIFEST, AGAIN)
     return Options(
         goals,
         members,
@@ -87,7 +83,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
         policies,
         config["option_timeout"],
         initiation,
-        masked,
+        config["mask_reached"],
         domain=config["domain"],
         domain_config=config["domain_config"],
         dwell=length if rule is Dwell else 1,

@@ -103,6 +103,7 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
     "observation_shape": lambda value: isinstance(value, list) and bool(value) and all(map(_size, value)),
     "observation_dtype": lambda value: value in ("uint8", "float32"),
     "domain_config": lambda value: isinstance(value, dict),
+    "mask_reached": lambda value: isinstance(value, bool),
     **dict.fromkeys(("crop_height", "crop_width"), _size),
     **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), _count),
     **dict.fromkeys(("ended_at", "options_ended_at", "hidden_width"), _count),
