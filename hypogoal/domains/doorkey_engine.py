@@ -34,6 +34,7 @@ from hypogoal.domains.doorkey_env import (
 
 N_ACTIONS = len(Actions)
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = (int(action) for action in Actions)
+SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # when it is looked for what can be reached
 CELLS = SIZE * SIZE
 POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
 HELD = CELLS  # a key's place: its cell, or HELD + rank on the ring (rank 0 was picked up first)
@@ -232,19 +233,18 @@ class DoorKeyEngine(Engine):
             "keys_held": held @ np.array([1, 2, 4]),
         }
 
-    def distances(self, drop: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def distances(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Breadth-first search: ids of all states reachable from the starts, nearest first, and steps to each.
 
-        States in which the episode ends are included and not gone beyond. Without ``drop`` they are a few thousand of a
-        layout; with it some ten million.
+        States in which the episode ends are included and not gone beyond. Without dropping a key they are a few
+        thousand of a layout; with it, which is not looked at, some ten million.
         """
-        actions = np.array([action for action in range(N_ACTIONS) if drop or action != DROP])
         rings, depth = [np.array([self._start(seed) for seed in self.layouts.seeds])], 0  # those so many steps away
         seen, steps = np.zeros(self.n_states, np.bool_), [np.zeros(len(rings[0]), np.int64)]
         seen[rings[0]] = True
         while len(rings[-1]):
             origin = rings[-1][~self._final[rings[-1]]]
-            following = np.unique(self.follow(np.repeat(origin, len(actions)), np.tile(actions, len(origin))))
+            following = np.unique(self.follow(np.repeat(origin, len(SEARCHED)), np.tile(SEARCHED, len(origin))))
             seen = np.concatenate([seen, np.zeros(self.n_states - len(seen), np.bool_)])
             new = following[~seen[following]]
             seen[new] = True
@@ -253,20 +253,20 @@ class DoorKeyEngine(Engine):
             steps.append(np.full(len(new), depth))
         return np.concatenate(rings), np.concatenate(steps)
 
-    def reachable(self, drop: bool = False) -> NDArray[np.int64]:
+    def reachable(self) -> NDArray[np.int64]:
         """Ids of all states reachable from the start, nearest first, one for each image.
 
         States that differ only in the order of the keys on the ring look the same; the first one found stands
         for them all.
         """
-        ids, _ = self.distances(drop)
+        ids, _ = self.distances()
         images = self.codes(ids).view(f"V{CELLS}")[:, 0]
         _, first = np.unique(images, return_index=True)
         return ids[np.sort(first)]
 
     def plan(self) -> Plan:
         """Of all states but those that only dropping a key leads to, of which there are some ten million."""
-        ids, actions = self.distances()[0], np.array([action for action in range(N_ACTIONS) if action != DROP])
+        ids, actions = self.distances()[0], SEARCHED
         final = self._final[ids]
         following = np.repeat(ids[:, None], len(actions), axis=1)
         each = np.broadcast_to(actions, following.shape)[~final]
