@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.config import setting
-from hypogoal.core.errors import UserError
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
 from hypogoal.domains.base import Domain
@@ -114,9 +113,6 @@ def labelled_rooms(groups: int) -> tuple[int, ...]:
 
 def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
     """The rooms of the unlabelled states: those given, or one with a ladder that has no labels and one without."""
-    for room in config.unlabelled_rooms:
-        if not 0 <= room < ROOMS:
-            raise UserError("no such room", f"unlabelled_rooms={room}", f"Rooms are 0 to {ROOMS - 1}.")
     if config.unlabelled_rooms:
         return tuple(dict.fromkeys(config.unlabelled_rooms))
     labelled = labelled_rooms(config.groups)

@@ -14,7 +14,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Observations
+from hypogoal.dataset import Observations, require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -69,9 +69,7 @@ class TrainingStates:
         if labels.shape != observations.shape[:1] or unlabelled.shape[1:] != observations.shape[1:]:
             shapes = f"observations {observations.shape}, labels {labels.shape}, unlabelled {unlabelled.shape}"
             raise UserError("the states do not fit together", shapes, "Collect them again.")
-        if not labels.any() or labels.all():
-            counts = f"{int(labels.sum())} positives of {len(labels)}"
-            raise UserError("labelled states of both classes are needed", counts, "Collect others.")
+        require_classes(labels[:, None], ["the sub-goal"], None, "Collect others.")
         self.labels, self.n_labelled, self.n_unlabelled = labels, len(observations), len(unlabelled)
         self.ladders, self.device = ladders, device
         self._labelled = observations

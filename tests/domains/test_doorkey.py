@@ -263,7 +263,7 @@ def test_held_out_layouts_are_new() -> None:
 
 def test_collections_that_cannot_be() -> None:
     """Spec G2: one clear line where a sub-goal has no positives, or a room too small for the draws."""
-    with pytest.raises(UserError, match="two classes of"):
+    with pytest.raises(UserError, match="collect-red-key has no positives"):
         collected(labelled_seed=1, keyring=False)
     with pytest.raises(UserError, match="only 60 key placements"):
         collected(regime="shuffled", labelled_seed=11, draws=61)

@@ -534,7 +534,7 @@ def test_an_objective_that_gives_nan_is_named(monkeypatch: pytest.MonkeyPatch) -
 def test_data_that_cannot_be_learned_from_are_one_clear_line() -> None:
     """Spec G2: one class only, no unlabelled states, shapes that do not fit."""
     observations, labels, unlabelled = toy()
-    with pytest.raises(UserError, match="both classes are needed: 0 positives of 64"):
+    with pytest.raises(UserError, match="the sub-goal has no positives among 64 labelled states"):
         fit(observations, labels & False, unlabelled, TOY, seed=0)
     with pytest.raises(UserError, match="unlabelled states are needed"):
         fit(observations, labels, unlabelled[:0], TOY, seed=0)
