@@ -171,14 +171,13 @@ def is_finished(cell: Cell) -> bool:
     """
     if not cell.out.exists() or (cell.out.is_dir() and not any(cell.out.iterdir())):
         return False
+    where: Path | None = cell.out
     try:
         fault = _fault(cell)
     except UserError as error:
-        if cell.stage in DERIVED:
-            return False
-        raise UserError(str(error), None, "Move it out of the run to have it made again.") from None
+        fault, where = str(error), None
     if fault and cell.stage not in DERIVED:
-        raise UserError(fault, cell.out, "Move it out of the run to have it made again.")
+        raise UserError(fault, where, "Move it out of the run to have it made again.")
     return not fault
 
 

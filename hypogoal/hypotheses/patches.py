@@ -201,7 +201,12 @@ def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) 
             level += 1
             window = _side(layer.kernel_size) ** 2
             seen = rows.index_select(0, batch.parts[level - 1]).view(-1, window, rows.shape[1]) if level else rows
-            rows = _convolved(layer, seen) if isinstance(layer, nn.Conv2d) else seen.max(dim=1).values
+            if isinstance(layer, nn.MaxPool2d):
+                rows = seen.max(dim=1).values
+            else:
+                weight = layer.weight.permute(2, 3, 1, 0).reshape(-1, layer.out_channels)
+                flat = seen.view(-1, len(weight))
+                rows = flat @ weight if layer.bias is None else torch.addmm(layer.bias, flat, weight)
         elif isinstance(layer, nn.BatchNorm2d):
             rows = _batch_norm(layer, rows, batch.shares[level], batch.places[level], counted)
         elif isinstance(layer, nn.Flatten):
@@ -211,13 +216,6 @@ def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) 
         else:
             rows = layer(rows)
     return rows
-
-
-def _convolved(layer: nn.Conv2d, seen: Tensor) -> Tensor:
-    """A convolution of patches (U, k * k, C): (U, channels out)."""
-    weight = layer.weight.permute(2, 3, 1, 0).reshape(-1, layer.out_channels)
-    flat = seen.view(-1, len(weight))
-    return flat @ weight if layer.bias is None else torch.addmm(layer.bias, flat, weight)
 
 
 def _batch_norm(

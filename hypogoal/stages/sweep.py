@@ -206,12 +206,11 @@ def _begin(
     factor = machine_factor() if todo else 1.0
     if len(todo) < len(planned.cells):
         say(f"{len(planned.cells) - len(todo)} of {len(planned.cells)} cells are done")
-    if todo:
-        for line in cost_lines(todo, planned.workers, factor):
-            say(line)
-    seconds = wall_seconds(todo, planned.workers, factor)
-    if confirm is not None and seconds > LONG_SECONDS:
-        confirm(cost_lines(todo, planned.workers, factor)[-1])
+    told = cost_lines(todo, planned.workers, factor) if todo else []
+    for line in told:
+        say(line)
+    if confirm is not None and wall_seconds(todo, planned.workers, factor) > LONG_SECONDS:
+        confirm(told[-1])
     (out / records.LOGS).mkdir(parents=True, exist_ok=True)
     if lost and unsure:  # said to who asked for quiet, too
         _say(f"{lost}, and is written anew: what is complete is kept where its command makes it")

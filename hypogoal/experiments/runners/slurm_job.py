@@ -68,19 +68,16 @@ def run_job(run: Path, name: str) -> None:
         again, code = False, 1
     code = signals.running.ended(code)
     if again:
-        _queue_again(cell)
+        # By array and element: the last element's own number is the array's too, and would queue all of them again.
+        job = "_".join(os.environ.get(name, "") for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID"))
+        say(f"{cell.name}: saved, queued again (job {job})", err=True)
+        done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise UserError(
+                f"Slurm does not queue it again ({done.stderr.strip()})", cell.name, "Start the sweep again."
+            )
     elif code:
         raise UserError(f"{name} failed: {reason(run, cell, code)}")
-
-
-def _queue_again(cell: Cell) -> None:
-    # By array and element: the last element's own number is the array's too, and would queue all of them again.
-    names = ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID")
-    job = "_".join(os.environ.get(name, "") for name in names)
-    say(f"{cell.name}: saved, queued again (job {job})", err=True)
-    done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UserError(f"Slurm does not queue it again ({done.stderr.strip()})", cell.name, "Start the sweep again.")
 
 
 def _saved(cell: Cell) -> list[tuple[str, int]]:
