@@ -82,7 +82,7 @@ class Looked:
 
     def predict(self, observations: NDArray[np.uint8], positions: None = None) -> NDArray[np.float32]:
         """As :meth:`Ensemble.predict`."""
-        networks = self.ensemble.eval().networks()
+        networks = self.ensemble.eval().networks
         with torch.inference_mode():
             rows = [
                 torch.stack([patches.forward(network, batch) for network in networks]).softmax(dim=-1)[..., 1].T.numpy()
@@ -97,7 +97,7 @@ def _batches(layouts: str, unlabelled: bool) -> list[patches.Batch]:
     """The distinct patches of the held-out or the unlabelled states, in the chunks of :meth:`Ensemble.predict`."""
     split = states_of(layouts).unlabelled if unlabelled else states_of(layouts).heldout
     observations = split.observations
-    network = Ensemble(EnsembleConfig().network, observations.shape[1:], 1, torch.Generator()).networks()[0]
+    network = Ensemble(EnsembleConfig().network, observations.shape[1:], 1, torch.Generator()).networks[0]
     batches = []
     for start in range(0, len(observations), PATCH_CHUNK):
         tables = patches.make_tables(observations[start : start + PATCH_CHUNK], network)

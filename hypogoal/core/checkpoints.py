@@ -35,7 +35,7 @@ FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART, SUM_PART = "json-3", "crc32"  # the number rises with what stages keep
+JSON_PART, SUM_PART = "json-4", "crc32"  # the number rises with what stages keep
 ARRAY, TENSOR = "$array", "$tensor"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -242,7 +242,7 @@ def _restored(value: Any, saved: Any) -> Any:
     elif isinstance(value, deque):
         value.clear()
         value.extend(saved)
-    elif isinstance(value, list) and value and isinstance(value[0], Resumable | deque):
+    elif isinstance(value, list) and value and isinstance(value[0], Resumable | deque | np.random.Generator):
         for item, known in zip(value, saved, strict=True):
             _restored(item, known)
     elif isinstance(value, torch.nn.Module):

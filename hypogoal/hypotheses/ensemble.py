@@ -46,7 +46,8 @@ class Ensemble(nn.Module):
             ``view`` shows -> logits (N, 2).
         trunk: the encoder, from the same to (N, F), that members share; None where each has its own.
         frozen: whether it is, and so always in evaluation mode.
-        parts: the trunk, to be run once, and the K networks behind it: :meth:`networks` where there is no trunk.
+        parts: the trunk, to be run once, and the K networks behind it: ``networks`` where there is no trunk.
+        networks: the members in the order of layers that is fastest; weights and BatchNorm statistics are shared.
         thresholds: float32 (K,), the probabilities above which the members' verdicts are yes.
 
     Raises:
@@ -85,8 +86,8 @@ class Ensemble(nn.Module):
             self.heads, self.members = nn.ModuleList(heads), tuple(networks)
             if self.frozen:
                 self.trunk.requires_grad_(False)
-        self._networks = tuple(map(reordered, networks))
-        self.parts = self.trunk and reordered(self.trunk), tuple(heads) or self._networks
+        self.networks = tuple(map(reordered, networks))
+        self.parts = self.trunk and reordered(self.trunk), tuple(heads) or self.networks
         self.register_buffer("thresholds", torch.full((members,), THRESHOLD))
         self.train()
 
@@ -97,10 +98,6 @@ class Ensemble(nn.Module):
     def __len__(self) -> int:
         """K, the number of members."""
         return len(self.members)
-
-    def networks(self) -> tuple[nn.Sequential, ...]:
-        """The members in the order of layers that is fastest; weights and BatchNorm statistics are shared."""
-        return self._networks
 
     def train(self, mode: bool = True) -> Self:
         """Training or evaluation mode; of a frozen trunk always the latter."""

@@ -41,7 +41,7 @@ class StackedMembers:
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
         whole = [isinstance(ensemble.view, FullView) and ensemble.view.standard is None for ensemble in ensembles]
         self._one_view = all(whole)
-        networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
+        networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
         self.count = len(networks)
         self.joined = ensembles[0].trunk is None and _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.checkpoints import Checkpoints, Resumable, State, optimiser_snapshot, restore_optimiser
+from hypogoal.core.checkpoints import Checkpoints, Resumable, State
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.dataset import Observations
@@ -144,11 +144,13 @@ def _diverse(config: EnsembleConfig) -> bool:
     return config.diversity_weight > 0 and load_objective(config.diversity).acts(config.members)
 
 
-class _Round:
+class _Round(Resumable):
     """The training of ``members`` against each other and against those before them, which are frozen.
 
     It stops at the first loss or weight that is NaN or Inf, looking every ``REPORT_EVERY`` steps.
     """
+
+    CHANGING = ("optimiser", "changes", "done", "losses")
 
     def __init__(
         self,
@@ -178,22 +180,13 @@ class _Round:
         self.losses: list[Tensor] = []  # of the steps since the last look: each member's, and those of diversity
 
     def snapshot(self) -> State:
-        """All that the next steps depend on; losses as arrays, which may hold NaN."""
-        return {
-            "optimiser": optimiser_snapshot(self.optimiser),
-            "changes": [rng.bit_generator.state for rng in self.changes],
-            "layers": global_state(self.states.device),
-            "watch": {"done": self.done, "rows": [losses.cpu().numpy() for losses in self.losses]},
-        }
+        """All that the next steps depend on."""
+        return {**super().snapshot(), "layers": global_state(self.states.device)}
 
-    def restore(self, saved: State) -> None:
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of the same training."""
-        restore_optimiser(self.optimiser, saved["optimiser"])
-        for rng, kept in zip(self.changes, saved["changes"], strict=True):
-            rng.bit_generator.state = kept
-        restore_global(saved["layers"], self.states.device)
-        self.done = saved["watch"]["done"]
-        self.losses = [torch.from_numpy(losses) for losses in saved["watch"]["rows"]]
+        super().restore(snapshot)
+        restore_global(snapshot["layers"], self.states.device)
 
     def steps(self, on_step: OnStep | None) -> Iterator[int]:
         """Step after step, to the last; their numbers."""

@@ -233,7 +233,7 @@ def learned_terminations(
     ``rule``: see :func:`rule_of`.
     """
     stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
-    networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks()]
+    networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
     members = len(ensembles[0])
     shared = ensembles[0].trunk is not None  # all members cost little more than one
 

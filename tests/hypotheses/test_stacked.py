@@ -79,7 +79,7 @@ def test_networks_without_windows_are_judged_whole() -> None:
     assert split_of(padded) is None
     assert split_of(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3, 2))) is None
     generator = torch.Generator().manual_seed(0)
-    network = Ensemble("doorkey", (64, 64, 3), 1, generator).networks()[0]
+    network = Ensemble("doorkey", (64, 64, 3), 1, generator).networks[0]
     assert split_of(network) is not None
     assert split_of(network)[1:] == (17, 8)
 
