@@ -131,8 +131,8 @@ def evaluate(
     quiet: cli.Quiet = False,
 ) -> None:
     """Compute every number of a run: accuracy, curves, choices."""
+    from hypogoal.evaluation.questions import summary_table
     from hypogoal.stages.evaluate import evaluate as evaluated
-    from hypogoal.stages.evaluate import summary_table
 
     out = out or run / "evaluation"
     metrics = evaluated(run, out, layouts=layouts or "", force=force, resume=resume, quiet=quiet)

@@ -124,9 +124,11 @@ class Engine(ABC):
     def n_states(self) -> int:
         """Ids known so far are 0 .. n_states - 1."""
 
-    @abstractmethod
     def reset(self) -> NDArray[np.int64]:
-        """Put every environment at the start of an episode; returns the ids, int64 (E,)."""
+        """Put every environment at the start of an episode; returns the ids, int64 (E,). As is, where ``restarts``."""
+        self.ids = self.elapsed = np.zeros(self.count, np.int64)
+        self.restart(np.ones(self.count, np.bool_))
+        return self.ids.copy()
 
     @abstractmethod
     def step(self, actions: NDArray[np.int64]) -> Step:
@@ -219,11 +221,6 @@ class TurnEngine(Engine):
     @abstractmethod
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
         """One environment's step number ``elapsed`` of an episode: state, reward, terminated, truncated."""
-
-    def reset(self) -> NDArray[np.int64]:
-        self.ids = np.array([self._begin(number) for number in range(self.count)], np.int64)
-        self.elapsed = np.zeros(self.count, np.int64)
-        return self.ids.copy()
 
     def restart(self, where: NDArray[np.bool_]) -> None:
         ids, elapsed = self.ids.copy(), self.elapsed.copy()

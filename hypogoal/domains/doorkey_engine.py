@@ -135,11 +135,6 @@ class DoorKeyEngine(Engine):
     def tiles(self) -> NDArray[np.uint8]:
         return tiles()
 
-    def reset(self) -> NDArray[np.int64]:
-        self.ids = self.elapsed = np.zeros(self.count, np.int64)
-        self.restart(np.ones(self.count, np.bool_))
-        return self.ids.copy()
-
     def restart(self, where: NDArray[np.bool_]) -> None:
         self.ids, self.elapsed = self.ids.copy(), np.where(where, 0, self.elapsed)
         for number in where.nonzero()[0].tolist():

@@ -53,10 +53,6 @@ class KnownWindows:
         self._rows: dict[bytes, int] = {}
         self._table = torch.empty(0)
 
-    def __len__(self) -> int:
-        """How many are known."""
-        return len(self._rows)
-
     def of(self, images: NDArray[np.uint8]) -> Tensor:
         """Numbers float32 (N, F, h, w) of images uint8 (N, H, W, C)."""
         views = np.lib.stride_tricks.sliding_window_view(images, (self.side, self.side), axis=(1, 2))

@@ -77,7 +77,6 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     require_file(file, "the image is", DO)
     try:
         if file.suffix == ARRAY:
-            require_file(file, "the state is", DO)
             values = np.load(file, mmap_mode="r", allow_pickle=False)
             if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)

@@ -18,7 +18,7 @@ from hypogoal.evaluation.distance import INSIDE, NEAR
 from hypogoal.evaluation.judging import Case, Work, cases_of, judgements, processes_for
 from hypogoal.evaluation.numbers import Row, ensemble_names, groups_of, method_names, plain
 from hypogoal.evaluation.provenance import provenance
-from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings, summary_table
+from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings
 from hypogoal.evaluation.run import LAST, WINDOW, find, most_used
 from hypogoal.experiments.cells import DERIVED
 from hypogoal.experiments.records import PLAN, read_plan
@@ -26,8 +26,6 @@ from hypogoal.experiments.status import stamp_of
 from hypogoal.hypotheses.ensemble import THRESHOLD
 from hypogoal.meta.config import layout_seeds
 from hypogoal.needs import evaluation_needs
-
-__all__ = ["evaluate", "summary_table"]
 
 SETTINGS = {"window": WINDOW, "solved": SOLVED, "gamma": GAMMA, "threshold": THRESHOLD}
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have

@@ -61,14 +61,14 @@ class Film(NamedTuple):
 
 def _films(run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
     """Those that were asked for; where nobody asked, one where there can be one, and a line where it cannot be."""
-    if videos is not None:
-        return (play_films(agents_of(run), run, videos) if videos else []), []
-    try:
-        return play_films(agents_of(run), run, 1), []
-    except NoAgent:
+    if videos == 0:
         return [], []
+    try:
+        return play_films(agents_of(run), run, videos or 1), []
     except UserError as error:
-        return [], [f"no film of an episode: {error}"]
+        if videos:
+            raise
+        return [], [] if isinstance(error, NoAgent) else [f"no film of an episode: {error}"]
 
 
 def agents_of(run: Path) -> list[Artefact]:

@@ -18,11 +18,11 @@ from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation import explorer, judging
 from hypogoal.evaluation.page import Material
-from hypogoal.evaluation.questions import OLDER, render
+from hypogoal.evaluation.questions import OLDER, render, summary_table
 from hypogoal.evaluation.run import read_evaluation
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.hypotheses.scores import member_scores, ranking
-from hypogoal.stages.evaluate import evaluate, summary_table
+from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import draw_figures, report
 
 QUIET = {"quiet": True}
