@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import replacing
+from hypogoal.core.files import replace_file
 
 if TYPE_CHECKING:
     import torch
@@ -119,12 +119,14 @@ class Checkpoints:
         if not all(np.isfinite(values).all() for values in tensors.values() if values.dtype.kind == "f"):
             return
         text = np.frombuffer(json.dumps(tree).encode(), np.uint8)
-        parts = {**arrays, **tensors, JSON_PART: text}
+        fresh = self.path.with_suffix(".new")
         try:
             self.path.parent.mkdir(exist_ok=True)
-            with replacing(self.path) as fresh:
-                save_file({**parts, SUM_PART: _checksum(parts)}, fresh)
+            parts = {**arrays, **tensors, JSON_PART: text}
+            save_file({**parts, SUM_PART: _checksum(parts)}, fresh)
+            replace_file(fresh, self.path)
         except (OSError, SafetensorError) as error:
+            fresh.unlink(missing_ok=True)
             what = f"a checkpoint cannot be written ({error})"
             raise UserError(what, self.path, "Make room, then give --resume to go on.") from None
 

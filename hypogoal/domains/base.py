@@ -125,7 +125,7 @@ class Engine(ABC):
         """Ids known so far are 0 .. n_states - 1."""
 
     def reset(self) -> NDArray[np.int64]:
-        """Put every environment at the start of an episode; returns the ids, int64 (E,). As is, where ``restarts``."""
+        """Put every environment at the start of an episode; returns the ids, int64 (E,). Here by ``restart``."""
         self.ids = self.elapsed = np.zeros(self.count, np.int64)
         self.restart(np.ones(self.count, np.bool_))
         return self.ids.copy()
