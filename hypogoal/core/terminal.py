@@ -27,15 +27,11 @@ def printable(text: str) -> str:
 
 def say(text: object, *, err: bool = False) -> None:
     """A line for people, on standard output or error."""
-    _write(printable(str(text)), err=err)
+    give(printable(str(text)), err=err)
 
 
 def give(text: object, *, err: bool = False) -> None:
     """What programs read, as it is: JSON, or the path of an output, of which they can make use only if it is exact."""
-    _write(str(text), err=err)
-
-
-def _write(text: str, *, err: bool) -> None:
     stream = sys.stderr if err else sys.stdout
     try:
         if stream is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -206,20 +207,13 @@ class TrainingStates:
 
 def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> Iterator[NDArray[np.int64]]:
     """Without end: ``count`` items of the pools in turn; each is shuffled anew whenever it has been gone through."""
-    streams = [
-        _shuffled(pool, rng_for(seed, name, *([number] if len(pools) > 1 else []))) for number, pool in enumerate(pools)
-    ]
+    rngs = [rng_for(seed, name, *([number] if len(pools) > 1 else [])) for number in range(len(pools))]
+    streams = [chain.from_iterable(map(rng.permutation, repeat(pool))) for rng, pool in zip(rngs, pools, strict=True)]
     turn = 0
     while True:
         drawn = np.array([next(streams[(turn + item) % len(streams)]) for item in range(count)], dtype=np.int64)
         turn = (turn + count) % len(streams)
         yield drawn
-
-
-def _shuffled(pool: NDArray[np.int64], rng: np.random.Generator) -> Iterator[np.int64]:
-    """Without end: the pool's items, shuffled anew whenever it has been gone through."""
-    while True:
-        yield from rng.permutation(pool)
 
 
 def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor:

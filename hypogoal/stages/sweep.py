@@ -7,6 +7,7 @@ import contextlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ FIGURES = {  # of the paper, and what has one preset: the experiment and this
 }
 CELLS = {("doorkey", "choosing"): "choosing"}  # presets with cells of their own: the experiment that has them
 AGAIN = "give the same command again to go on"
+_say = partial(say, err=True)
 
 
 def config_class_of(stage: str, domain: str = "doorkey") -> type:
@@ -247,7 +249,3 @@ def gather(out: Path) -> Path:
         about = {"cells": [cell.text for cell in planned.cells], "seconds": round(seconds, 1)}
         replace_text(out / records.FINISHED, json.dumps(about, indent=1) + "\n")
     return results
-
-
-def _say(text: str) -> None:
-    say(text, err=True)
