@@ -7,7 +7,8 @@ ONLY ?= doorkey montezuma training options loop startup
 
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+USER := $(VENV)/.installed
+STAMP := $(VENV)/.installed-dev
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test kernels slurm check bench docs clean
@@ -15,7 +16,7 @@ STAMP := $(VENV)/.installed
 help: ## what one can make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-setup: $(STAMP) ## make .venv and install hypogoal with its tested versions into it (once)
+setup: $(STAMP) ## make .venv and install hypogoal and the developers' tools, tested versions (once)
 
 # A half-made .venv (Debian without python3-venv) must not pass for a whole one at the next call.
 $(BIN)/python:
@@ -24,13 +25,18 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) || \
 		{ rm -rf $(VENV); echo "python could not make a virtual environment: install python3-venv" >&2; exit 1; }
 
-$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+$(USER): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing hypogoal and its dependencies into $(VENV) (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
 	@touch $@
 
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing hypogoal, its dependencies and the developers' tools into $(VENV) (some minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $(USER) $@
+
 # An unfinished demo is continued, a finished one only shown again; for a fresh one remove $(ROOMS) and $(DEMO).
-demo: $(STAMP) ## where an ensemble is needed, in runs/rooms, then three-key DoorKey, in runs/demo: from nothing to a report
+demo: $(USER) ## where an ensemble is needed, in runs/rooms, then three-key DoorKey, in runs/demo: from nothing to a report
 	$(BIN)/hypogoal run which-feature --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
 

@@ -9,7 +9,7 @@ import sys
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.9.0"
+__version__ = "0.10.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import OptionEnv, load_ensemble, load_options
@@ -51,12 +51,17 @@ def _register(_imported: object = None) -> None:
 class _Registration:
     """Waits until someone imports Gymnasium, which takes longer than all that is imported here, and few need it."""
 
+    asking = False  # the other finders
+
     def find_spec(self, name: str, *_: object) -> Any:
-        if name != "gymnasium" or self not in sys.meta_path:
+        if name != "gymnasium" or self.asking:
             return None
-        sys.meta_path.remove(self)
-        loader: Any = getattr(spec := find_spec(name), "loader", None)
-        if loader is not None:
+        self.asking = True
+        try:
+            spec: Any = find_spec(name)
+        finally:
+            self.asking = False
+        if loader := getattr(spec, "loader", None):
             load = loader.exec_module
             loader.exec_module = lambda module: _register(load(module))
         return spec

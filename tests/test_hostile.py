@@ -62,7 +62,7 @@ HOSTILE = {
     "external storage": (external, "lie in another file"),
     "virtual": (virtual, "lie in another file"),
     "references": (lambda f, s: f.create_dataset(OBSERVATIONS, shape=(7, *SHAPE), dtype=h5py.ref_dtype), "type"),
-    "floats": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, *SHAPE))), "type"),
+    "floats": (lambda f, s: f.create_dataset(OBSERVATIONS, data=np.zeros((7, *SHAPE))), "is float64"),
     "a filter": (
         lambda f, s: f.create_dataset(OBSERVATIONS, shape=(7, *SHAPE), dtype="u1", chunks=True, scaleoffset=0),
         "filter",

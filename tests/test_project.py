@@ -230,14 +230,15 @@ def test_set_up_is_done_once_and_again_when_the_versions_change(tmp_path: Path) 
         fresh = make(tmp_path, "-n", target).stdout
         assert create in fresh
         assert install in fresh
+        assert ("[dev]" in fresh) == (target != "demo"), "who runs the demo needs no developers' tools"
     (tmp_path / ".venv/bin").mkdir(parents=True)
     (tmp_path / ".venv/bin/python").touch()
-    (tmp_path / ".venv/.installed").touch()
+    (tmp_path / ".venv/.installed-dev").touch()
     again = make(tmp_path, "-n", "test").stdout
     assert "pytest" in again
     assert create not in again
     assert install not in again
-    later = (tmp_path / ".venv/.installed").stat().st_mtime + 10
+    later = (tmp_path / ".venv/.installed-dev").stat().st_mtime + 10
     os.utime(tmp_path / "constraints.txt", (later, later))
     changed = make(tmp_path, "-n", "test").stdout
     assert install in changed

@@ -367,10 +367,7 @@ def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str
 
     loader = jinja2.PackageLoader("hypogoal.evaluation", "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    css, script = (
-        resources.files("hypogoal.evaluation").joinpath(f"templates/{name}").read_text(encoding="utf-8")
-        for name in ("report.css", "explorer.js")
-    )
+    css, script = packaged("templates/report.css"), packaged("templates/explorer.js")
     return environment.get_template("report.html").render(
         title=title,
         subtitle=subtitle,
@@ -381,6 +378,11 @@ def draw_page(title: str, subtitle: str, sections: Sequence[Block], version: str
         sections=sections,
         footer=f"Made by hypogoal {version}. This page is one file and needs no network.",
     )
+
+
+def packaged(name: str) -> str:
+    """The text of a file that comes with the evaluation."""
+    return resources.files("hypogoal.evaluation").joinpath(name).read_text(encoding="utf-8")
 
 
 def _digest(text: str) -> str:

@@ -2,7 +2,6 @@
 
 import tomllib
 from collections.abc import Iterator
-from importlib import resources
 from operator import itemgetter
 
 from rich.console import Group
@@ -22,7 +21,7 @@ from hypogoal.evaluation import (
     zero_shot,
 )
 from hypogoal.evaluation.numbers import Metrics
-from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed
+from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, listed, packaged
 from hypogoal.evaluation.provenance import domains_of, provenance_section
 
 # In the order of the page; the numbers of one are there for those below it.
@@ -49,8 +48,7 @@ def agents_last() -> list[Question]:
 
 def meanings() -> dict[str, dict[str, str]]:
     """What each quantity is."""
-    told = resources.files("hypogoal.evaluation").joinpath("quantities.toml").read_text(encoding="utf-8")
-    quantities: dict[str, tuple[str, str]] = tomllib.loads(told)
+    quantities: dict[str, tuple[str, str]] = tomllib.loads(packaged("quantities.toml"))
     for question in QUESTIONS:
         quantities |= question.meanings
     return {name: {"unit": unit, "meaning": meaning} for name, (unit, meaning) in quantities.items()}
