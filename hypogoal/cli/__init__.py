@@ -51,14 +51,14 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
     if arguments is None:
         signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
-        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see __main__
-            signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = _unraised
         open_streams()
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     try:
+        if arguments is None and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see __main__
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         os.getcwd()  # which may have been deleted
         return _called(given)
     except Unprinted as error:

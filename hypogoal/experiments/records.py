@@ -6,6 +6,7 @@ the lock goes on to the cell's own processes, so it ends with the last of them. 
 """
 
 import json
+import socket
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -62,6 +63,11 @@ def read_record(run: Path, cell: Cell) -> Record:
 def write_record(run: Path, cell: Cell, record: Record) -> None:
     """Write down how a cell went."""
     replace_text(run / LOGS / f"{cell.name}.json", json.dumps(asdict(record)) + "\n")
+
+
+def begun(before: Record) -> Record:
+    """The record of a cell that is being started."""
+    return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
 
 
 def excuse(run: Path, cells: Sequence[Cell]) -> None:

@@ -19,6 +19,7 @@ from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_env import SUB_GOALS
 from hypogoal.evaluation import hypotheses
 from hypogoal.evaluation.judging import Work
+from hypogoal.evaluation.questions import summary_table
 from hypogoal.evaluation.run import find, read_evaluation
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.records import write_plan
@@ -27,7 +28,7 @@ from hypogoal.inspection import summary_of
 from hypogoal.learners.baselines.settings import BaselineConfig
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.stages.collect import collect
-from hypogoal.stages.evaluate import evaluate, missing, summary_table
+from hypogoal.stages.evaluate import evaluate, missing
 from hypogoal.stages.report import draw_figures, report
 from hypogoal.stages.train_baseline import train_baseline
 from hypogoal.stages.train_ensemble import train_ensemble

@@ -1,7 +1,6 @@
 """One cell's process: what every runner starts, on whichever machine (Spec G4)."""
 
 import os
-import socket
 import subprocess
 import time
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from hypogoal.core.drafts import unfinished
 from hypogoal.core.own_code import environment_of_children
 from hypogoal.core.workers import CORES, PYTHON, die_with_parent
 from hypogoal.experiments.cells import Cell
-from hypogoal.experiments.records import Record, open_log, read_record, write_record
+from hypogoal.experiments.records import Record, begun, open_log, read_record, write_record
 from hypogoal.experiments.status import stamp_of
 
 # Of the libraries beneath the stages: one thread a process, unless the user says otherwise.
@@ -59,7 +58,7 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False, check: 
     log = open_log(run, cell)
     try:
         before = read_record(run, cell)
-        record = Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
+        record = begun(before)
         write_record(run, cell, record)
         log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
         fresh = (force or cell.out.exists()) and not check  # what is there is an evaluation of before
