@@ -34,7 +34,7 @@ from hypogoal.dataset import Split, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
 from hypogoal.domains.base import defaults_of  # noqa: E402
 from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
-from hypogoal.hypotheses.networks import build_network  # noqa: E402
+from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
 from hypogoal.hypotheses.training import fit  # noqa: E402
 
 WANTED = {"doorkey": 4.0, "montezuma": 2.5}
@@ -78,7 +78,8 @@ def plain(split: Split, unlabelled: np.ndarray, config: EnsembleConfig, steps: i
     """Seconds of a step of the plain loop."""
     generator = torch.Generator().manual_seed(0)
     shape = split.observations.shape[1:]
-    members = [build_network(config.network, shape, generator).train() for _ in range(config.members)]
+    name = network_for(config.network, split.observations.dtype)
+    members = [build_network(name, shape, generator).train() for _ in range(config.members)]
     adam = [
         torch.optim.Adam(member.parameters(), lr=config.learning_rate, weight_decay=config.l2_weight)
         for member in members
