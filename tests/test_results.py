@@ -6,7 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bandits, choosing, hypotheses, labels, ladder_options, ladders, thresholds, which_feature
+from benchmarks import (
+    bandits,
+    choosing,
+    hypotheses,
+    labels,
+    ladder_options,
+    ladders,
+    many_layouts,
+    thresholds,
+    which_feature,
+)
 from benchmarks.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -16,6 +26,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "hypotheses-doorkey": hypotheses.tables,
     "hypotheses-ladders": ladders.tables,
     "labels-doorkey": labels.tables,
+    "many-layouts": many_layouts.tables,
     "options-that-hold": ladder_options.tables_that_hold,
     "preference-doorkey": choosing.tables,
     "thresholds-doorkey": thresholds.tables,
