@@ -3,14 +3,20 @@
 import json
 import math
 import os
+import re
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
 from hypogoal.core.terminal import printable, say, screen
 
 PLAIN_INTERVAL_SECONDS = 10.0
+LOOK_SECONDS = 1.0
+UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86400.0}  # of time, and their seconds
 
 
 class Progress:
@@ -44,7 +50,7 @@ class Progress:
         if self._bar is not None:
             self._bar.stop()
         elif not self.quiet and kind is None:
-            self._line("done")
+            self._line(f"done in {duration(time.monotonic() - self._start)}")
 
     def expect(self, total: int) -> None:
         """How many units there will be, where that is known only now."""
@@ -72,13 +78,46 @@ class Progress:
         elif time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
             self._line(text)
 
+    @contextmanager
+    def following(self, count: Callable[[], int]) -> Iterator[None]:
+        """Within the block ``count`` is asked each second how much is done: by other processes, whose logs it reads."""
+        over = threading.Event()
+
+        def look() -> None:
+            while not over.wait(LOOK_SECONDS):
+                self.update(count())
+
+        thread = threading.Thread(target=look, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+        self.update(count())
+
     def _line(self, text: str) -> None:
         self._last = time.monotonic()
         seconds = max(self._last - self._start, 1e-9)
-        rate = (self.done - self._before) / seconds
-        left = max(self.total - self.done, 0) / rate if rate > 0 else 0.0
-        tail = f", {text}" if text else ""
-        say(f"{self.title}: {self.done}/{self.total} ({rate:.0f}/s, {left:.0f} s left){tail}", err=True)
+        rate = max(self.done - self._before, 0) / seconds
+        speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""
+        left = f" ({speed}, {duration((self.total - self.done) / rate)} left)" if rate and self.done < self.total else ""
+        say(f"{self.title}: {self.done}/{self.total}{left}{f', {text}' if text else ''}", err=True)
+
+
+def duration(seconds: float) -> str:
+    """As a person says it: 12 min, 3.4 h."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    if seconds < 90 * 60:
+        return f"{round(seconds / 60)} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} days"
+
+
+def said_left(text: str) -> float | None:
+    """Seconds that a line of :class:`Progress` says are left; None where it says none."""
+    told = re.search(rf", ([\d.]+) ({'|'.join(UNITS)}) left\)", text)
+    return float(told[1]) * UNITS[told[2]] if told else None
 
 
 class MetricsLog:

@@ -119,7 +119,7 @@ class Work:
 
     contents: Contents  # the run's artefacts
     arrays: Any  # ``arrays.h5``, to be written into
-    progress: Progress  # is told of each artefact
+    progress: Progress  # is told of each sub-goal judged and looked at, each run, and each layout that one plays
     layouts: tuple[int, ...] = ()  # on which trained agents are to play
     shown: int | None = None  # the ensemble whose states are shown; None where there is none
     browsed: int | None = None  # the ensemble whose states are browsed; None where there is none
@@ -160,18 +160,17 @@ def processes_for(cases: Sequence[Case], cores: int) -> int:
     return min(cores, len(cases)) if work >= SPREAD_FROM else 1
 
 
-def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[int], None]) -> Iterator[Judgement]:
+def judgements(cases: Sequence[tuple[int, Case]], workers: int, done: Callable[[], None]) -> Iterator[Judgement]:
     """Every case judged, ``workers`` processes at once, one after another with its states: the same for any number.
 
     Cases, each with its ensemble's number, come with those on the same states one after another, since each process
-    keeps the last ones that it read. ``done`` is told an ensemble's number as soon as one of its cases is judged, in
-    any order.
+    keeps the last ones that it read. ``done`` is called as soon as one of them is judged.
     """
     judged: dict[int, Judged] = {}
 
     def keep(index: int, result: Judged) -> None:
         judged[index] = result
-        done(cases[index][0])
+        done()
 
     in_processes([partial(judge, case) for _, case in cases], workers, keep)
     for index, (number, case) in enumerate(cases):

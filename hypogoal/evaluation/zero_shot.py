@@ -146,10 +146,14 @@ def numbers(work: Work) -> dict[str, Any]:
     found: list[tuple[tuple[str, ...], dict[str, Any]]] = []
     for artefact in work.contents.agents:
         if "options.safetensors" not in artefact.manifest["files"]:
+            work.progress.advance(len(work.layouts))
             continue
         path, config = work.contents.name(artefact), artefact.config
-        firsts = range(0, len(work.layouts), AT_ONCE)
-        parts = [played(artefact, work.layouts[first : first + AT_ONCE]) for first in firsts]
+        parts = []
+        for first in range(0, len(work.layouts), AT_ONCE):
+            layouts = work.layouts[first : first + AT_ONCE]
+            parts.append(played(artefact, layouts))
+            work.progress.advance(len(layouts))
         own = {*layout_seeds(config.get("layouts", ""), config["layout_seed"])}
         about = {"path": path, "seed": artefact.seed, "trained_on": len(own.intersection(work.layouts))}
         for key in parts[0]:

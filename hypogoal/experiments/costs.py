@@ -10,6 +10,7 @@ from typing import Any
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import human
+from hypogoal.core.progress import duration
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings
@@ -158,12 +159,3 @@ def cost_lines(cells: Sequence[Cell], workers: int, factor: float) -> list[str]:
     text += f" ({factor:.2g} times what docs/performance.md's machine takes)" if seconds else ""
     lines.append(text + (f"; {unknown} of unknown length" if unknown and seconds else ""))
     return lines
-
-
-def duration(seconds: float) -> str:
-    """As a person says it: 12 min, 3.4 h."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    if seconds < 90 * 60:
-        return f"{round(seconds / 60)} min"
-    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} days"

@@ -4,7 +4,6 @@ A cell is finished when its output's manifest says so, which is held against the
 of the output's files once (some ms per MB); ``hypogoal verify`` reads what is in them, too.
 """
 
-import re
 import stat
 import time
 from collections.abc import Sequence
@@ -14,10 +13,10 @@ from typing import Any
 
 from hypogoal.core.artefacts import MANIFEST, check_files, find_input, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
+from hypogoal.core.progress import duration, said_left
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation.run import find
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
-from hypogoal.experiments.costs import duration
 from hypogoal.experiments.records import Record, is_running, last_line, log_of, read_plan, read_record
 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
@@ -110,8 +109,8 @@ def time_left(states: Sequence[State], workers: int, factor: float) -> float | N
             seconds = 0.0
         else:
             return None
-        if told := re.search(r"\([1-9]\d*/s, (\d+) s left\)", row.text):  # what it says itself is nearer
-            left.append(float(told[1]))
+        if (told := said_left(row.text)) is not None:  # what it says itself is nearer
+            left.append(told)
             continue
         spent = row.record.seconds + (time.time() - row.record.started if row.state == RUNNING else 0.0)
         left.append(max(0.0, seconds - spent))

@@ -56,7 +56,8 @@ def evaluate(
     with create_artefact(
         out, kind="evaluation", config=settings, seed=0, inputs=[*data, *inputs], force=force, resume=resume
     ) as folder:
-        steps = Progress("evaluate", total=len(inputs), quiet=quiet)
+        parts = 2 * len(cases) + len(contents.ladders) + len(contents.agents) * (1 + len(seeds))
+        steps = Progress("evaluate", total=parts, quiet=quiet)
         with create_hdf5(folder / "arrays.h5") as arrays, steps as progress:
             work = Work(contents, arrays, progress, seeds)
             judge_ensembles(work, cases, workers)
@@ -90,19 +91,15 @@ def judge_ensembles(work: Work, cases: Sequence[tuple[int, Case]], workers: int)
     """
     artefacts = work.contents.ensembles
     configs = [artefact.config for artefact in artefacts]
-    left = [len(config["sub_goals"]) for config in configs]
     work.shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
     work.browsed = most_used(work.contents)
     rows: list[list[dict[str, Any]]] = [[] for _ in configs]
 
-    def done(number: int) -> None:
-        left[number] -= 1
-        work.progress.advance(left[number] == 0)
-
-    for judgement in judgements(cases, workers, done):
+    for judgement in judgements(cases, workers, work.progress.advance):
         for question in QUESTIONS:
             question.look(work, judgement)
         rows[judgement.number].append(judgement.row)
+        work.progress.advance()
     names = zip(artefacts, ensemble_names(configs), method_names(configs), rows, strict=True)
     for artefact, name, method, goals in names:
         about: dict[str, Any] = {"path": work.contents.name(artefact), "name": name, "seed": artefact.seed}

@@ -14,6 +14,7 @@ from hypogoal.core.checkpoints import FOLDER, Resumable, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import json_lines, read_end
 from hypogoal.core.manifests import LOG, SCORES
 from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
@@ -78,17 +79,25 @@ def train_ensemble(
         jobs = [partial(_train_one, data, others, sub_goal, config, seed, folder, device) for sub_goal in sub_goals]
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
         (folder.parent / FOLDER).mkdir(exist_ok=True)
-        with Progress("train-ensemble", total=len(jobs), quiet=quiet) as progress:
-
-            def done(number: int, summary: dict[str, Any]) -> None:
-                summaries[number] = summary
-                progress.advance(1)
-
-            in_processes(jobs, workers, done)
+        logs = [folder.parent / FOLDER / f"{sub_goal}{PARTS[LOG]}" for sub_goal in sub_goals]
+        with Progress("train-ensemble", total=len(jobs) * steps_of(config), quiet=quiet) as progress:
+            progress.resume(steps_in(logs))
+            with progress.following(partial(steps_in, logs)):
+                in_processes(jobs, workers, summaries.__setitem__)
         for log, part in [*PARTS.items()][: 2 if config.score_every else 1]:
             parts = (folder.parent / FOLDER / f"{sub_goal}{part}" for sub_goal in sub_goals)
             (folder / log).write_text("".join(path.read_text(encoding="utf-8") for path in parts), encoding="utf-8")
     return summaries
+
+
+def steps_of(config: TrainEnsembleConfig) -> int:
+    """Training steps of a sub-goal's ensemble: of members one after the other, those of all."""
+    return config.steps * (config.members if config.schedule == "sequential" else 1)
+
+
+def steps_in(logs: Sequence[Path]) -> int:
+    """How many steps of all sub-goals are in their logs, which their processes are writing."""
+    return sum(next((line.get("step", 0) for line in json_lines(reversed(read_end(log, 400)))), 0) for log in logs)
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:
@@ -190,7 +199,7 @@ def _train_one(
     if not checkpoints.saved:
         report.log.restore(0)
         report.scores.restore(0)
-    steps = config.steps * (config.members if config.schedule == "sequential" else 1)
+    steps = steps_of(config)
     heldout = dataset.heldout(sub_goal) if config.score_every else None
 
     def look(step: int, ensemble: Ensemble) -> None:

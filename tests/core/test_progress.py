@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+import threading
+import time
 
 import pytest
 
@@ -20,3 +23,32 @@ def test_what_is_not_known_yet_is_not_said(capsys: pytest.CaptureFixture[str], m
     assert "5/10" in said and "loss 0.25" in said and "nan" not in said and "success" not in said
     print_outcome({"steps": 5, "episodes": 0, "success": math.nan, "loss": 0.25}, quiet=False)
     assert capsys.readouterr().out == "steps 5, episodes 0, loss 0.25\n"
+
+
+def test_what_others_do_is_counted(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec A6: how far other processes are is asked again and again, so that a line comes while they work."""
+    monkeypatch.setattr(progress, "PLAIN_INTERVAL_SECONDS", 0.0)
+    monkeypatch.setattr(progress, "LOOK_SECONDS", 0.01)
+    asked: list[int] = []
+    enough = threading.Event()
+
+    def count() -> int:
+        asked.append(len(asked))
+        if len(asked) > 5:
+            enough.set()
+        return len(asked)
+
+    with Progress("train", total=1000) as bar, bar.following(count):
+        assert enough.wait(30)
+    assert bar.done == len(asked)
+    assert re.search(r"^train: 5/1000 \(\d+/s, \d+ s left\)$", capsys.readouterr().err, re.MULTILINE)
+    time.sleep(0.05)
+    assert bar.done == len(asked), "it is asked no more"
+
+
+@pytest.mark.parametrize("seconds", [3, 600, 9000, 400_000])
+def test_the_time_left_is_read_as_it_is_said(seconds: int) -> None:
+    """Spec A8: a sweep's status goes by what a stage says of itself."""
+    line = f"train-meta: 5/10 (2 s each, {progress.duration(seconds)} left), success 0.5"
+    assert progress.said_left(line) == pytest.approx(seconds, rel=0.03)
+    assert progress.said_left("train-meta: 10/10, success 0.5") is None

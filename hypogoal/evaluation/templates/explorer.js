@@ -41,10 +41,9 @@
     const wrong = one.says[index] !== one.truth;
     return make("span", { class: wrong ? "wrong" : yes(one.says[index]) }, yes(one.says[index]) + (wrong ? " ✗" : ""));
   };
-  const said = (one, index) => make("span", {}, make("small", {}, `${index} `), verdict(one, index));
+  const said = (one, index) => make("span", {}, make("small", {}, make("span", { class: "heard" }, "member "), `${index} `), verdict(one, index));
 
   const tile = (one, index) => {
-    const says = one.says.map((said, k) => `member ${k} ${yes(said)}`).join(", ");
     const where = [one.place, one.kind].filter(Boolean).join(", ");
     const button = make(
       "button",
@@ -53,9 +52,8 @@
         class: "tile",
         "data-state": index,
         "aria-pressed": index === state,
-        "aria-label": `State ${index}, ${where}: truth ${yes(one.truth)}; ${says}`,
       },
-      image(one.png, ""),
+      image(one.png, `State ${index}, ${where}:`),
       make("span", {}, "truth " + yes(one.truth)),
       make("span", { class: "says" }, ...one.says.map((_, k) => said(one, k))),
     );
