@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -18,10 +21,11 @@ BASE = 450e6
 MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal (the paper's for Montezuma)
 WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
+LIGHT_POLICIES = 1e6  # weights of all light policies, which share most of them; 0.4 MB of 15 options
 COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
 PER_TRANSITION = 50  # bytes in a replay, its sum tree included
 CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
-LOGS = 50e6
+LOGS = 5e6
 
 
 class Needs(NamedTuple):
@@ -39,7 +43,8 @@ def ensemble_needs(
     labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
     others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
     states = (labelled + others) * dataset.observation_bytes
-    return Needs(workers * ensemble_process(states, config.members), ensemble_disk(sub_goals, config.members))
+    each = member_bytes(config.network, dataset.observation_shape, dataset.observation_dtype)
+    return Needs(workers * ensemble_process(states, config.members), ensemble_disk(sub_goals, config.members, each))
 
 
 def ensemble_process(states: float, members: int) -> float:
@@ -47,10 +52,26 @@ def ensemble_process(states: float, members: int) -> float:
     return BASE + 3 * states + COPIES * members * MEMBER
 
 
-def ensemble_disk(sub_goals: int, members: int) -> float:
-    """What an ensemble needs on the disk, its checkpoints included."""
-    training = COPIES * members * MEMBER
-    return sub_goals * (members * MEMBER + training) + CHECKPOINTS * training + LOGS
+def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
+    """Bytes of a member network for observations of this shape and type.
+
+    ``MEMBER`` for a network of someone's own, which is not run here, or for one that does not take them.
+    """
+    from hypogoal.core.seeding import torch_generator
+    from hypogoal.hypotheses.networks import NETWORKS, build_network, network_for
+
+    name = network_for(network, dtype)
+    try:
+        made = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
+    except UserError:
+        made = None
+    return 4.0 * sum(weights.numel() for weights in made.parameters()) if made else MEMBER
+
+
+def ensemble_disk(sub_goals: int, members: int, each: float) -> float:
+    """What an ensemble of members of ``each`` bytes needs on the disk, its checkpoints included."""
+    training = (COPIES - 1) * members * each  # gradients are not kept
+    return sub_goals * (members * each + training) + LOGS
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
@@ -62,13 +83,15 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
     picture = domain.observation_bytes
     paper = config.network == "paper"
     replays = options if paper else 1
-    weights = options * PAPER_POLICY if paper else 8e6
+    weights = options * PAPER_POLICY if paper else LIGHT_POLICIES
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
-    state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept + stops
+    state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept
     members = len(about["sub_goals"]) * about["members"] * (MEMBER + WINDOWS)
+    packed = stops / domain.packed
     # A checkpoint is a copy of the state, in memory while it is written.
-    return Needs(BASE + 2 * state + members, weights + stops + CHECKPOINTS * state + LOGS)
+    memory = BASE + 2 * (state + stops) + members
+    return Needs(memory, weights + packed + CHECKPOINTS * (state + packed) + LOGS)
 
 
 def baseline_needs(observation: int, replay: int) -> Needs:

@@ -195,6 +195,11 @@ def domain_of(artefact: Path, kind: str) -> str:
     return open_dataset(artefact).domain if kind == "data" else str(open_artefact(artefact, kind).config["domain"])
 
 
+def run_of(data: Path) -> Path:
+    """The run that a data file is of: the folder of a ``data.h5``, else a new one that is called as the file is."""
+    return data.parent if data.name == "data.h5" else Path("runs", data.stem)
+
+
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
     """The numbers of states of a data file; nothing where there are none."""
     if quiet or not counts:

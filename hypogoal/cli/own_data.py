@@ -48,7 +48,7 @@ def import_(
             force=force,
         )  # fmt: skip
     cli.print_counts(counts, quiet)
-    cli.print_next(quiet, "train-ensemble", out, "--out", Path("runs", out.stem, "ensemble"))
+    cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
     give(out)
 
 

@@ -23,7 +23,7 @@ def collect(given: cli.Given, domain: cli.DomainName) -> None:
     found = load_domain(domain, given=True)
     config = given.config(domain, given=True)
     cli.print_counts(collected(found, config, given.out, name=domain, **given.how), given.how["quiet"])
-    given.end({}, "train-ensemble", given.out, "--out", Path("runs", given.out.stem, "ensemble"))
+    given.end({}, "train-ensemble", given.out, "--out", cli.run_of(given.out) / "ensemble")
 
 
 @cli.stage(cli.MAKE, "train-ensemble", "train-ensemble data/doorkey.h5 --out runs/mine/ensemble")

@@ -75,7 +75,7 @@ class Progress:
         text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value))
         if self._bar is not None:
             self._bar.update(self._task, completed=done, numbers=text)
-        elif time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
+        elif done < self.total and time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
             self._line(text)
 
     @contextmanager
@@ -101,7 +101,9 @@ class Progress:
         seconds = max(self._last - self._start, 1e-9)
         rate = max(self.done - self._before, 0) / seconds
         speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""
-        left = f" ({speed}, {duration((self.total - self.done) / rate)} left)" if rate and self.done < self.total else ""
+        left = (
+            f" ({speed}, {duration((self.total - self.done) / rate)} left)" if rate and self.done < self.total else ""
+        )
         say(f"{self.title}: {self.done}/{self.total}{left}{f', {text}' if text else ''}", err=True)
 
 

@@ -266,6 +266,7 @@ class Domain(ABC):
         many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence on how to read its observations, for people.
+        packed: how many times smaller than in memory collected states are on the disk, about; 1 where nobody knows.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
@@ -284,6 +285,7 @@ class Domain(ABC):
     reading = ""
     measures = pictures = sees_agent = False
     near = 0
+    packed = 1
 
     @property
     @abstractmethod

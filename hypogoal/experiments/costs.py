@@ -14,7 +14,7 @@ from hypogoal.core.progress import duration
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings
-from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, play_needs
+from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, member_bytes, play_needs
 from hypogoal.settings import configuration
 
 # CPU seconds of the piece of training below on the core that costs are of, idle (2.5 GHz, torch 2.13).
@@ -81,7 +81,7 @@ class Estimates:
             states = domain.collected_bytes(config)
             cores = int(self._rate("collect_cores")) or 1
             workers = as_dict(config).get("workers") or cores
-            return Cost(self._rate("collect"), BASE + 2 * states / cores, states, workers)
+            return Cost(self._rate("collect"), BASE + 2 * states / cores, states / domain.packed, workers)
         if cell.stage == "train-ensemble":
             held = str(self.rates.get("heldout", ""))
             known = source is not None and held in as_dict(source)
@@ -90,7 +90,8 @@ class Estimates:
             seconds = self._rate("member_step", config.network) * config.steps * count
             seconds += self._rate("localiser") * (config.view == "agent-crop" and config.localiser == "learned")
             cores = min(config.workers or goals, goals)
-            return Cost(seconds, ensemble_process(taught, count), ensemble_disk(goals, count), cores)
+            each = member_bytes(config.network, domain.observation_shape, domain.observation_dtype)
+            return Cost(seconds, ensemble_process(taught, count), ensemble_disk(goals, count, each), cores)
         if cell.stage == "train-baseline":
             chosen = HYPERPARAMETERS[config.agent, config.setting]
             kept = chosen.replay if isinstance(chosen, DQNSettings) else 0

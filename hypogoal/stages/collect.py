@@ -41,7 +41,7 @@ def collect(
         before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
         raise check_complete(before, about, given)
     size = domain.collected_bytes(config)
-    preflight("collect", out, (COLLECT_BASE + 2 * size, size), quiet=quiet)
+    preflight("collect", out, (COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
         kept = {"kept": partial(checkpoints_of, work.files)} if domain.resumes else {}
         with Progress(f"collect {about['domain']}", total=1, quiet=quiet) as progress:
