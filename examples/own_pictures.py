@@ -1,11 +1,12 @@
-"""Is the lamp on? Pictures of one's own, and no environment: two members learn, one of them goes by the lamp.
+"""Is the lamp on? Pictures of one's own and no environment, from two arrays to a report. A minute on one core.
 
-In the labelled room the window is bright whenever the lamp is on, so labels cannot tell which of the two is meant;
-pictures of other rooms, without labels, make members differ. Under a minute on a core:
+In the labelled room the window is bright whenever the lamp is on, so the labels cannot tell which of the two is meant.
+Unlabelled pictures of other rooms make the members differ. With seed 1 one goes by the lamp and the other by the
+window; other seeds also find "both" and "either", which fit the labels as well.
 
     python own_pictures.py
     hypogoal import pictures.npz --out runs/lamp/data.h5
-    hypogoal train-ensemble runs/lamp/data.h5 --out runs/lamp/ensemble --set members=2 --set steps=100
+    hypogoal train-ensemble runs/lamp/data.h5 --out runs/lamp/ensemble --set members=2 --set steps=100 --seed 1
     hypogoal evaluate runs/lamp
     hypogoal report runs/lamp
 """

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import csv
 import json
+import runpy
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +199,7 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.atari
-def test_freeway_goes_through_collect_ensembles_and_evaluation(tmp_path: Path) -> None:
+def test_freeway_goes_through_all_stages(tmp_path: Path) -> None:
     """Spec B6: an Atari game other than Montezuma's Revenge, with sub-goals from its memory and defaults of its own."""
     run = tmp_path / "run"
     data, ensemble = str(run / "data.h5"), run / "ensemble"
@@ -206,8 +208,37 @@ def test_freeway_goes_through_collect_ensembles_and_evaluation(tmp_path: Path) -
     few = settings("steps=10", "members=2", "workers=1")
     assert main(["train-ensemble", data, "--out", str(ensemble), "-q", *few]) == 0
     assert json.loads((ensemble / "manifest.json").read_text(encoding="utf-8"))["config"]["network"] == "montezuma"
+    assert main(["train-options", str(ensemble), "--out", str(run / "options"), "-q", *PLAY]) == 0
+    assert (
+        main(["train-meta", str(ensemble), "--options", str(run / "options"), "--out", str(run / "meta"), "-q", *PLAY])
+        == 0
+    )
     assert main(["evaluate", str(run), "-q"]) == 0
+    assert main(["report", str(run)]) == 0
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
     rows = {row["sub_goal"]: row for row in metrics["ensembles"][0]["sub_goals"]}
-    assert set(rows) == {"half-way", "far-side"}
+    assert set(rows) == {"half-way", "far-side"} and metrics["agents"]
+    assert "far-side" in (run / "report" / "index.html").read_text(encoding="utf-8")
     assert all(row["balanced_accuracy"]["best"] is not None for row in rows.values())
+
+
+def test_own_pictures_go_from_arrays_to_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6: the commands of its docstring, without an environment; members differ where the labels do not say."""
+    example = EXAMPLES / "own_pictures.py"
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(example))
+    lines = [
+        shlex.split(line) for line in (ast.get_docstring(ast.parse(example.read_text("utf-8"))) or "").splitlines()
+    ]
+    for words in (line for line in lines if line[:1] == ["hypogoal"]):
+        assert main(words[1:]) == 0, words
+    metrics = json.loads(Path("runs/lamp/evaluation/metrics.json").read_text(encoding="utf-8"))
+    members = metrics["ensembles"][0]["sub_goals"][0]["balanced_accuracy"]
+    assert members["best"] > 0.95 and members["worst"] < 0.9
+    assert "lamp-on" in Path("runs/lamp/report/index.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_examples_are_short(example: Path) -> None:
+    """Spec B6: what one reads before one writes one's own."""
+    assert len(example.read_text(encoding="utf-8").splitlines()) <= 40
