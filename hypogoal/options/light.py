@@ -50,10 +50,6 @@ class LightLearner(Learner):
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
-        if config.shaping and not self.running_only:
-            what = "only the running option's member says how near it is to a yes"
-            given = f"shaping={config.shaping:g}, experience={config.experience}"
-            raise UserError(what, given, "Give --set experience=own or --set shaping=0.")
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
@@ -150,14 +146,6 @@ class LightLearner(Learner):
         ahead = self.tensor(batch["steps"]).float()[:, None]
 
         values, next_online, next_target = self._values(s, following)
-        if self.config.shaping:
-            # A potential for a reward is the same as learning what is left of the values above it (Wiewiora 2003).
-            option = batch["option"].astype(np.int64)
-            near, next_near = (
-                self.config.shaping * self.tensor(self.terminations.nearness(ids, option))[:, None, None]
-                for ids in (s, following)
-            )
-            values, next_online, next_target = values + near, next_online + next_near, next_target + next_near
         with torch.no_grad():
             goal = double_q_targets(
                 self.tensor(reached) * self.config.option_gamma ** (ahead - 1),

@@ -23,7 +23,6 @@ from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
-FAR = 20.0  # log-odds
 MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
 
 
@@ -88,12 +87,6 @@ class Terminations(Resumable):
             judged = self.classify_one(fresh, int(first)).reshape(len(fresh), self.together)
             self._log_odds[fresh, first : first + self.together] = judged
         return self._log_odds[ids, options]
-
-    def nearness(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.float32]:
-        """How near the options that run are to a yes, float32 (n,): 1 at the threshold, 0 from ``FAR`` below it on."""
-        below = self.log_odds(ids, options) - self.thresholds[options]
-        near: NDArray[np.float32] = np.clip(1 + below / np.float32(FAR), 0, 1)
-        return near
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether executions reach their sub-goals in the states they come to: bool (E,), asked once a step.
