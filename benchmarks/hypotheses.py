@@ -33,7 +33,7 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected, Split
+from hypogoal.dataset import Collected, States
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -111,7 +111,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
     prepare()
     data = states_of(layouts)
     column = data.sub_goals.index(sub_goal)
-    heldout = Split(data.heldout.observations, data.heldout.labels[:, column], data.heldout.origins)
+    heldout = States(data.heldout.observations, data.heldout.labels[:, column], data.heldout.origins)
     rows: dict[tuple[int, int], Row] = {}
 
     def look(step: int, ensemble: Ensemble) -> None:
