@@ -266,13 +266,13 @@ def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
 
 def summary(metrics: Metrics) -> list[Table]:
     """For a terminal, where there is anything to choose."""
-    agents = metrics.get("choosing", [])
+    agents = metrics["choosing"]
     return [page.terminal(TITLE, (*COLUMNS[:2], COLUMNS[-1]), _choosers(agents))] if agents else []
 
 
 def sections(material: Material) -> list[Block]:
     """One table; each member's quality and preference are in ``numbers.csv``."""
-    agents = material.metrics.get("choosing", [])
+    agents = material.metrics["choosing"]
     if not agents:
         return []
     text = (

@@ -297,7 +297,7 @@ def against(agents: Sequence[Entry]) -> Rows:
     runs = [(agent["name"], (layout_of(run), run["seed"]), run) for agent in agents for run in agent["runs"]]
     rows: Rows = []
     for quantity, higher in HIGHER.items():
-        measured = [(name, alike, run.get(quantity, math.nan)) for name, alike, run in runs]
+        measured = [(name, alike, run[quantity]) for name, alike, run in runs]
         rows += pairs(measured, quantity, higher=higher, layouts=True)
     return rows
 
@@ -324,7 +324,7 @@ def solved(steps: Mapping[str, Any]) -> str:
 
 AGENT = page.label("agent", "name")
 RUNS = page.number("runs", lambda agent: len(agent["runs"]))
-NEARLY: tuple[str, Any] = (f"within {NEAR} shortest paths", lambda of: of.get("near"))  # older evaluations lack it
+NEARLY = (f"within {NEAR} shortest paths", "near")
 SOLVED_AT = page.number("95 % at", "steps_to_95", solved)
 HEADLINE = (
     RUNS,
@@ -394,28 +394,14 @@ def summary_section(material: Material) -> Block:
 
 def _answers(material: Material) -> list[str]:
     """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
-    agents = material.metrics["agents"]
-    shown = variants(agents)
-    several = len(shown) > 1
+    shown = variants(material.metrics["agents"])
     paragraphs = []
     for agent in shown:
-        name = f"the agent '{agent['name']}'" if several else "the option agent"
-        text = _achieved(agent, name)
-        control = control_of(material, agent)
-        alike = not several or control is None or same_settings(agent, control)
-        among = f"uniformly random choice among options of {'the same members' if alike else 'its ensemble'}"
-        against = [] if control is None else [(among, control)]
-        if not several:
-            against += [(other["name"], other) for other in agents if other not in (agent, control)]
-        if agent["success"]["mean"] is not None and against:
-            text += f" {_listed(against)}"
-        frozen = [entry for entry in material.metrics.get("choosing", []) if entry["name"] == agent["name"]]
-        for entry in frozen:
+        text = _achieved(agent, f"the agent '{agent['name']}'" if len(shown) > 1 else "the option agent")
+        for entry in (entry for entry in material.metrics["choosing"] if entry["name"] == agent["name"]):
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
             text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
-        if several and control is None and not frozen:
-            text += " No random choice among options of the same members was run."
-        if len(agent["runs"]) < SEVERAL and not several:
+        if len(agent["runs"]) < SEVERAL and len(shown) == 1:
             text += " So few runs decide nothing: more seeds and layouts do."
         paragraphs.append(text)
     return paragraphs
@@ -430,16 +416,6 @@ def _achieved(agent: Mapping[str, Any], name: str) -> str:
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
         f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
-
-
-def _listed(others: Sequence[tuple[str, Entry]]) -> str:
-    """The same of other agents in one sentence."""
-    told = []
-    for name, agent in others:
-        success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
-        told.append(f"{name}: {'no episode ended' if success is None else f'{page.percent(success)}, {steps} steps'}")
-    text = "; ".join(told)
-    return f"{text[0].upper()}{text[1:]}."
 
 
 def _episodes(agent: Mapping[str, Any]) -> str:
@@ -583,41 +559,14 @@ def _draw_curve(axes: Axes, line: Line) -> None:
         axes.plot(steps, line.values.T, linewidth=0.6, alpha=0.5, **look)
 
 
-def variants(entries: Iterable[Entry], name: str = LEARNED) -> list[Entry]:
-    """The entries called ``name``, also those to which settings that differ between runs were added."""
-    return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{name}, ")]
+def variants(entries: Iterable[Entry]) -> list[Entry]:
+    """The entries called ``LEARNED``, also those to which settings that differ between runs were added."""
+    return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{LEARNED}, ")]
 
 
-def control_of(material: Material, agent: Entry) -> Entry | None:
-    """The random chooser among a variant's options: the one with the same settings added to its name.
-
-    Settings that most runs of a name share are not added to it, so a name can leave open which options were chosen
-    among. Then it is the only chooser with an ensemble of this variant, if no other variant has that ensemble.
-    """
-    agents, controls = variants(material.metrics["agents"]), variants(material.metrics["agents"], RANDOM)
-    if len(agents) == len(controls) == 1:
-        return controls[0]
-    ensembles = {of["name"]: {run["ensemble"] for run in of["runs"]} for of in material.metrics.get("selection", ())}
-
-    def shares(first: Entry, second: Entry) -> bool:
-        return bool(ensembles.get(first["name"], set()) & ensembles.get(second["name"], set()))
-
-    same = [control for control in controls if same_settings(agent, control)]
-    if same and (shares(agent, same[0]) or not {agent["name"], same[0]["name"]} <= set(ensembles)):
-        return same[0]
-    near = [control for control in controls if shares(agent, control)]
-    rivals = [other for other in agents for control in near if shares(other, control)]
-    return near[0] if len(near) == len(rivals) == 1 else None
-
-
-def same_settings(agent: Entry, control: Entry) -> bool:
-    """Whether the same settings are added to both names."""
-    return bool(settings_of(agent) == settings_of(control, RANDOM))
-
-
-def settings_of(agent: Entry, name: str = LEARNED) -> str:
+def settings_of(agent: Entry) -> str:
     """What is added to a variant's name; nothing where it is the usual one."""
-    return str(agent["name"]).removeprefix(name).removeprefix(", ")
+    return str(agent["name"]).removeprefix(LEARNED).removeprefix(", ")
 
 
 def which(agent: Entry, entries: Sequence[Entry]) -> str:

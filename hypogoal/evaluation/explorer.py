@@ -92,18 +92,16 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
 
 def explorer_section(material: Material) -> Block:
     """A browser of held-out states, with filters."""
-    found = material.metrics.get("explorer")
+    found = material.metrics["explorer"]
     if found is None:
-        old = "explorer" not in material.metrics and material.metrics["ensembles"]
-        needed = "a new evaluation: evaluate --force" if old else "an ensemble artefact: train-ensemble"
-        missing = [f"States to browse: they need {needed}."]
+        missing = ["States to browse: they need an ensemble artefact: train-ensemble."]
         return page.section("explorer", TITLE, [], [], missing)
     source = page.pick(material.metrics["ensembles"], "path", found["ensemble"])
     shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
         f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them. Choose a "
         "state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against it. Choose "
-        f"a member to see the options it became. {found['sub_goals'][0].get('reading', '')}"
+        f"a member to see the options it became. {found['sub_goals'][0]['reading']}"
     )
     sample = (
         f"{shown:,} of {states:,} states of a sub-goal, drawn so that every kind of outcome and every place comes up; "

@@ -122,7 +122,7 @@ COLUMNS = (
 
 def sections(material: Material) -> list[Block]:
     """One table."""
-    if not material.metrics.get("ranking"):
+    if not material.metrics["ranking"]:
         return []
     text = (
         "Ranking is the area under the ROC curve: the share of pairs of a positive and a negative in which a member "

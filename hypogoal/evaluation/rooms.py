@@ -62,17 +62,16 @@ def room_metrics(
     verdicts: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
-    kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
 
-    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there are,
-    ``room`` and ``kind``, whose values have the names ``kinds``.
+    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
+    ``room``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
         of accuracy, balanced accuracy and ``ranking`` (area under the ROC curve); ``validated``: which member the rooms
-        of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
+        of labelled groups pick. NaN where not defined.
     """
     seen, rooms = origins["seen"], origins.get("room")
     validated = choose(verdicts, labels, seen)
@@ -88,12 +87,7 @@ def room_metrics(
             "members": [{"member": member, **row} for member, row in enumerate(by_member(scores))],
             "scores": {score: with_validated(scores[score], validated["member"]) for score in SCORED},
         }
-    return {
-        "scopes": scopes,
-        "validated": validated,
-        "by_room": [] if rooms is None else _by_room(verdicts, labels, rooms, seen),
-        "false_positives": _false_positives(verdicts, labels, origins, kinds),
-    }
+    return {"scopes": scopes, "validated": validated}
 
 
 def choose(
@@ -115,38 +109,6 @@ def choose(
 def with_validated(scores: NDArray[np.float64], validated: Any) -> dict[str, float]:
     """Best, mean and worst of the members' scores (K,), and that of the member ``validated``; NaN where none is."""
     return {**best_mean_worst(scores), "validated": math.nan if validated is None else float(scores[validated])}
-
-
-def _by_room(
-    verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], rooms: NDArray[np.int64], seen: NDArray[np.int64]
-) -> list[dict[str, Any]]:
-    rows = []
-    for room in np.unique(rooms):
-        here = rooms == room
-        scores = member_scores(verdicts[here], labels[here])
-        counts = {"states": int(here.sum()), "positives": int(labels[here].sum())}
-        told = {score: scores[score].tolist() for score in ("balanced_accuracy", "accuracy", "recall")}
-        rows.append({"room": int(room), "seen": int(seen[here].max()), **counts, **told})
-    return rows
-
-
-def _false_positives(
-    verdicts: NDArray[np.bool_],
-    labels: NDArray[np.bool_],
-    origins: Mapping[str, NDArray[np.int64]],
-    names: Sequence[str],
-) -> list[dict[str, Any]]:
-    if "kind" not in origins:
-        return []
-    rows = []
-    for scope in TABLED:
-        inside = np.isin(origins["seen"], SCOPES[scope]) & ~labels
-        for kind in np.unique(origins["kind"][inside]):
-            these = inside & (origins["kind"] == kind)
-            name = names[kind] if 0 <= kind < len(names) else str(kind)
-            share = verdicts[these].mean(0).tolist()
-            rows.append({"scope": scope, "kind": name, "negatives": int(these.sum()), "share": share})
-    return rows
 
 
 def of_rooms(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
@@ -196,8 +158,7 @@ def look(work: Work, judgement: Judgement) -> None:
     """Members room by room, where held-out states say which rooms training saw."""
     split, judged = judgement.split, judgement.judged
     if "seen" in split.origins:
-        states = (split.labels, split.origins, judgement.kinds)
-        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, *states)
+        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, split.labels, split.origins)
 
 
 def missing(work: Work) -> list[str]:

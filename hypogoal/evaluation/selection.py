@@ -29,7 +29,6 @@ from hypogoal.meta.config import layout_seeds
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
-LATE = 0.25  # the last part of training that is looked at by itself
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
 PARTS = 20  # of training, in which choices are counted apart
 SELECTED = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING)  # agents whose options are members: to select among
@@ -73,18 +72,14 @@ def selection_of_run(
     """Spec F6: how often each of K members of G sub-goals was offered and chosen, beside its ``match``, float (G*K,).
 
     A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option, offered,
-    chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last quarter of
-    training). NaN where not defined.
+    chosen, reached, expected, mean duration in steps, match and preference. NaN where not defined.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
-    begin, end = (choices.step.min(), choices.step.max()) if len(choices.step) else (0, 0)
-    late = choices.since(end - LATE * (end - begin))
     duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
     counts = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")}
     columns = {**counts, "expected": totals["expected"], "duration": duration, "match": match}
     columns["preference"] = preference(totals["chosen"], totals["expected"])
-    columns["late_preference"] = preference(late.total("chosen", options), late.total("expected", options))
     by_goal = []
     for index, sub_goal in enumerate(sub_goals):
         start = index * members
@@ -185,22 +180,9 @@ def missing(work: Work) -> list[str]:
     return [f"no truth of {name} in its domain, to match members with" for name in names]
 
 
-MEMBERS = (
-    page.label("sub-goal", "sub_goal", once=True),
-    page.label("member", "name"),
-    page.number("offered", "offered"),
-    page.number("chosen", "chosen"),
-    page.number("expected", "expected", page.fixed, 0),
-    page.number("preference", "preference", page.fixed, 2),
-    page.number("late", "late_preference", page.fixed, 2),
-    page.number("steps", "duration", page.fixed, 1),
-    page.number("match", "match", page.fixed, 2),
-)
-
-
 def sections(material: Material) -> list[Block]:
-    """Which options are chosen and where they stop, of a run with agents."""
-    return [choices_section(material)] if material.of_agents() else []
+    """Which options are chosen and where they stop, of a run with agents that see pictures."""
+    return [choices_section(material)] if material.of_agents() and not material.of_numbers() else []
 
 
 def _agent(material: Material) -> Entry | None:
@@ -221,17 +203,16 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
 
 
 def choices_section(material: Material) -> Block:
-    """Of the first run how often each member was chosen, over what a uniform choice would have; Figures 7 and 8."""
+    """What preference is, and of the first run Figures 7 and 8."""
     agent, title = _agent(material), "Which hypotheses are chosen, and where they stop"
     if agent is None:
         lacking = ["Choices and termination states: they need a meta artefact with learned terminations: train-meta."]
         return page.section("choices", title, [], [], lacking, folded=True)
-    run = agent["runs"][0]
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
         "would have chosen it: 1 for a chooser that does not care. Match is the balanced accuracy of the member's "
-        "classifier against the true sub-goal on the layout, not how good its option is. numbers.csv has the same of "
-        "every run, the random chooser's too, if one was run. What that choosing is worth is asked in "
+        "classifier against the true sub-goal on the layout, not how good its option is. numbers.csv has both of "
+        "every member of every run, the random chooser's too, if one was run. What that choosing is worth is asked in "
         f"'{choosing.TITLE}', of agents whose options can be asked anywhere."
     )
     stops = (
@@ -239,21 +220,10 @@ def choices_section(material: Material) -> Block:
         "is sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
         "that it prefers least."
     )
-    lines = []
-    for goal in run["sub_goals"]:
-        words = {goal[word]: f" ({word})" for word in reversed(MOST)}
-        for index, member in enumerate(goal["members"]):
-            lines.append({**member, "sub_goal": goal["sub_goal"], "name": f"{index}{words.get(index, '')}"})
-    members = page.table(
-        MEMBERS,
-        lines,
-        caption=f"{run['path']}, {_name(run)}: decisions at which the option was offered and chosen; expected under "
-        "uniform choice; preference over all and over the last quarter of training; mean steps of an execution; match.",
-    )
-    drawn = [page.shown(material, figure) for figure in figures(material)]  # none of numbers
+    drawn = [page.shown(material, figure) for figure in figures(material)]
     rows = [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
     texts = [text, which(agent, material.metrics["selection"])]
-    return page.section("choices", title, texts, [members, *rows], folded=True)
+    return page.section("choices", title, texts, rows, folded=True)
 
 
 def figures(material: Material) -> Iterator[Drawn]:

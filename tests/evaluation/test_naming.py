@@ -116,7 +116,6 @@ def test_selection_of_a_run_by_hand():
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     first, second = selection_of_run(Choices(*columns), np.array([0.6, 0.9, 0.5, 1.0]), ("a", "b"), 2)
     assert [member["preference"] for member in first["members"]] == pytest.approx([10 / 30, 50 / 20])
-    assert [member["late_preference"] for member in first["members"]] == pytest.approx([0, 3])
     assert [member["match"] for member in first["members"]] == [0.6, 0.9]
     assert [member["option"] for member in second["members"]] == [2, 3]
     assert [member["chosen"] for member in second["members"]] == [0, 10]
