@@ -21,7 +21,7 @@ from scipy.stats import rankdata
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import BANDITS, LEARNED, NEARLY, base_name, near_shortest
+from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name, near_shortest
 from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import Episodes
@@ -90,12 +90,11 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
     there: an option's where it is offered, its sub-goal does not hold, and can be had within the timeout; NaN for an
     option that begins nowhere.
     """
-    from hypogoal.options.planned import distances
+    from hypogoal.options.planned import distances, places_of
 
     plan = loop.engine.plan()
     assert plan is not None
-    place = np.full(loop.engine.n_states, -1, dtype=np.int64)
-    place[plan.ids] = np.arange(len(plan.ids))
+    place = places_of(plan, loop.engine)
     truth = loop.engine.labels(plan.ids)
     away = distances(truth, place[plan.following], plan.final)
     column = np.full(loop.engine.n_actions, -1, dtype=np.int64)
@@ -187,7 +186,7 @@ def numbers(work: Work) -> dict[str, Any]:
             config = artefact.config
             known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
             known = known and not config.get("layouts")  # whose states are too many to say what follows in each
-            if base_name(artefact.kind, config) not in (LEARNED, *BANDITS.values()) or not known:
+            if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not known:
                 continue
             domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)
             if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(domain.sub_goals):

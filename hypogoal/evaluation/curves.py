@@ -42,7 +42,7 @@ from hypogoal.evaluation.plots import (
     SKY,
     STYLES,
     VERMILLION,
-    label_lines,
+    legend_below,
     styled,
 )
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
@@ -53,30 +53,28 @@ if TYPE_CHECKING:
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
 SEVERAL = 3  # runs of an agent from which on intervals and pairs say more than the runs
 SOLVED = 0.95  # share of the window's episodes
-GAMMA = 0.99  # per environment step, of the discounted return
 NEAR = 1.5  # times the shortest path
 LEARNED = "options (learned members)"
-BANDITS = {"thompson": "Thompson sampling", "exp3": "Exp3"}  # by their setting, over learned members
+THOMPSON = "Thompson sampling"  # over learned members
 RANDOM = "random choice"
 ORACLE = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
 PRETRAINING = "random choice while options learn"
 BASELINES = ("PPO tuned", "PPO paper", "DQN tuned", "DQN paper")
-ORDER = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
+ORDER = (LEARNED, THOMPSON, RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
 UNITS = {
     "success": "share of episodes",
     "reward": "undiscounted, per episode",
     "length": "steps",
     "length_over_shortest": "ratio to the layout's shortest path",
     "near": "share of episodes",
-    "discounted_return": "reward discounted by 0.99 per step",
 }
 LAYOUTS_OR_RUNS = "layouts (or runs of one layout)"  # what numbers and curves are over, see ``numbers.by_layout``
 BANDS = (
     "runs of one of several layouts count once, by their mean. Thin lines: each of fewer than 8; else bands: ± one "
     "standard error"
 )
-HIGHER = {"success": True, "length": False, "near": True, "discounted_return": True}  # compared; the higher is better
+HIGHER = {"success": True, "length": False, "near": True}  # compared; the higher is better
 Bounds = tuple[float | None, float | None]
 SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
 SOLID, DASHED, MIXED, LONG, SHORT = STYLES
@@ -155,14 +153,6 @@ def steps_to_solve(episodes: Episodes, window: int = WINDOW) -> int | None:
     return int(episodes.step[reached[0] + window - 1]) if len(reached) else None
 
 
-def discounted_return(episodes: Episodes) -> float:
-    """Spec F5: mean of 0.99 ** (length - 1) * reward, for tasks whose reward comes last; NaN without episodes.
-
-    Unlike success at a cap of 500 steps it tells a short way to the goal from a long one.
-    """
-    return mean_of(GAMMA ** (episodes.length - 1.0) * episodes.reward)
-
-
 def near_shortest(episodes: Episodes, shortest_path: int | None) -> float:
     """Share that succeeded within ``NEAR`` times the layout's shortest path (steps); NaN if unknown, or no episodes."""
     return mean_of(episodes.succeeded & (episodes.length <= NEAR * shortest_path)) if shortest_path else math.nan
@@ -171,10 +161,9 @@ def near_shortest(episodes: Episodes, shortest_path: int | None) -> float:
 def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WINDOW) -> dict[str, float | int | None]:
     """Spec F5: what is said of one run, from all of its training episodes.
 
-    episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio), near
-    (see :func:`near_shortest`) and discounted_return over the last episodes, ``window`` of them at most, and
-    steps_to_95; NaN where there is no episode. ``shortest_path`` is primitive steps from the start to the goal at
-    least.
+    episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio) and near
+    (see :func:`near_shortest`) over the last episodes, ``window`` of them at most, and steps_to_95; NaN where there is
+    no episode. ``shortest_path`` is primitive steps from the start to the goal at least.
     """
     last = episodes.last(window)
     length = mean_of(last.length)
@@ -186,7 +175,6 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WIN
         "length": length,
         "length_over_shortest": length / shortest_path if shortest_path else math.nan,
         "near": near_shortest(last, shortest_path),
-        "discounted_return": discounted_return(last),
         "steps_to_95": steps_to_solve(episodes, window),
     }
 
@@ -197,8 +185,8 @@ def base_name(kind: str, config: Mapping[str, Any]) -> str:
         return f"{config['agent'].upper()} {config['setting']}"
     if kind == "options":
         return PRETRAINING
-    if bandit := BANDITS.get(config["chooser"]):
-        return f"{bandit}, {ORACLE}" if config["termination"] == "oracle" else bandit
+    if config["chooser"] == "thompson":
+        return f"{THOMPSON}, {ORACLE}" if config["termination"] == "oracle" else THOMPSON
     if config["termination"] == "oracle":
         return ORACLE_RANDOM if config["chooser"] == "random" else ORACLE
     return RANDOM if config["chooser"] == "random" else LEARNED
@@ -332,7 +320,6 @@ HEADLINE = (
     page.number("steps", "length", page.spread, 0),
     page.number("× shortest", "length_over_shortest", page.spread, 2),
     page.number(*NEARLY, page.spread, 2),
-    page.number("discounted return", "discounted_return", page.spread, 2),
     SOLVED_AT,
 )
 PLAIN = (
@@ -348,7 +335,6 @@ INTERVALS = (
     page.number("success, %", "success", page.interval, 1, 100),
     page.number("steps", "length", page.interval, 0),
     page.number(*NEARLY, page.interval, 2),
-    page.number("discounted return", "discounted_return", page.interval, 2),
     page.number("runs", "success.n"),
 )
 
@@ -383,7 +369,7 @@ def summary_section(material: Material) -> Block:
         caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
         "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
         f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
-        "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
+        "95 % at: median number of environment steps, in thousands, at which 95 of "
         "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
@@ -438,7 +424,7 @@ def runs_of(agent: Entry) -> str:
 def runs_section(material: Material) -> Block:
     """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
-    digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
+    digits = {"length": 0, "success": 2, "near": 2}
     blocks = [
         page.table(
             INTERVALS,
@@ -538,7 +524,7 @@ def learning_curves(
         axes.set_ylabel(quantity)
         axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
-        label_lines(figure, axes, 2, handlelength=2.4)
+        legend_below(figure, [axes], 2, handlelength=2.4)
     return figure
 
 

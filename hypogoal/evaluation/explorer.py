@@ -190,8 +190,6 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
 
 def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: str) -> dict[str, Any]:
     option = goal["members"][member]
-    counts = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
-    parts = zip(*(count[:, option["option"]] for count in counts), strict=True)
     notes = [word for word in ("most", "least") if goal[word] == member]
     return {
         "name": f"layout {run['layout_seed']}, run seed {run['seed']}{f', {settings}' if settings else ''}",
@@ -203,8 +201,6 @@ def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: 
             ("mean steps", page.fixed(option["duration"], 1)),
             ("match on this layout", page.fixed(option["match"], 2)),
         ],
-        # Preference in each part of training; None where it was not offered.
-        "over": [round(float(chosen / expected), 3) if expected > 0 else None for chosen, expected in parts],
         "png": _overlay(material, run["path"], option["option"]),
     }
 
@@ -222,7 +218,6 @@ def _stopped(material: Material, row: Entry, member: int) -> dict[str, Any]:
             ("timed out", page.percent(option["timed_out"])),
             ("mean steps", page.fixed(option["duration"], 1)),
         ],
-        "over": [],
         "png": _overlay(material, row["path"], option["option"]),
     }
 

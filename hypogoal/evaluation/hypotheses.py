@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import combinations
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,6 @@ from hypogoal.hypotheses.scores import (
     by_member,
     mean_disagreement,
     member_scores,
-    pairwise_disagreement,
 )
 
 if TYPE_CHECKING:
@@ -44,7 +42,7 @@ def sub_goal_metrics(
     """Spec F1, F2: one sub-goal's K members by their verdicts on N held-out states and on M unlabelled ones.
 
     Scores of every member, pooled over layouts and, where these (N,) are known, per layout; best, mean and worst
-    balanced accuracy; the mean disagreement of two members on either set of states, and that of every pair.
+    balanced accuracy; the mean disagreement of two members on either set of states.
     """
     scores, members = member_scores(heldout, labels), heldout.shape[1]
     says_yes = unlabelled.mean(0) if len(unlabelled) else np.full(members, math.nan)
@@ -54,7 +52,6 @@ def sub_goal_metrics(
         accuracy = member_scores(heldout[here], labels[here])["balanced_accuracy"].tolist()
         counts = {"states": int(here.sum()), "positives": int(labels[here].sum())}
         by_layout.append({"layout_seed": int(seed), **counts, "balanced_accuracy": accuracy})
-    rates = dict(zip(STATES, map(pairwise_disagreement, (unlabelled, heldout)), strict=True))
     return {
         "sub_goal": sub_goal,
         "states": len(labels),
@@ -65,14 +62,7 @@ def sub_goal_metrics(
         ],
         "balanced_accuracy": best_mean_worst(scores["balanced_accuracy"]),
         "by_layout": by_layout,
-        "disagreement": {
-            "unlabelled": mean_disagreement(unlabelled),
-            "heldout": mean_disagreement(heldout),
-            "pairs": [
-                {"members": list(pair), **{states: float(rates[states][pair]) for states in STATES}}
-                for pair in combinations(range(members), 2)
-            ],
-        },
+        "disagreement": {"unlabelled": mean_disagreement(unlabelled), "heldout": mean_disagreement(heldout)},
     }
 
 

@@ -21,7 +21,6 @@ from rich.table import Table
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
 from hypogoal.evaluation.numbers import (
-    ORACLE,
     Metrics,
     Rows,
     by_method,
@@ -95,15 +94,14 @@ def choose(
 ) -> dict[str, int | float | None]:
     """Spec F1: the member with the highest balanced accuracy on held-out states in rooms of labelled groups.
 
-    Members' order is chance, so of several equally good ones the first is taken; ``tied`` says how many there are.
+    Members' order is chance, so of several equally good ones the first is taken.
     ``validation`` is its balanced accuracy there; ``member`` is None where those rooms lack a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
     scores = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
     if np.isnan(scores).all():
-        return {"member": None, "validation": math.nan, "tied": 0}
-    best = float(np.nanmax(scores))
-    return {"member": int(np.nanargmax(scores)), "validation": best, "tied": int((scores == best).sum())}
+        return {"member": None, "validation": math.nan}
+    return {"member": int(np.nanargmax(scores)), "validation": float(np.nanmax(scores))}
 
 
 def with_validated(scores: NDArray[np.float64], validated: Any) -> dict[str, float]:
@@ -121,8 +119,7 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
 
     Ensembles have ``method``, ``groups`` and ``sub_goals``, those with ``rooms``. Rows have ``scores``: scope -> score
     -> best, validated, mean, worst (see ``numbers.over``); ``positives`` and ``always_no`` (the accuracy of never
-    saying yes) per scope; ``tied``: mean number of members among which the validation rooms could not tell;
-    disagreement on unlabelled and held-out states.
+    saying yes) per scope; disagreement on unlabelled and held-out states.
     """
     table = []
     cells = grouped(of_rooms(ensembles), lambda of: (of[0]["method"], of[0]["groups"], of[1]["sub_goal"]))
@@ -141,7 +138,6 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
             }
             for scope in TABLED
         }
-        entry["tied"] = float(np.mean([goal["rooms"]["validated"]["tied"] for goal in goals]))
         for states in STATES:
             shares = [goal["disagreement"][states] for goal in goals]
             entry[f"disagreement_{states}"] = over(shares, SHARE, cell, SHARE, states, deviation=True)
@@ -206,12 +202,12 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """What was asked of ladders and what came out; Figure 3."""
+    """What was asked of ladders; Figure 3."""
     return [ladders_section(material), rooms_section(material)] if material.of_ladders() else []
 
 
 def ladders_section(material: Material) -> Block:
-    """The question, and the answer in two sentences."""
+    """The question; the answers are in the tables below."""
     metrics = material.metrics
     asked = (
         "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
@@ -220,39 +216,7 @@ def ladders_section(material: Material) -> Block:
     )
     alone = not metrics["agents"]
     identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
-    answer = " ".join(filter(None, [_scored(metrics["rooms"]), _stopped(metrics["distance"]["over_ladders"])]))
-    return page.section(identity, title, [answer, asked], [], metrics["missing"] if alone else [])
-
-
-def _scored(rows: Sequence[Entry]) -> str:
-    few = [entry for entry in rows if entry["groups"] == min((row["groups"] or 0 for row in rows), default=0)]
-    parts = []
-    for entry in few:
-        found = entry["scores"]["unseen"]["balanced_accuracy"]
-        if found["best"]["mean"] is not None:
-            best, validated = (page.fixed(found[which]["mean"], 2) for which in ("best", "validated"))
-            parts.append(f"{entry['method']}: {best} (validated {validated})")
-    if not parts:
-        return ""
-    return (
-        f"With the fewest labels (N={few[0]['groups']}), balanced accuracy of the best member on rooms that training "
-        f"never saw: {'; '.join(parts)}; 0.5 is chance."
-    )
-
-
-def _stopped(rows: Sequence[Entry]) -> str:
-    there = [entry for entry in rows if entry["best"]["mean"] is not None]
-    learned = [entry for entry in there if not entry["method"].startswith(ORACLE)]
-    if not learned:
-        return ""
-    near = min(learned, key=lambda entry: entry["best"]["mean"])
-    oracle = next((entry for entry in there if entry["method"].startswith(ORACLE)), None)
-    beside = f"; options that end at the true sub-goal: {page.fixed(oracle['best']['mean'], 0)}" if oracle else ""
-    return (
-        f"The best member's options stop {page.fixed(near['best']['mean'], 0)} units of position from a true base at "
-        f"best, the mean member's {page.fixed(near['mean']['mean'], 0)} ({near['method']}, N={near['groups']}), mean "
-        f"over {len(near['ladders'])} ladders{beside}."
-    )
+    return page.section(identity, title, [asked], [], metrics["missing"] if alone else [])
 
 
 def rooms_section(material: Material) -> Block:

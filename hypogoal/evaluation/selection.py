@@ -17,7 +17,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
-from hypogoal.evaluation.curves import BANDITS, LEARNED, PRETRAINING, RANDOM, base_name, variants, which
+from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, THOMPSON, base_name, variants, which
 from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
-PARTS = 20  # of training, in which choices are counted apart
-SELECTED = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING)  # agents whose options are members: to select among
+SELECTED = (LEARNED, THOMPSON, RANDOM, PRETRAINING)  # agents whose options are members: to select among
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
 MOST = ("most", "least")  # preferred
 SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth, on a run's layout
@@ -47,23 +46,6 @@ def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[n
     """
     safe = np.where(expected > 0, expected, 1.0)
     return np.where(expected > 0, chosen / safe, np.nan)
-
-
-def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[str, NDArray[np.float64]]:
-    """Spec E5, F6: choices counted in equal parts of training, in the order of time, each in the part in which it ends.
-
-    ``step``, where each part ends (P,), and ``chosen`` and ``expected``, (P, O) each; P is ``parts``, or as many as
-    there are choices where those are fewer.
-    """
-    windows = np.unique(choices.step)
-    parts = min(parts, len(windows))
-    ends = np.array([part[-1] for part in np.array_split(windows, parts)]) if parts else np.zeros(0)
-    part = np.searchsorted(ends, choices.step)
-    found = {"step": ends.astype(np.float64)}
-    for name in ("chosen", "expected"):
-        counts = np.bincount(part * options + choices.option, getattr(choices, name), minlength=parts * options)
-        found[name] = counts.reshape(parts, options).astype(np.float64)
-    return found
 
 
 def selection_of_run(
@@ -114,8 +96,6 @@ def numbers(work: Work) -> dict[str, Any]:
                 place = f"terminations/{about['path']}/{option}"
                 work.arrays[place] = overlay(states)
                 work.arrays[place].attrs["states"] = len(states)
-            for column, counts in over_training(choices, len(config["sub_goals"]) * config["members"]).items():
-                work.arrays[f"choices/{about['path']}/{column}"] = counts
             of = {name: about[name] for name in ("path", "seed", "layout_seed")}
             chosen = selection_of_run(choices, match, config["sub_goals"], config["members"])
             rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})

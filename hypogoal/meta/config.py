@@ -136,9 +136,9 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
     )
     chooser: str = setting(
         "ppo",
-        "the meta-policy, uniform choice among those offered, or a bandit that sees no state (thompson, exp3)",
-        source="ours: controls; Thompson 1933; Auer et al. 2002",
-        choices=("ppo", "random", "thompson", "exp3"),
+        "the meta-policy, uniform choice among those offered, or a bandit that sees no state",
+        source="ours: controls; Thompson 1933",
+        choices=("ppo", "random", "thompson"),
     )
 
 

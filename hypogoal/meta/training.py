@@ -22,7 +22,6 @@ from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
 from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import STACK
 from hypogoal.options.initiation import Initiation
@@ -33,6 +32,7 @@ from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
+from hypogoal.options.thompson import ThompsonChooser
 from hypogoal.options.visited import Visited
 from hypogoal.options.windows import AgentWindows, localiser_of
 
@@ -99,8 +99,8 @@ def assemble(
         gamma = config.gamma
         if config.chooser == "ppo":
             chooser = MetaPolicy(engine, options, config, seed, device)
-        elif config.chooser in BANDITS:
-            chooser = BANDITS[config.chooser](options, engine.count, rng)
+        elif config.chooser == "thompson":
+            chooser = ThompsonChooser(options, engine.count, rng)
     loop = OptionLoop(
         engine,
         terminations,

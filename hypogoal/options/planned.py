@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine, Plan
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 
@@ -35,8 +36,7 @@ class PlannedLearner(Learner):
             what = "nobody knows what follows on each action in this domain"
             raise UserError(what, "network=planned", "Give --set network=light.")
         self.actions = plan.actions
-        self._place = np.full(self.engine.n_states, -1, np.int64)
-        self._place[plan.ids] = np.arange(len(plan.ids))
+        self._place = places_of(plan, self.engine)
         self._after = self._place[plan.following]
         self.steps = distances(self.terminations.of(plan.ids), self._after, plan.final)
 
@@ -69,6 +69,13 @@ class PlannedLearner(Learner):
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         """There are none."""
+
+
+def places_of(plan: Plan, engine: Engine) -> NDArray[np.int64]:
+    """Where in a plan each of the engine's states is, int64 (n_states,); -1 of those that are not in it."""
+    places = np.full(engine.n_states, -1, np.int64)
+    places[plan.ids] = np.arange(len(plan.ids))
+    return places
 
 
 def distances(reached: NDArray[np.bool_], after: NDArray[np.int64], final: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -18,7 +18,7 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import meanings, paper_figures
 from hypogoal.evaluation.run import Choices, Episodes
-from hypogoal.evaluation.selection import choices_section, over_training, selection_of_run
+from hypogoal.evaluation.selection import choices_section, selection_of_run
 
 SUB_GOALS = ["open-red-door"]
 
@@ -62,7 +62,6 @@ def chosen(name, runs, arrays):
     rows = []
     for run in runs:
         found = selection_of_run(choices, np.array([0.6, 0.9]), SUB_GOALS, 2)
-        arrays |= {f"choices/{run.path}/{key}": counts for key, counts in over_training(choices, 2).items()}
         about = {"path": run.path, "seed": run.seed, "layout_seed": 200, "ensemble": run.config.get("ensemble")}
         rows.append({**about, "sub_goals": found})
     return {"name": name, "runs": rows}
@@ -82,7 +81,8 @@ def test_figure_6_shows_rewards_of_any_size(reward):
     axes = material.figures["reward"].axes[0]
     low, high = axes.get_ylim()
     assert low < reward < high
-    assert [text.get_text() for text in axes.texts] == ["options (learned\nmembers)"]
+    (legend,) = material.figures["reward"].legends
+    assert [text.get_text() for text in legend.get_texts()] == ["options (learned members)"]
     caption = next(block["caption"] for block in row["blocks"] if block.get("id") == "figure-reward")
     assert "random play" not in caption
 

@@ -55,7 +55,7 @@ def test_pairs_without_a_number_are_left_out():
 
 
 def run(layout, seed, length):
-    numbers = {"success": 1.0, "length": length, "near": float(length <= 15), "discounted_return": 1 / length}
+    numbers = {"success": 1.0, "length": length, "near": float(length <= 15)}
     return {"layout_seed": layout, "seed": seed, **numbers}
 
 
@@ -66,9 +66,9 @@ def test_agents_are_paired_by_layout_and_seed():
     alone = {"name": "elsewhere", "runs": [run(500, 0, 1)]}
     rows = curves.against([own, other, alone])
     assert [(row["first"], row["second"], row["quantity"]) for row in rows] == [
-        ("options", "random", quantity) for quantity in ("success", "length", "near", "discounted_return")
+        ("options", "random", quantity) for quantity in ("success", "length", "near")
     ]
-    success, length, near, _ = rows
+    success, length, near = rows
     assert (success["ties"], success["probability"]) == (3, 0.5)
     assert (length["n"], length["wins"]) == (3, 2)
     assert (near["n"], near["wins"], near["ties"]) == (3, 1, 2)
@@ -76,7 +76,7 @@ def test_agents_are_paired_by_layout_and_seed():
     assert length["difference"] == pytest.approx(((-12 + 1) / 2 - 10) / 2)  # each layout once
     assert curves.against([]) == curves.against([own]) == []
     unknown = [{**agent, "runs": [{**of, "near": None} for of in agent["runs"]]} for agent in (own, other)]
-    assert [row["n"] for row in curves.against(unknown)] == [3, 3, 0, 3]
+    assert [row["n"] for row in curves.against(unknown)] == [3, 3, 0]
 
 
 def ensemble(name, seed, **best):

@@ -48,7 +48,7 @@ def test_each_scope_by_hand():
 def test_validation_picks_by_the_labelled_rooms_only():
     """Spec F1: the member chosen there may be the worst elsewhere; its score on unseen rooms is what it is."""
     found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS)
-    assert found["validated"] == {"member": 0, "validation": 1.0, "tied": 1}
+    assert found["validated"] == {"member": 0, "validation": 1.0}
     scores = found["scopes"]["unseen"]["scores"]["balanced_accuracy"]
     assert scores == pytest.approx(
         {"best": 7 / 8, "validated": 1 / 4, "mean": (1 / 4 + 7 / 8 + 1 / 2) / 3, "worst": 1 / 4}
@@ -57,11 +57,11 @@ def test_validation_picks_by_the_labelled_rooms_only():
 
 
 def test_validation_says_when_it_cannot_choose():
-    """Spec F1: of members that are equally good the first, and how many there are; none without both classes."""
+    """Spec F1: of members that are equally good the first; none without both classes."""
     same = np.repeat(VERDICTS[:, :1], 3, axis=1)
-    assert choose(same, LABELS, SEEN) == {"member": 0, "validation": 1.0, "tied": 3}
+    assert choose(same, LABELS, SEEN) == {"member": 0, "validation": 1.0}
     nothing = choose(VERDICTS, LABELS, np.zeros_like(SEEN))
-    assert (nothing["member"], nothing["tied"]) == (None, 0)
+    assert nothing["member"] is None
     assert np.isnan(nothing["validation"])
     assert np.isnan(with_validated(np.array([0.5, 0.7]), None)["validated"])
 
@@ -77,10 +77,10 @@ def test_no_positive_in_unseen_rooms_is_said():
     assert found["validated"]["member"] == 1
 
 
-def ensemble(groups, seed, best, method="dbat, K=2", tied=1, sub_goal="down"):
+def ensemble(groups, seed, best, method="dbat, K=2", sub_goal="down"):
     scores = {"best": best, "validated": best - 0.2, "mean": best - 0.1, "worst": best - 0.3}
     scope = {"states": 12, "positives": 3, "scores": dict.fromkeys(SCORED, scores)}
-    rooms = {"scopes": {"unseen": scope, "all": scope}, "validated": {"tied": tied}}
+    rooms = {"scopes": {"unseen": scope, "all": scope}}
     disagreement = {"unlabelled": 0.1 * seed, "heldout": 0.2}
     row = {"sub_goal": sub_goal, "rooms": rooms, "disagreement": disagreement}
     return {"method": method, "groups": groups, "seed": seed, "sub_goals": [row]}
@@ -91,7 +91,7 @@ def test_the_table_over_seeds():
     rows = rooms_table(
         [
             ensemble(2, 0, 0.9),
-            ensemble(1, 0, 0.6, tied=2),
+            ensemble(1, 0, 0.6),
             ensemble(1, 1, 0.8),
             ensemble(1, 2, float("nan")),
             ensemble(1, 0, 0.5, "single CNN"),
@@ -108,7 +108,6 @@ def test_the_table_over_seeds():
     assert found["interval"] == pytest.approx([0.7 - 12.706 * 0.1, 0.7 + 12.706 * 0.1], abs=1e-3)
     assert rows[0]["scores"]["all"]["accuracy"]["validated"]["mean"] == pytest.approx(0.5)
     assert rows[0]["always_no"] == {"unseen": 0.75, "all": 0.75}
-    assert rows[0]["tied"] == pytest.approx(4 / 3)
     assert rows[0]["disagreement_unlabelled"]["mean"] == pytest.approx(0.1)
     alone = rows[3]["scores"]["unseen"]["balanced_accuracy"]["best"]
     assert np.isnan(alone["standard_deviation"])

@@ -170,7 +170,7 @@ def test_metrics_are_written_as_returned(run, metrics):
 
     text = (run / "evaluation" / "metrics.json").read_text()
     assert json.loads(text, parse_constant=refuse) == metrics
-    for key in ("success", "length", "discounted_return"):
+    for key in ("success", "length", "near"):
         aggregated = metrics["agents"][0][key]
         assert {"mean", "standard_error", "iqm", "interval", "interval_over", "n", "unit"} == set(aggregated)
     assert set(metrics["ensembles"][0]["sub_goals"][0]["members"][0]) - {"member"} <= set(metrics["quantities"])
