@@ -54,15 +54,13 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
     Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (see :func:`near_shortest`) and
     ``length`` (mean steps).
     """
-    from hypogoal.options.choosers import Chooser, Outcome  # with PyTorch, which a report needs not
+    from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome  # with PyTorch, which a report needs not
 
     heard: list[tuple[NDArray[Any], ...]] = []
     inner = loop.chooser
 
     class Heard(Chooser):
-        def choose(
-            self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-        ) -> NDArray[np.int64]:
+        def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
             chosen = inner.choose(environments, ids, offered)
             heard.append((ids.copy(), chosen.copy(), offered.copy()))
             return chosen

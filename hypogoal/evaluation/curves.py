@@ -374,7 +374,7 @@ def summary_section(material: Material) -> Block:
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
     row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": asked}
-    blocks = [row, headline] if metrics["agents"] else drawn
+    blocks = [row, headline] if drawn else []
     return page.section("summary", "Summary", _answers(material), blocks, metrics["missing"])
 
 
@@ -438,10 +438,7 @@ def runs_section(material: Material) -> Block:
 
 def figures(material: Material) -> list[Drawn]:
     """Figure 6 and the same of episode length."""
-    if not material.metrics["agents"]:
-        nothing = "It needs options, meta or baseline artefacts: train-meta, train-baseline."
-        return [Drawn("reward", "Reward", None, missing=nothing)]
-    return [_curve(material, "reward"), _curve(material, "length")]
+    return [_curve(material, quantity) for quantity in ("reward", "length")] if material.metrics["agents"] else []
 
 
 def _curve(material: Material, quantity: str) -> Drawn:

@@ -54,7 +54,6 @@ SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "
 _NAMES = (*WHICH, "executions_deviation", *SHARES)
 NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
 ROOMS_SHOWN = 3
-NEEDED = "It needs options artefacts with executions.csv: train-options with --set start=LADDER."
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
 MARK: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5}
@@ -377,15 +376,14 @@ def summary(metrics: Metrics) -> list[Table]:
 
 def sections(material: Material) -> list[Block]:
     """Figures 4 and 5, of a run with ladders."""
-    return [distance_section(material), stops_section(material)] if material.of_ladders() else []
+    there = material.metrics["distance"]["options"]
+    return [distance_section(material), stops_section(material)] if there else []
 
 
 def distance_section(material: Material) -> Block:
     """Figure 4: how far from a true base options stop."""
     found = material.metrics["distance"]
-    title, drawn = "Options on ladders", page.shown(material, _bars(material))
-    if not found["options"]:
-        return page.section("distance", title, [], [drawn])
+    drawn = page.shown(material, _bars(material))
     text = (
         "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
         f"rooms, it stops from the nearest true base of a ladder, over its last {LAST} executions; an execution that "
@@ -412,7 +410,7 @@ def distance_section(material: Material) -> Block:
             material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
         ),
     ]
-    return page.section("distance", title, [text], blocks)
+    return page.section("distance", "Options on ladders", [text], blocks)
 
 
 def _ordered(rows: Sequence[Entry]) -> list[Entry]:
@@ -422,13 +420,11 @@ def _ordered(rows: Sequence[Entry]) -> list[Entry]:
 
 def figures(material: Material) -> list[Drawn]:
     """Figures 4 and 5."""
-    return [_bars(material), *_stops(material)]
+    return [_bars(material), *_stops(material)] if material.metrics["distance"]["options"] else []
 
 
 def _bars(material: Material) -> Drawn:
     found, name = material.metrics["distance"], "Figure 4: distance to the nearest true base"
-    if not found["options"]:
-        return Drawn("figure4", name, None, missing=NEEDED)
     rows = [entry for entry in _ordered(found["over_ladders"]) if entry["best"]["mean"] is not None]
     name_of, bars = page.method_of(found["options"]), []
     for entry in rows:
@@ -465,7 +461,7 @@ def stops_section(material: Material) -> Block:
 def _stops(material: Material) -> list[Drawn]:
     found = material.metrics["distance"]
     if not found["shown"]:
-        nothing = NEEDED if not found["options"] else "The domain has no pictures of its rooms."
+        nothing = "The domain has no pictures of its rooms."
         return [Drawn("figure5", "Figure 5: where executions stopped", None, missing=nothing)]
     return [_scatter(material, figure, index) for index, figure in enumerate(found["shown"])]
 

@@ -93,9 +93,6 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
 def explorer_section(material: Material) -> Block:
     """A browser of held-out states, with filters."""
     found = material.metrics["explorer"]
-    if found is None:
-        missing = ["States to browse: they need an ensemble artefact: train-ensemble."]
-        return page.section("explorer", TITLE, [], [], missing)
     source = page.pick(material.metrics["ensembles"], "path", found["ensemble"])
     shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
@@ -230,5 +227,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=lambda material: [] if material.of_numbers() else [explorer_section(material)],
+    sections=lambda material: [explorer_section(material)] if material.metrics["explorer"] else [],
 )

@@ -130,8 +130,8 @@ class Work:
     metrics: dict[str, Any] = field(default_factory=dict)  # the numbers so far
 
     def kept(self, question: str, ensemble: int | None) -> dict[str, Any] | None:
-        """What a question keeps of the one ensemble whose states it looked at; None where there is none."""
-        if ensemble is None:
+        """What a question keeps of the one ensemble whose states it looked at; None where it looked at none."""
+        if ensemble is None or not self.looked[question]:
             return None
         source = self.ensembles[ensemble]
         about = {"ensemble": source["path"], "seed": source["seed"], "baseline": BASELINE}

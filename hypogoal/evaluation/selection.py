@@ -162,16 +162,13 @@ def missing(work: Work) -> list[str]:
 
 def sections(material: Material) -> list[Block]:
     """Which options are chosen and where they stop, of a run with agents that see pictures."""
-    return [choices_section(material)] if material.of_agents() and not material.of_numbers() else []
+    agent = _agent(material)
+    return [choices_section(material, agent)] if agent and not material.of_numbers() else []
 
 
 def _agent(material: Material) -> Entry | None:
     """The variant of the option agent that is shown."""
     return next(iter(variants(material.metrics["selection"])), None)
-
-
-def _name(run: Entry) -> str:
-    return f"layout seed {run['layout_seed']}, run seed {run['seed']}"
 
 
 def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, str, NDArray[np.uint8] | None]:
@@ -182,12 +179,8 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
     return f"{word} preferred: member {goal[word]}", note, image
 
 
-def choices_section(material: Material) -> Block:
+def choices_section(material: Material, agent: Entry) -> Block:
     """What preference is, and of the first run Figures 7 and 8."""
-    agent, title = _agent(material), "Which hypotheses are chosen, and where they stop"
-    if agent is None:
-        lacking = ["Choices and termination states: they need a meta artefact with learned terminations: train-meta."]
-        return page.section("choices", title, [], [], lacking, folded=True)
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
         "would have chosen it: 1 for a chooser that does not care. Match is the balanced accuracy of the member's "
@@ -203,7 +196,7 @@ def choices_section(material: Material) -> Block:
     drawn = [page.shown(material, figure) for figure in figures(material)]
     rows = [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
     texts = [text, which(agent, material.metrics["selection"])]
-    return page.section("choices", title, texts, rows, folded=True)
+    return page.section("choices", "Which hypotheses are chosen, and where they stop", texts, rows, folded=True)
 
 
 def figures(material: Material) -> Iterator[Drawn]:
@@ -211,6 +204,7 @@ def figures(material: Material) -> Iterator[Drawn]:
     agent, selection = _agent(material), material.metrics["selection"]
     run = agent["runs"][0] if agent and not material.of_numbers() else {"sub_goals": []}
     for goal in run["sub_goals"]:
+        where = f"layout seed {run['layout_seed']}, run seed {run['seed']}"
         sides = [_side(material, run["path"], goal, word) for word in MOST if goal[word] is not None]
         if not sides:
             continue
@@ -218,7 +212,7 @@ def figures(material: Material) -> Iterator[Drawn]:
         title = name.replace("figure", "Figure ") if name in NUMBERED.values() else "As Figures 7 and 8"
         caption = (
             f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
-            f"prefers most and of the one it prefers least ({run['path']}, {_name(run)}); the last states, 128 at "
+            f"prefers most and of the one it prefers least ({run['path']}, {where}); the last states, 128 at "
             "most, in which the member's classifier ended its option. Preference: chosen / expected under uniform "
             f"choice; match: balanced accuracy on that layout. {which(agent, selection) if agent else ''}"
         ).rstrip()

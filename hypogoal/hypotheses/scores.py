@@ -102,7 +102,7 @@ def _ratio(numerator: NDArray[np.int64], denominator: NDArray[np.int64]) -> NDAr
 
 def by_member(scores: Scores) -> list[dict[str, float]]:
     """Arrays (K,) of scores as K rows of numbers."""
-    return [{name: float(values[member]) for name, values in scores.items()} for member in range(len(scores["recall"]))]
+    return [dict(zip(scores, row, strict=True)) for row in zip(*(of.tolist() for of in scores.values()), strict=True)]
 
 
 def best_mean_worst(scores: NDArray[np.float64]) -> dict[str, float]:

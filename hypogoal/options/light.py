@@ -8,6 +8,7 @@ only its verdicts are asked for; then a transition may reach several steps ahead
 
 import copy
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
-from hypogoal.learners.double_dqn import double_q_targets, follow_tensors
+from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tensors
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, StepsAhead
+from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
@@ -72,7 +74,7 @@ class LightLearner(Learner):
         return config.replay + (2 * config.n_step + STACK) * config.environments
 
     @torch.no_grad()
-    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
         values = apply_to_states(self.online, self.pictures, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
@@ -180,14 +182,10 @@ class LightLearner(Learner):
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
         """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""
+        finite = bool(torch.isfinite(loss))
+        whose = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
         where = f"in the batch of update {self.updates}, step {self.steps}"
-        if not torch.isfinite(loss):
-            options = (~errors.isfinite()).any(0).nonzero().flatten().tolist()
-            raise NumericalError(f"the option loss is {float(loss.detach())}, from option {options}, {where}")
-        norm = self._flat.backward(loss, GRADIENT_NORM)
-        if not torch.isfinite(norm):
-            raise NumericalError(f"a gradient of the options is {float(norm)} {where}")
-        self.optimiser.step()
+        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, whose, where)
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
             follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine, Plan
+from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 
@@ -44,14 +45,12 @@ class PlannedLearner(Learner):
     def reach(config: OptionConfig, options: int) -> int:
         return 0
 
-    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
         nearest: NDArray[np.int64] = ahead.argmin(axis=1)
         return nearest
 
-    def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
-    ) -> NDArray[np.int64]:
+    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
         """There is nothing to explore."""
         return self.actions[self.greedy(ids, options, age)]
 

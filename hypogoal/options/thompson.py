@@ -10,12 +10,11 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import AGAIN, check_fit
-from hypogoal.options.choosers import Chooser, Outcome
+from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
 
 
 class ThompsonChooser(Chooser):
@@ -35,9 +34,7 @@ class ThompsonChooser(Chooser):
         self._taken, self._drawn = np.zeros((environments, options)), np.zeros((environments, options))
         self._earned = np.zeros(environments)
 
-    def choose(
-        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-    ) -> NDArray[np.int64]:
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         fresh = environments[~self._taken[environments].any(1)]
         solved, unsolved = 1.0 + self.credit
         self._drawn[fresh] = self.rng.beta(solved, unsolved, (len(fresh), len(solved)))

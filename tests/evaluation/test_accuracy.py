@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from hypogoal.evaluation.hypotheses import sub_goal_metrics
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.selection import preference
 from hypogoal.hypotheses.scores import (
@@ -61,15 +60,6 @@ def test_member_order_does_not_matter():
     for name, values in member_scores(VERDICTS[:, order], LABELS).items():
         np.testing.assert_array_equal(values, member_scores(VERDICTS, LABELS)[name][order])
     assert mean_disagreement(VERDICTS[:, order]) == pytest.approx(mean_disagreement(VERDICTS))
-
-
-def test_scores_of_each_layout():
-    """Spec F1: a layout's scores are those of its states alone."""
-    seeds = np.array([7, 7, 9, 9, 7, 9])
-    found = sub_goal_metrics("red", VERDICTS, LABELS, seeds, VERDICTS)["by_layout"]
-    assert [layout["layout_seed"] for layout in found] == [7, 9]
-    assert [(layout["states"], layout["positives"]) for layout in found] == [(3, 2), (3, 2)]
-    np.testing.assert_allclose(found[1]["balanced_accuracy"], [1, (1 / 2 + 0) / 2, 1 / 2, 1 / 2])
 
 
 def test_best_mean_and_worst_member():

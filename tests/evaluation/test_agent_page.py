@@ -18,7 +18,7 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import meanings, paper_figures
 from hypogoal.evaluation.run import Choices, Episodes
-from hypogoal.evaluation.selection import choices_section, selection_of_run
+from hypogoal.evaluation.selection import sections, selection_of_run
 
 SUB_GOALS = ["open-red-door"]
 
@@ -182,7 +182,7 @@ def test_of_one_variant_nothing_is_said_of_variants():
     material = material_of(made(), made(chooser="random", reward=0.0))
     (text,) = summary_section(material)["paragraphs"]
     assert text.startswith("The option agent reached the goal")
-    said = str(choices_section(material))
+    said = str(sections(material))
     assert "variant" not in said
     drawn, _ = paper_figures(material)
     assert "variant" not in str([one.caption for one in drawn])
@@ -192,7 +192,7 @@ def test_sections_that_show_one_variant_say_which():
     """Spec F6: preferences, and Figures 7 and 8."""
     shown = "Shown is options (learned members), ensemble=dbat, one of 2 variants of the option agent."
     material = material_of(*two(), *two("random")[2:])
-    assert shown in choices_section(material)["paragraphs"]
+    assert shown in sections(material)[0]["paragraphs"]
     captions = {one.name: one.caption for one in paper_figures(material)[0]}
     assert captions["figure7"].endswith(shown)
 
