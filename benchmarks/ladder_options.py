@@ -9,7 +9,6 @@ rows of the CSV. Kept and gone on with as in ``benchmarks.hypotheses``; ``--tabl
 
 from __future__ import annotations
 
-import argparse
 import csv
 import shutil
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, run_cells, table
+from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from benchmarks.ladders import read as read_lengths
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import parse_integers
@@ -301,17 +300,13 @@ def _steps(cell: tuple[str, ...]) -> tuple[int, ...]:
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser = parser_of(__doc__, "10")
     parser.add_argument(
         "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
     )
     parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
     parser.add_argument("--methods", default="dbat,none,cnn,oracle", help=f"of {', '.join(METHODS)}")
     parser.add_argument("--ladders", default=",".join(LADDERS[:9]), help=f"of {', '.join(LADDERS)}")
-    parser.add_argument("--seeds", type=parse_integers, default=(10,), help="10-12 or 10,12")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join((tables_that_hold if "hold" in arguments.csv.stem else tables)(arguments.csv)))
