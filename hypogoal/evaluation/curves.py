@@ -42,8 +42,7 @@ from hypogoal.evaluation.plots import (
     SKY,
     STYLES,
     VERMILLION,
-    legend_below,
-    styled,
+    drawing,
 )
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
 
@@ -467,18 +466,9 @@ def _curve(material: Material, quantity: str) -> Drawn:
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
         f"{which_figure}: {title.lower()}, mean of the last 100 at each step.{several} {agents[0]['name']}: "
-        f"{runs_of(agents[0])}; the other agents: {_others(agents)}.{reference}"
+        f"{runs_of(agents[0])}; other agents' runs: numbers.csv.{reference}"
     )
     return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
-
-
-def _others(agents: Sequence[Mapping[str, Any]]) -> str:
-    if len(agents) < 2:
-        return "none"
-    alike = [{(run["layout_seed"], run["seed"]) for run in agent["runs"]} for agent in agents]
-    if all(runs == alike[0] for runs in alike):
-        return "the same layouts and seeds"
-    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see numbers.csv"
 
 
 @dataclass(frozen=True)
@@ -510,9 +500,7 @@ def learning_curves(
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
     """
-    with styled():
-        figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
-        axes = figure.subplots()
+    with drawing(2.9, 2, NARROW, handlelength=2.4) as (figure, axes):
         for line in lines:
             _draw_curve(axes, line)
         for name, value in references:
@@ -521,7 +509,6 @@ def learning_curves(
         axes.set_ylabel(quantity)
         axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
-        legend_below(figure, [axes], 2, handlelength=2.4)
     return figure
 
 
@@ -545,11 +532,6 @@ def _draw_curve(axes: Axes, line: Line) -> None:
 def variants(entries: Iterable[Entry]) -> list[Entry]:
     """The entries called ``LEARNED``, also those to which settings that differ between runs were added."""
     return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{LEARNED}, ")]
-
-
-def settings_of(agent: Entry) -> str:
-    """What is added to a variant's name; nothing where it is the usual one."""
-    return str(agent["name"]).removeprefix(LEARNED).removeprefix(", ")
 
 
 def which(agent: Entry, entries: Sequence[Entry]) -> str:

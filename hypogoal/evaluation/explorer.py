@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import settings_of, variants
+from hypogoal.evaluation.curves import LEARNED, variants
 from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
 
@@ -113,7 +113,7 @@ def explorer_section(material: Material) -> Block:
     choices = {
         "goal": [(goal["name"], goal["name"]) for goal in goals],
         "errors": [*errors, *((str(member), f"member {member} wrong") for member in range(source["members"]))],
-        "place": _any(sorted(places, key=_natural)),
+        "place": _any(places),
         "kind": _any(sorted(kinds)),
     }
     block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "caption": sample}
@@ -123,12 +123,6 @@ def explorer_section(material: Material) -> Block:
 def _any(values: Sequence[str]) -> list[tuple[str, str]]:
     """Choices of a filter, each value's own name; none where there is nothing to choose."""
     return [("", "any"), *((value, value) for value in values)] if len(values) > 1 else []
-
-
-def _natural(place: str) -> tuple[int, str]:
-    """Layout 9 before layout 10."""
-    digits = "".join(character for character in place.partition("(")[0] if character.isdigit())
-    return int(digits or 0), place
 
 
 def _goal(material: Material, source: Entry, sub_goal: str) -> dict[str, Any]:
@@ -178,7 +172,7 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
         for run in agent["runs"]:
             goal = next((goal for goal in run["sub_goals"] if goal["sub_goal"] == sub_goal), None)
             if run["ensemble"] == ensemble and goal is not None:
-                options.append(_chosen(material, run, goal, member, settings_of(agent)))
+                options.append(_chosen(material, run, goal, member, agent["name"].removeprefix(LEARNED)))
     for row in material.metrics["distance"]["options"]:
         if row["ensemble"] == ensemble and row["sub_goal"] == sub_goal:
             options.append(_stopped(material, row, member))
@@ -189,7 +183,7 @@ def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: 
     option = goal["members"][member]
     notes = [word for word in ("most", "least") if goal[word] == member]
     return {
-        "name": f"layout {run['layout_seed']}, run seed {run['seed']}{f', {settings}' if settings else ''}",
+        "name": f"layout {run['layout_seed']}, run seed {run['seed']}{settings}",
         "note": f"{notes[0]} preferred of its sub-goal" if notes else "",
         "facts": [
             ("chosen", f"{option['chosen']:,} of {option['offered']:,} offers"),

@@ -64,10 +64,10 @@ def styled(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None
 
 
 @contextmanager
-def drawing(height: float, columns: int, **more: Any) -> Iterator[tuple[Figure, Axes]]:
+def drawing(height: float, columns: int, width: float = WIDTH, **more: Any) -> Iterator[tuple[Figure, Axes]]:
     """One plot, ``height`` inches high; at the end of the ``with`` its :func:`legend_below` of at most ``columns``."""
     with styled():
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        figure = Figure(figsize=(width, height), layout="constrained")
         axes = figure.subplots()
         yield figure, axes
         legend_below(figure, [axes], columns, **more)

@@ -160,10 +160,22 @@ def missing(work: Work) -> list[str]:
     return [f"no truth of {name} in its domain, to match members with" for name in names]
 
 
+MEMBERS = (
+    page.label("sub-goal", "sub_goal", once=True),
+    page.label("member", "name"),
+    page.number("offered", "offered"),
+    page.number("chosen", "chosen"),
+    page.number("expected", "expected", page.fixed, 0),
+    page.number("preference", "preference", page.fixed, 2),
+    page.number("steps", "duration", page.fixed, 1),
+    page.number("match", "match", page.fixed, 2),
+)
+
+
 def sections(material: Material) -> list[Block]:
-    """Which options are chosen and where they stop, of a run with agents that see pictures."""
+    """Which options are chosen and where they stop, of a run with agents."""
     agent = _agent(material)
-    return [choices_section(material, agent)] if agent and not material.of_numbers() else []
+    return [choices_section(material, agent)] if agent else []
 
 
 def _agent(material: Material) -> Entry | None:
@@ -180,12 +192,13 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
 
 
 def choices_section(material: Material, agent: Entry) -> Block:
-    """What preference is, and of the first run Figures 7 and 8."""
+    """Of the first run how often each member was chosen, over what a uniform choice would have; Figures 7 and 8."""
+    run = agent["runs"][0]
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
         "would have chosen it: 1 for a chooser that does not care. Match is the balanced accuracy of the member's "
-        "classifier against the true sub-goal on the layout, not how good its option is. numbers.csv has both of "
-        "every member of every run, the random chooser's too, if one was run. What that choosing is worth is asked in "
+        "classifier against the true sub-goal on the layout, not how good its option is. numbers.csv has the same of "
+        "every run, the random chooser's too, if one was run. What that choosing is worth is asked in "
         f"'{choosing.TITLE}', of agents whose options can be asked anywhere."
     )
     stops = (
@@ -193,10 +206,20 @@ def choices_section(material: Material, agent: Entry) -> Block:
         "is sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
         "that it prefers least."
     )
-    drawn = [page.shown(material, figure) for figure in figures(material)]
-    rows = [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
+    lines = []
+    for goal in run["sub_goals"]:
+        words = {goal[word]: f" ({word})" for word in reversed(MOST)}
+        for index, member in enumerate(goal["members"]):
+            lines.append({**member, "sub_goal": goal["sub_goal"], "name": f"{index}{words.get(index, '')}"})
+    caption = (
+        f"{run['path']}, layout seed {run['layout_seed']}, run seed {run['seed']}: decisions at which the option was "
+        "offered and chosen; expected under uniform choice; preference; mean steps of an execution; match."
+    )
+    drawn = [page.shown(material, figure) for figure in figures(material)]  # none of numbers
+    blocks = [page.table(MEMBERS, lines, caption=caption)]
+    blocks += [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
     texts = [text, which(agent, material.metrics["selection"])]
-    return page.section("choices", "Which hypotheses are chosen, and where they stop", texts, rows, folded=True)
+    return page.section("choices", "Which hypotheses are chosen, and where they stop", texts, blocks, folded=True)
 
 
 def figures(material: Material) -> Iterator[Drawn]:
