@@ -239,7 +239,14 @@ def test_numbers_of_a_stranger_are_shown_as_they_are(capsys):
     """Spec G2: a terminal obeys nothing that stands in an evaluation, and one of another shape is told."""
     row = {"name": "[red]x[/blue]\x1b[31m", "sub_goal": "y"}
     row |= {which: {"mean": 0.5} for which in ("best", "mean", "worst", "disagreement_heldout")}
-    numbers = {"rooms": [], "hypotheses": [row], "distance": {"options": []}, "agents": [], "missing": []}
+    numbers = {
+        "rooms": [],
+        "hypotheses": [row],
+        "distance": {"options": []},
+        "agents": [],
+        "missing": [],
+        "choosing": [],
+    }
     draw(summary_of(numbers, "here"), 80)
     text = capsys.readouterr().out
     assert "[red]x[/blue]?" in text and "\x1b" not in text
