@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -11,12 +12,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
 from hypogoal.evaluation.numbers import student_interval
 
 Row = dict[str, Any]
 Cell = tuple[str, ...]
+
+
+def parser_of(doc: str | None, seeds: str) -> argparse.ArgumentParser:
+    """What all such experiments can be told; ``doc`` is the module's, ``seeds`` the default."""
+    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser.add_argument("--seeds", type=parse_integers, default=parse_integers(seeds), help="0-9 or 0,2,5")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
+    return parser
 
 
 def run_cells(

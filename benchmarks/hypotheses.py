@@ -16,7 +16,6 @@ prints the tables of all cells that there are, as Markdown.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -28,12 +27,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, run_cells, table
+from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import seed_for
-from hypogoal.dataset import Collected, Split
+from hypogoal.dataset import Collected, States
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -111,7 +109,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
     prepare()
     data = states_of(layouts)
     column = data.sub_goals.index(sub_goal)
-    heldout = Split(data.heldout.observations, data.heldout.labels[:, column], data.heldout.origins)
+    heldout = States(data.heldout.observations, data.heldout.labels[:, column], data.heldout.origins)
     rows: dict[tuple[int, int], Row] = {}
 
     def look(step: int, ensemble: Ensemble) -> None:
@@ -286,15 +284,11 @@ def _seeds(numbers: Numbers) -> str:
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser = parser_of(__doc__, "0-9")
     parser.add_argument("--layouts", choices=LAYOUTS, default="test")
-    parser.add_argument("--seeds", type=parse_integers, default=parse_integers("0-9"), help="0-9 or 0,2,5")
     parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
     parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
     parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))

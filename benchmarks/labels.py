@@ -9,7 +9,6 @@ from those of layout 0, half of them positives where there are so many. Kept and
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -19,10 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, run_cells, table
+from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from benchmarks.hypotheses import Looked, settings_of, states_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import parse_integers
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -135,11 +133,7 @@ def by_seed(rows: list[dict[str, str]], name: str, count: int, method: str, sub_
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
-    parser.add_argument("--seeds", type=parse_integers, default=parse_integers("0-4"), help="0-4 or 0,2,5")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
+    parser = parser_of(__doc__, "0-4")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))

@@ -9,7 +9,6 @@ rows of the CSV. Kept and gone on with as in ``benchmarks.hypotheses``; ``--tabl
 
 from __future__ import annotations
 
-import argparse
 import csv
 import shutil
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, run_cells, table
+from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from benchmarks.ladders import read as read_lengths
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import parse_integers
@@ -57,12 +56,11 @@ METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of t
     "no-context": ("without other surroundings", WINDOW | {"augment": "grey"}, HOLDS),
     "no-median": ("threshold .5", WINDOW | {"threshold": "0.5"}, HOLDS),
     "no-patience": ("without patience", WINDOW, {}),
-    "shaped": ("with shaping", WINDOW, HOLDS | {"shaping": 0.5}),
     CARRIED: ("carried over", WINDOW, HOLDS | {"policy_view": "agent-crop"}),
     "oracle": ("true sub-goal", {}, {"termination": "oracle"}),  # whatever the ensemble
 }
 # Whose ensemble is another method's.
-ENSEMBLES = {CARRIED: "holds-dbat", "no-patience": "holds-dbat", "shaped": "holds-dbat", "oracle": "dbat"}
+ENSEMBLES = {CARRIED: "holds-dbat", "no-patience": "holds-dbat", "oracle": "dbat"}
 MEMBERS, STEPS = 3, 40_000
 FEWEST = 8  # ladders of which a mean is shown
 # The paper's Figure 4 has twelve; the tops of the last three are bases themselves.
@@ -230,7 +228,7 @@ def tables_that_hold(path: Path) -> Iterator[str]:
         of = {key: {seed: members[seed] for seed in seeds} for key, members in found.items() if key[1] in ladders}
         rows = ([METHODS[method][0], *(_bold(of[method, ladder]) for ladder in ladders)] for method in parts)
         yield from table(["", *ladders], rows)
-    if shaped := found.get(("shaped", "14-22")):
+    if shaped := found.get(("shaped", "14-22")):  # by a setting that is gone: it gained nothing
         plain = {seed: found["holds-dbat", "14-22"][seed] for seed in shaped}
         yield "14-22 with and without `shaping=0.5`: best / **mean** / worst member, mean over the same seeds."
         yield ""
@@ -302,17 +300,13 @@ def _steps(cell: tuple[str, ...]) -> tuple[int, ...]:
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser = parser_of(__doc__, "10")
     parser.add_argument(
         "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
     )
     parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
     parser.add_argument("--methods", default="dbat,none,cnn,oracle", help=f"of {', '.join(METHODS)}")
     parser.add_argument("--ladders", default=",".join(LADDERS[:9]), help=f"of {', '.join(LADDERS)}")
-    parser.add_argument("--seeds", type=parse_integers, default=(10,), help="10-12 or 10,12")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join((tables_that_hold if "hold" in arguments.csv.stem else tables)(arguments.csv)))

@@ -14,7 +14,6 @@ lack is the members' fault; ``oracle`` options learn with the true sub-goals, so
 
 from __future__ import annotations
 
-import argparse
 import csv
 import itertools
 import time
@@ -28,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Cell, Row, interval, run_cells, table
+from benchmarks.cells import Cell, Row, interval, parser_of, run_cells, table
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
@@ -190,14 +189,10 @@ def tables(path: Path) -> Iterator[str]:
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser = parser_of(__doc__, "0")
     parser.add_argument("--work", type=Path, default=Path("runs/many-layouts"), help="the folder of data and ensembles")
     parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}")
-    parser.add_argument("--seeds", type=parse_integers, default=(0,), help="0-4 or 0,2")
     parser.add_argument("--looks", type=parse_integers, default=LOOKS, help="environment steps at which to look")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))

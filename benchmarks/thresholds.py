@@ -10,7 +10,6 @@ positives.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -22,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from benchmarks.cells import Row, interval, run_cells, table
+from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from benchmarks.hypotheses import METHODS, states_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.config import parse_integers
 from hypogoal.core.seeding import seed_for
 from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -148,12 +146,8 @@ def by_seed(rows: list[dict[str, str]], rule: str, method: str, sub_goal: str = 
 
 def main() -> None:
     """Run the cells that are not in the file yet."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("csv", type=Path, help="the file of all cells; made where there is none")
+    parser = parser_of(__doc__, "0-4")
     parser.add_argument("--layouts", choices=("choice", "test"), default="test")
-    parser.add_argument("--seeds", type=parse_integers, default=parse_integers("0-4"), help="0-4 or 0,2,5")
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--tables", action="store_true", help="print the tables and run nothing")
     arguments = parser.parse_args()
     if arguments.tables:
         print("\n".join(tables(arguments.csv)))

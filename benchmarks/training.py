@@ -30,7 +30,7 @@ from torch.nn import functional  # noqa: E402
 from hypogoal.core.checkpoints import Checkpoints  # noqa: E402
 from hypogoal.core.compute import prepare  # noqa: E402
 from hypogoal.core.config import resolve  # noqa: E402
-from hypogoal.dataset import Split, open_dataset  # noqa: E402
+from hypogoal.dataset import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
 from hypogoal.domains.base import defaults_of  # noqa: E402
 from hypogoal.hypotheses.config import EnsembleConfig  # noqa: E402
@@ -61,7 +61,7 @@ class Clock(Checkpoints):
         return statistics.median(np.diff(self.times))
 
 
-def states(domain: str, folder: Path) -> tuple[Split, np.ndarray]:
+def states(domain: str, folder: Path) -> tuple[States, np.ndarray]:
     """Real states, collected by the tool."""
     from hypogoal.cli import main
 
@@ -74,7 +74,7 @@ def states(domain: str, folder: Path) -> tuple[Split, np.ndarray]:
     return data.labelled(SUB_GOAL[domain]), data.unlabelled()
 
 
-def plain(split: Split, unlabelled: np.ndarray, config: EnsembleConfig, steps: int) -> float:
+def plain(split: States, unlabelled: np.ndarray, config: EnsembleConfig, steps: int) -> float:
     """Seconds of a step of the plain loop."""
     generator = torch.Generator().manual_seed(0)
     shape = split.observations.shape[1:]
@@ -109,14 +109,14 @@ def plain(split: Split, unlabelled: np.ndarray, config: EnsembleConfig, steps: i
     return statistics.median(times[1:])
 
 
-def ours(split: Split, unlabelled: np.ndarray, config: EnsembleConfig) -> float:
+def ours(split: States, unlabelled: np.ndarray, config: EnsembleConfig) -> float:
     """Seconds of a step of ``fit``."""
     clock = Clock()
     fit(split.observations, split.labels, unlabelled, config, 0, checkpoints=clock)
     return clock.per_step()
 
 
-def compared(split: Split, unlabelled: np.ndarray, domain: str, members: int, steps: int, repeats: int) -> Any:
+def compared(split: States, unlabelled: np.ndarray, domain: str, members: int, steps: int, repeats: int) -> Any:
     """Both ways, in turn."""
     config = resolve(
         EnsembleConfig,

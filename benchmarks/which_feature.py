@@ -22,10 +22,10 @@ import numpy as np
 from benchmarks.cells import table
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import number
-from hypogoal.which_feature.page import COLUMNS, Line, summary, told
 from hypogoal.which_feature.run import Cell
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS
+from hypogoal.which_feature.table import COLUMNS, Line, summary, told
 
 WEIGHTS = (1.0, 0.1, 0.01, 0.001, 0.0001)
 OBJECTIVES = (  # in the order in which they are run
@@ -36,7 +36,6 @@ UNWEIGHTED = ("none", "cnn", "oracle")
 CHOICE_SEEDS, CHOICE_MIX, CHOICE_MIX_OF_TWO = (100,), 0.5, 1.0
 HIGH, LOW = 0.95, 0.6
 SCORES = ("ranking", "balanced_accuracy", "at_best")
-NONE = np.empty((0, 2, 0), dtype=np.int64)  # states that members are surest of: not in the CSV
 CSV = Path(__file__).resolve().parents[1] / "docs" / "results" / "which-feature.csv"
 TWO = CSV.with_name("which-feature-two.csv")
 SEQUENTIAL = CSV.with_name("which-feature-two-sequential.csv")  # members one after the other
@@ -55,7 +54,7 @@ def gather(target: Path, paths: Iterable[Path]) -> None:
 
 
 def read(path: Path) -> list[Cell]:
-    """The cells of a ``results.csv``, without the states that members are surest of."""
+    """The cells of a ``results.csv``."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     cells = []
@@ -63,7 +62,7 @@ def read(path: Path) -> list[Cell]:
         shape = (-1, len({row["factor"] for row in of}))
         ranked, at_half, at_best = (np.array([float(row[name]) for row in of]).reshape(shape) for name in SCORES)
         labels = np.array([int(row["labels"]) for row in of[: shape[1]]])
-        cells.append(Cell(entry, float(mix), int(seed), ranked, at_half, at_best, labels, NONE))
+        cells.append(Cell(entry, float(mix), int(seed), ranked, at_half, at_best, labels))
     return cells
 
 

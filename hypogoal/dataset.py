@@ -50,7 +50,7 @@ class States:
 
     Attributes:
         observations: uint8 or float32 (N, *observation_shape).
-        labels: bool (N, G), one column per sub-goal.
+        labels: bool (N, G), one column per sub-goal; (N,) where they are of one sub-goal.
         origins: int (N,) arrays that say where each state comes from (layout_seed, agent_x, ...).
     """
 
@@ -62,9 +62,6 @@ class States:
         """Those of them that are ``kept``, bool (N,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         return States(self.observations[kept], self.labels[kept], origins)
-
-
-Split: TypeAlias = States  # those of one sub-goal: labels bool (N,)
 
 
 @dataclass(frozen=True)
@@ -274,11 +271,11 @@ class Dataset:
             raise UserError("the data file has other names than features", self.path, AGAIN)
         return names
 
-    def labelled(self, sub_goal: str) -> Split:
+    def labelled(self, sub_goal: str) -> States:
         """The labelled states of one sub-goal."""
         return self._split("labelled", sub_goal)
 
-    def heldout(self, sub_goal: str) -> Split:
+    def heldout(self, sub_goal: str) -> States:
         """The held-out states of one sub-goal, with their true labels: for evaluation only."""
         return self._split("heldout", sub_goal)
 
@@ -303,7 +300,7 @@ class Dataset:
                     rows[split][goal] = {"states": len(labels), "positives": int(labels.sum())}
         return rows
 
-    def _split(self, split: str, sub_goal: str) -> Split:
+    def _split(self, split: str, sub_goal: str) -> States:
         if sub_goal not in self.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {', '.join(self.sub_goals)}.")
         base = f"{split}/{sub_goal}"
@@ -312,7 +309,7 @@ class Dataset:
             labels = self._labels(file, base)
             if labels.shape != (len(observations),):
                 raise hdf5.Foreign(f"{base}: labels of shape {labels.shape} for {len(observations)} states")
-            return Split(observations, labels, self._origins(file, base, len(observations)))
+            return States(observations, labels, self._origins(file, base, len(observations)))
 
     @staticmethod
     def _labels(file: Any, base: str) -> NDArray[np.bool_]:

@@ -80,7 +80,7 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_options() -> None:
     assert all(torch.equal(before[name], value) for name, value in learner.state().items())
     with torch.no_grad():
         learner.online.heads.bias.view(2, -1)[1] = torch.nan
-    with pytest.raises(NumericalError, match=r"the option loss is nan, from option \[1\], in the batch of update \d+"):
+    with pytest.raises(NumericalError, match=r"the loss of options \[1\] is nan in the batch of update \d+"):
         learner._update()
 
 
@@ -135,7 +135,7 @@ def test_a_gradient_that_is_no_number_stops_the_meta_policy() -> None:
     with pytest.raises(
         NumericalError, match=r"a gradient of the meta-policy is (nan|inf) in update 3, epoch 1, batch 2"
     ):
-        policy._step((weight - weight.detach()).sqrt().sum(), "update 3, epoch 1, batch 2")
+        policy._step((weight - weight.detach()).sqrt().sum(), "in update 3, epoch 1, batch 2")
     assert torch.isfinite(weight).all()
 
 

@@ -51,18 +51,16 @@ def which_feature(
     - labels: how many it takes until the right member is known, for those
     features that are covered
 
-    Writes results.csv (a line for each entry, mix, seed, member and feature)
-    and page.html.
+    Writes results.csv: a line for each entry, mix, seed, member and feature.
     """
     from hypogoal.core import own_code
     from hypogoal.core.compute import prepare
-    from hypogoal.which_feature import page, run
+    from hypogoal.which_feature import run, table
 
     prepare()
     options = {"diversity": diversity, "mix": mix, "members": members, "seeds": seeds}
     config = run.resolved({**options, "factors": factors, "high": high, "low": low}, set_ or ())
     with own_code.given(*run.objectives_in(diversity), *cli.values_of(set_)):
         cells = run.run(config, out, quiet)
-    draw(page.table_of(cells, config), 79)
-    page.write(out / "page.html", cells, config)
-    give(out / "page.html")
+    draw(table.table_of(cells, config), 79)
+    give(out / "results.csv")

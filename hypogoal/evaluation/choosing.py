@@ -21,7 +21,7 @@ from scipy.stats import rankdata
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import BANDITS, LEARNED, NEARLY, base_name, near_shortest
+from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name, near_shortest
 from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
 from hypogoal.evaluation.run import Episodes
@@ -54,15 +54,13 @@ def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choice
     Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (see :func:`near_shortest`) and
     ``length`` (mean steps).
     """
-    from hypogoal.options.choosers import Chooser, Outcome  # with PyTorch, which a report needs not
+    from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome  # with PyTorch, which a report needs not
 
     heard: list[tuple[NDArray[Any], ...]] = []
     inner = loop.chooser
 
     class Heard(Chooser):
-        def choose(
-            self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-        ) -> NDArray[np.int64]:
+        def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
             chosen = inner.choose(environments, ids, offered)
             heard.append((ids.copy(), chosen.copy(), offered.copy()))
             return chosen
@@ -90,12 +88,11 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
     there: an option's where it is offered, its sub-goal does not hold, and can be had within the timeout; NaN for an
     option that begins nowhere.
     """
-    from hypogoal.options.planned import distances
+    from hypogoal.options.planned import distances, places_of
 
     plan = loop.engine.plan()
     assert plan is not None
-    place = np.full(loop.engine.n_states, -1, dtype=np.int64)
-    place[plan.ids] = np.arange(len(plan.ids))
+    place = places_of(plan, loop.engine)
     truth = loop.engine.labels(plan.ids)
     away = distances(truth, place[plan.following], plan.final)
     column = np.full(loop.engine.n_actions, -1, dtype=np.int64)
@@ -187,7 +184,7 @@ def numbers(work: Work) -> dict[str, Any]:
             config = artefact.config
             known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
             known = known and not config.get("layouts")  # whose states are too many to say what follows in each
-            if base_name(artefact.kind, config) not in (LEARNED, *BANDITS.values()) or not known:
+            if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not known:
                 continue
             domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)
             if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(domain.sub_goals):
@@ -266,13 +263,13 @@ def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
 
 def summary(metrics: Metrics) -> list[Table]:
     """For a terminal, where there is anything to choose."""
-    agents = metrics.get("choosing", [])
+    agents = metrics["choosing"]
     return [page.terminal(TITLE, (*COLUMNS[:2], COLUMNS[-1]), _choosers(agents))] if agents else []
 
 
 def sections(material: Material) -> list[Block]:
     """One table; each member's quality and preference are in ``numbers.csv``."""
-    agents = material.metrics.get("choosing", [])
+    agents = material.metrics["choosing"]
     if not agents:
         return []
     text = (

@@ -241,7 +241,7 @@ def _curve(
 
 def _pairs(about: Mapping[str, Any]) -> Block:
     first = about["runs"][0]["label"]
-    digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2, "distance, best member": 1}
+    digits = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
     rows = about["comparisons"]
     blocks = page.comparison_tables(
         rows, "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)", digits

@@ -42,8 +42,7 @@ from hypogoal.evaluation.plots import (
     SKY,
     STYLES,
     VERMILLION,
-    label_lines,
-    styled,
+    drawing,
 )
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
 
@@ -53,30 +52,28 @@ if TYPE_CHECKING:
 FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
 SEVERAL = 3  # runs of an agent from which on intervals and pairs say more than the runs
 SOLVED = 0.95  # share of the window's episodes
-GAMMA = 0.99  # per environment step, of the discounted return
 NEAR = 1.5  # times the shortest path
 LEARNED = "options (learned members)"
-BANDITS = {"thompson": "Thompson sampling", "exp3": "Exp3"}  # by their setting, over learned members
+THOMPSON = "Thompson sampling"  # over learned members
 RANDOM = "random choice"
 ORACLE = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
 PRETRAINING = "random choice while options learn"
 BASELINES = ("PPO tuned", "PPO paper", "DQN tuned", "DQN paper")
-ORDER = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
+ORDER = (LEARNED, THOMPSON, RANDOM, PRETRAINING, ORACLE, ORACLE_RANDOM, *BASELINES)
 UNITS = {
     "success": "share of episodes",
     "reward": "undiscounted, per episode",
     "length": "steps",
     "length_over_shortest": "ratio to the layout's shortest path",
     "near": "share of episodes",
-    "discounted_return": "reward discounted by 0.99 per step",
 }
 LAYOUTS_OR_RUNS = "layouts (or runs of one layout)"  # what numbers and curves are over, see ``numbers.by_layout``
 BANDS = (
     "runs of one of several layouts count once, by their mean. Thin lines: each of fewer than 8; else bands: ± one "
     "standard error"
 )
-HIGHER = {"success": True, "length": False, "near": True, "discounted_return": True}  # compared; the higher is better
+HIGHER = {"success": True, "length": False, "near": True}  # compared; the higher is better
 Bounds = tuple[float | None, float | None]
 SHARES: Bounds = (-0.02, 1.04)  # limits for what lies within 0 and 1, so that a line on either is seen
 SOLID, DASHED, MIXED, LONG, SHORT = STYLES
@@ -155,14 +152,6 @@ def steps_to_solve(episodes: Episodes, window: int = WINDOW) -> int | None:
     return int(episodes.step[reached[0] + window - 1]) if len(reached) else None
 
 
-def discounted_return(episodes: Episodes) -> float:
-    """Spec F5: mean of 0.99 ** (length - 1) * reward, for tasks whose reward comes last; NaN without episodes.
-
-    Unlike success at a cap of 500 steps it tells a short way to the goal from a long one.
-    """
-    return mean_of(GAMMA ** (episodes.length - 1.0) * episodes.reward)
-
-
 def near_shortest(episodes: Episodes, shortest_path: int | None) -> float:
     """Share that succeeded within ``NEAR`` times the layout's shortest path (steps); NaN if unknown, or no episodes."""
     return mean_of(episodes.succeeded & (episodes.length <= NEAR * shortest_path)) if shortest_path else math.nan
@@ -171,10 +160,9 @@ def near_shortest(episodes: Episodes, shortest_path: int | None) -> float:
 def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WINDOW) -> dict[str, float | int | None]:
     """Spec F5: what is said of one run, from all of its training episodes.
 
-    episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio), near
-    (see :func:`near_shortest`) and discounted_return over the last episodes, ``window`` of them at most, and
-    steps_to_95; NaN where there is no episode. ``shortest_path`` is primitive steps from the start to the goal at
-    least.
+    episodes, window (episodes actually averaged), success, reward, length, length_over_shortest (ratio) and near
+    (see :func:`near_shortest`) over the last episodes, ``window`` of them at most, and steps_to_95; NaN where there is
+    no episode. ``shortest_path`` is primitive steps from the start to the goal at least.
     """
     last = episodes.last(window)
     length = mean_of(last.length)
@@ -186,7 +174,6 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WIN
         "length": length,
         "length_over_shortest": length / shortest_path if shortest_path else math.nan,
         "near": near_shortest(last, shortest_path),
-        "discounted_return": discounted_return(last),
         "steps_to_95": steps_to_solve(episodes, window),
     }
 
@@ -197,8 +184,8 @@ def base_name(kind: str, config: Mapping[str, Any]) -> str:
         return f"{config['agent'].upper()} {config['setting']}"
     if kind == "options":
         return PRETRAINING
-    if bandit := BANDITS.get(config["chooser"]):
-        return f"{bandit}, {ORACLE}" if config["termination"] == "oracle" else bandit
+    if config["chooser"] == "thompson":
+        return f"{THOMPSON}, {ORACLE}" if config["termination"] == "oracle" else THOMPSON
     if config["termination"] == "oracle":
         return ORACLE_RANDOM if config["chooser"] == "random" else ORACLE
     return RANDOM if config["chooser"] == "random" else LEARNED
@@ -297,7 +284,7 @@ def against(agents: Sequence[Entry]) -> Rows:
     runs = [(agent["name"], (layout_of(run), run["seed"]), run) for agent in agents for run in agent["runs"]]
     rows: Rows = []
     for quantity, higher in HIGHER.items():
-        measured = [(name, alike, run.get(quantity, math.nan)) for name, alike, run in runs]
+        measured = [(name, alike, run[quantity]) for name, alike, run in runs]
         rows += pairs(measured, quantity, higher=higher, layouts=True)
     return rows
 
@@ -324,7 +311,7 @@ def solved(steps: Mapping[str, Any]) -> str:
 
 AGENT = page.label("agent", "name")
 RUNS = page.number("runs", lambda agent: len(agent["runs"]))
-NEARLY: tuple[str, Any] = (f"within {NEAR} shortest paths", lambda of: of.get("near"))  # older evaluations lack it
+NEARLY = (f"within {NEAR} shortest paths", "near")
 SOLVED_AT = page.number("95 % at", "steps_to_95", solved)
 HEADLINE = (
     RUNS,
@@ -332,7 +319,6 @@ HEADLINE = (
     page.number("steps", "length", page.spread, 0),
     page.number("× shortest", "length_over_shortest", page.spread, 2),
     page.number(*NEARLY, page.spread, 2),
-    page.number("discounted return", "discounted_return", page.spread, 2),
     SOLVED_AT,
 )
 PLAIN = (
@@ -348,7 +334,6 @@ INTERVALS = (
     page.number("success, %", "success", page.interval, 1, 100),
     page.number("steps", "length", page.interval, 0),
     page.number(*NEARLY, page.interval, 2),
-    page.number("discounted return", "discounted_return", page.interval, 2),
     page.number("runs", "success.n"),
 )
 
@@ -383,39 +368,25 @@ def summary_section(material: Material) -> Block:
         caption="Over the last 100 training episodes of each run: mean ± standard error over layouts, or over runs "
         "of one layout. Steps: length of an episode, failures counted at the cap; × shortest: against the layout's "
         f"shortest path. Within {NEAR} shortest paths, in short near: the share of episodes that succeeded so soon. "
-        "Discounted return: 0.99 per step. 95 % at: median number of environment steps, in thousands, at which 95 of "
+        "95 % at: median number of environment steps, in thousands, at which 95 of "
         "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
     row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": asked}
-    blocks = [row, headline] if metrics["agents"] else drawn
+    blocks = [row, headline] if drawn else []
     return page.section("summary", "Summary", _answers(material), blocks, metrics["missing"])
 
 
 def _answers(material: Material) -> list[str]:
     """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
-    agents = material.metrics["agents"]
-    shown = variants(agents)
-    several = len(shown) > 1
+    shown = variants(material.metrics["agents"])
     paragraphs = []
     for agent in shown:
-        name = f"the agent '{agent['name']}'" if several else "the option agent"
-        text = _achieved(agent, name)
-        control = control_of(material, agent)
-        alike = not several or control is None or same_settings(agent, control)
-        among = f"uniformly random choice among options of {'the same members' if alike else 'its ensemble'}"
-        against = [] if control is None else [(among, control)]
-        if not several:
-            against += [(other["name"], other) for other in agents if other not in (agent, control)]
-        if agent["success"]["mean"] is not None and against:
-            text += f" {_listed(against)}"
-        frozen = [entry for entry in material.metrics.get("choosing", []) if entry["name"] == agent["name"]]
-        for entry in frozen:
+        text = _achieved(agent, f"the agent '{agent['name']}'" if len(shown) > 1 else "the option agent")
+        for entry in (entry for entry in material.metrics["choosing"] if entry["name"] == agent["name"]):
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
             text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
-        if several and control is None and not frozen:
-            text += " No random choice among options of the same members was run."
-        if len(agent["runs"]) < SEVERAL and not several:
+        if len(agent["runs"]) < SEVERAL and len(shown) == 1:
             text += " So few runs decide nothing: more seeds and layouts do."
         paragraphs.append(text)
     return paragraphs
@@ -430,16 +401,6 @@ def _achieved(agent: Mapping[str, Any], name: str) -> str:
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
         f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
-
-
-def _listed(others: Sequence[tuple[str, Entry]]) -> str:
-    """The same of other agents in one sentence."""
-    told = []
-    for name, agent in others:
-        success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
-        told.append(f"{name}: {'no episode ended' if success is None else f'{page.percent(success)}, {steps} steps'}")
-    text = "; ".join(told)
-    return f"{text[0].upper()}{text[1:]}."
 
 
 def _episodes(agent: Mapping[str, Any]) -> str:
@@ -462,7 +423,7 @@ def runs_of(agent: Entry) -> str:
 def runs_section(material: Material) -> Block:
     """Intervals and pairs; each run's numbers, and each layout's, are in ``numbers.csv``."""
     agents = material.metrics["agents"]
-    digits = {"length": 0, "success": 2, "near": 2, "discounted_return": 2}
+    digits = {"length": 0, "success": 2, "near": 2}
     blocks = [
         page.table(
             INTERVALS,
@@ -476,10 +437,7 @@ def runs_section(material: Material) -> Block:
 
 def figures(material: Material) -> list[Drawn]:
     """Figure 6 and the same of episode length."""
-    if not material.metrics["agents"]:
-        nothing = "It needs options, meta or baseline artefacts: train-meta, train-baseline."
-        return [Drawn("reward", "Reward", None, missing=nothing)]
-    return [_curve(material, "reward"), _curve(material, "length")]
+    return [_curve(material, quantity) for quantity in ("reward", "length")] if material.metrics["agents"] else []
 
 
 def _curve(material: Material, quantity: str) -> Drawn:
@@ -508,18 +466,9 @@ def _curve(material: Material, quantity: str) -> Drawn:
     several = f" Lines: mean over runs; {BANDS} over runs." if any(len(agent["runs"]) > 1 for agent in agents) else ""
     caption = (
         f"{which_figure}: {title.lower()}, mean of the last 100 at each step.{several} {agents[0]['name']}: "
-        f"{runs_of(agents[0])}; the other agents: {_others(agents)}.{reference}"
+        f"{runs_of(agents[0])}; other agents' runs: numbers.csv.{reference}"
     )
     return Drawn(quantity, title, drawn, caption, file="figure6" if quantity == "reward" else "figure6-length")
-
-
-def _others(agents: Sequence[Mapping[str, Any]]) -> str:
-    if len(agents) < 2:
-        return "none"
-    alike = [{(run["layout_seed"], run["seed"]) for run in agent["runs"]} for agent in agents]
-    if all(runs == alike[0] for runs in alike):
-        return "the same layouts and seeds"
-    return f"runs each: {page.listed(sorted({len(agent['runs']) for agent in agents[1:]}))}, see numbers.csv"
 
 
 @dataclass(frozen=True)
@@ -551,9 +500,7 @@ def learning_curves(
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
     """
-    with styled():
-        figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
-        axes = figure.subplots()
+    with drawing(2.9, 2, NARROW, handlelength=2.4) as (figure, axes):
         for line in lines:
             _draw_curve(axes, line)
         for name, value in references:
@@ -562,7 +509,6 @@ def learning_curves(
         axes.set_ylabel(quantity)
         axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
-        label_lines(figure, axes, 2, handlelength=2.4)
     return figure
 
 
@@ -583,41 +529,9 @@ def _draw_curve(axes: Axes, line: Line) -> None:
         axes.plot(steps, line.values.T, linewidth=0.6, alpha=0.5, **look)
 
 
-def variants(entries: Iterable[Entry], name: str = LEARNED) -> list[Entry]:
-    """The entries called ``name``, also those to which settings that differ between runs were added."""
-    return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{name}, ")]
-
-
-def control_of(material: Material, agent: Entry) -> Entry | None:
-    """The random chooser among a variant's options: the one with the same settings added to its name.
-
-    Settings that most runs of a name share are not added to it, so a name can leave open which options were chosen
-    among. Then it is the only chooser with an ensemble of this variant, if no other variant has that ensemble.
-    """
-    agents, controls = variants(material.metrics["agents"]), variants(material.metrics["agents"], RANDOM)
-    if len(agents) == len(controls) == 1:
-        return controls[0]
-    ensembles = {of["name"]: {run["ensemble"] for run in of["runs"]} for of in material.metrics.get("selection", ())}
-
-    def shares(first: Entry, second: Entry) -> bool:
-        return bool(ensembles.get(first["name"], set()) & ensembles.get(second["name"], set()))
-
-    same = [control for control in controls if same_settings(agent, control)]
-    if same and (shares(agent, same[0]) or not {agent["name"], same[0]["name"]} <= set(ensembles)):
-        return same[0]
-    near = [control for control in controls if shares(agent, control)]
-    rivals = [other for other in agents for control in near if shares(other, control)]
-    return near[0] if len(near) == len(rivals) == 1 else None
-
-
-def same_settings(agent: Entry, control: Entry) -> bool:
-    """Whether the same settings are added to both names."""
-    return bool(settings_of(agent) == settings_of(control, RANDOM))
-
-
-def settings_of(agent: Entry, name: str = LEARNED) -> str:
-    """What is added to a variant's name; nothing where it is the usual one."""
-    return str(agent["name"]).removeprefix(name).removeprefix(", ")
+def variants(entries: Iterable[Entry]) -> list[Entry]:
+    """The entries called ``LEARNED``, also those to which settings that differ between runs were added."""
+    return [entry for entry in entries if f"{entry['name']}, ".startswith(f"{LEARNED}, ")]
 
 
 def which(agent: Entry, entries: Sequence[Entry]) -> str:

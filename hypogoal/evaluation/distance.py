@@ -54,7 +54,6 @@ SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "
 _NAMES = (*WHICH, "executions_deviation", *SHARES)
 NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
 ROOMS_SHOWN = 3
-NEEDED = "It needs options artefacts with executions.csv: train-options with --set start=LADDER."
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
 HATCHES = ("", "//", r"\\", "xx")  # of bars, from one round of colours to the next
 MARK: dict[str, Any] = {"linestyle": "none", "markersize": 6, "markeredgewidth": 1.5}
@@ -126,16 +125,15 @@ def ladder_numbers(
     return rows
 
 
-def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Spec F3, Figure 4: distances over seeds, on each of the run's ladders and over all of them.
+def distance_table(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -> list[dict[str, Any]]:
+    """Spec F3, Figure 4: per method and N distances over seeds, each seed's mean over the run's ladders first.
 
-    Of each artefact it takes method, groups, ladder, seed and a row of :func:`ladder_numbers`. ``by_ladder``: per
-    method, N, ladder: the distance of the best, validated, mean and worst member and the best member's shares, over
-    seeds. ``over_ladders``: per method and N: the same, each seed's mean over ladders first. A seed that lacks one of
-    the ladders is left out there, so that nothing is compared over unlike ladders; ``each_seed`` has what the others
-    came to, the best member's. Artefacts alike in all of this count each for itself.
+    Of each artefact it takes method, groups, ladder, seed and a row of :func:`ladder_numbers`. Told are the distance of
+    the best, validated, mean and worst member and the best member's shares. A seed that lacks one of the ladders is
+    left out, so that nothing is compared over unlike ladders; ``each_seed`` has what the others came to, the best
+    member's. Artefacts alike in all of this count each for itself.
     """
-    by_ladder, over_ladders = [], []
+    table = []
     cells = grouped(rows, itemgetter(*CELL))
     for key in sorted(cells, key=by_method):
         numbers: dict[tuple[tuple[int, int], str], dict[str, float]] = {}
@@ -143,10 +141,6 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
             before = sum((seed, ladder) == (row["seed"], row["ladder"]) for (seed, _), ladder in numbers)
             numbers[(row["seed"], before), row["ladder"]] = _numbers(row)
         about, seeds = dict(zip(CELL, key, strict=True)), sorted({seed for seed, _ in numbers})
-        for ladder in ladders:
-            if here := [numbers[seed, ladder] for seed in seeds if (seed, ladder) in numbers]:
-                over = _over_seeds(here, *map(str, key), ladder)
-                by_ladder.append({**about, "ladder": ladder, "seeds": len(here), **over})
         whole = [seed for seed in seeds if all((seed, ladder) in numbers for ladder in ladders)]
         means = [
             {name: float(np.mean([numbers[seed, ladder][name] for ladder in ladders])) for name in _NAMES}
@@ -155,8 +149,8 @@ def distance_tables(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -
         incomplete = [seed[0] for seed in seeds if seed not in whole]
         about |= {"ladders": list(ladders), "seeds": len(whole), "incomplete_seeds": incomplete}
         about["each_seed"] = [mean["best"] for mean in means]
-        over_ladders.append({**about, **_over_seeds(means, *map(str, key))})
-    return {"by_ladder": by_ladder, "over_ladders": over_ladders}
+        table.append({**about, **_over_seeds(means, *map(str, key))})
+    return table
 
 
 def _numbers(row: Entry) -> dict[str, float]:
@@ -206,8 +200,8 @@ def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = (
 def numbers(work: Work) -> dict[str, Any]:
     """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
 
-    ``options``: a row per artefact and sub-goal; ``by_ladder`` and ``over_ladders``: over seeds; ``shown``: what Figure
-    5 is drawn of, for each ladder and N the best members of the first seed, whose stops are in the arrays.
+    ``options``: a row per artefact and sub-goal; ``over_ladders``: over seeds; ``shown``: what Figure 5 is drawn of,
+    for each ladder and N the best members of the first seed, whose stops are in the arrays.
     """
     found, executions, options = work.contents, {}, []
     for artefact, (validated, about) in zip(found.ladders, _named(work), strict=True):
@@ -225,7 +219,7 @@ def numbers(work: Work) -> dict[str, Any]:
     starts = [start for start in (domain.starts if domain else ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
     stops = show_stops(options, ladders, executions, domain, work.arrays)
-    return {"distance": {"options": options, **distance_tables(options, ladders), "shown": stops}}
+    return {"distance": {"options": options, "over_ladders": distance_table(options, ladders), "shown": stops}}
 
 
 def rows_of_ladder(
@@ -382,15 +376,14 @@ def summary(metrics: Metrics) -> list[Table]:
 
 def sections(material: Material) -> list[Block]:
     """Figures 4 and 5, of a run with ladders."""
-    return [distance_section(material), stops_section(material)] if material.of_ladders() else []
+    there = material.metrics["distance"]["options"]
+    return [distance_section(material), stops_section(material)] if there else []
 
 
 def distance_section(material: Material) -> Block:
     """Figure 4: how far from a true base options stop."""
     found = material.metrics["distance"]
-    title, drawn = "Options on ladders", page.shown(material, _bars(material))
-    if not found["options"]:
-        return page.section("distance", title, [], [drawn])
+    drawn = page.shown(material, _bars(material))
     text = (
         "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
         f"rooms, it stops from the nearest true base of a ladder, over its last {LAST} executions; an execution that "
@@ -417,7 +410,7 @@ def distance_section(material: Material) -> Block:
             material.comparisons("distance"), "ladder, N and seed", digits={"distance, best member": 1}
         ),
     ]
-    return page.section("distance", title, [text], blocks)
+    return page.section("distance", "Options on ladders", [text], blocks)
 
 
 def _ordered(rows: Sequence[Entry]) -> list[Entry]:
@@ -427,18 +420,16 @@ def _ordered(rows: Sequence[Entry]) -> list[Entry]:
 
 def figures(material: Material) -> list[Drawn]:
     """Figures 4 and 5."""
-    return [_bars(material), *_stops(material)]
+    return [_bars(material), *_stops(material)] if material.metrics["distance"]["options"] else []
 
 
 def _bars(material: Material) -> Drawn:
     found, name = material.metrics["distance"], "Figure 4: distance to the nearest true base"
-    if not found["options"]:
-        return Drawn("figure4", name, None, missing=NEEDED)
     rows = [entry for entry in _ordered(found["over_ladders"]) if entry["best"]["mean"] is not None]
     name_of, bars = page.method_of(found["options"]), []
     for entry in rows:
         mean, wide = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
-        each = [seed for seed in entry.get("each_seed", ()) if seed is not None]
+        each = [seed for seed in entry["each_seed"] if seed is not None]
         bars.append((name_of(entry), _group(entry), mean, wide, each))
     names = list(dict.fromkeys(name for name, *_ in bars if not name.startswith(ORACLE)))
     drawn = distance_bars(bars, names, INSIDE) if bars else None
@@ -470,7 +461,7 @@ def stops_section(material: Material) -> Block:
 def _stops(material: Material) -> list[Drawn]:
     found = material.metrics["distance"]
     if not found["shown"]:
-        nothing = NEEDED if not found["options"] else "The domain has no pictures of its rooms."
+        nothing = "The domain has no pictures of its rooms."
         return [Drawn("figure5", "Figure 5: where executions stopped", None, missing=nothing)]
     return [_scatter(material, figure, index) for index, figure in enumerate(found["shown"])]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import settings_of, variants
+from hypogoal.evaluation.curves import LEARNED, variants
 from hypogoal.evaluation.page import Block, Entry, Material, Question
 from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat, reduced, to_bytes
 
@@ -92,18 +92,13 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
 
 def explorer_section(material: Material) -> Block:
     """A browser of held-out states, with filters."""
-    found = material.metrics.get("explorer")
-    if found is None:
-        old = "explorer" not in material.metrics and material.metrics["ensembles"]
-        needed = "a new evaluation: evaluate --force" if old else "an ensemble artefact: train-ensemble"
-        missing = [f"States to browse: they need {needed}."]
-        return page.section("explorer", TITLE, [], [], missing)
+    found = material.metrics["explorer"]
     source = page.pick(material.metrics["ensembles"], "path", found["ensemble"])
     shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
     text = (
         f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them. Choose a "
         "state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against it. Choose "
-        f"a member to see the options it became. {found['sub_goals'][0].get('reading', '')}"
+        f"a member to see the options it became. {found['sub_goals'][0]['reading']}"
     )
     sample = (
         f"{shown:,} of {states:,} states of a sub-goal, drawn so that every kind of outcome and every place comes up; "
@@ -118,7 +113,7 @@ def explorer_section(material: Material) -> Block:
     choices = {
         "goal": [(goal["name"], goal["name"]) for goal in goals],
         "errors": [*errors, *((str(member), f"member {member} wrong") for member in range(source["members"]))],
-        "place": _any(sorted(places, key=_natural)),
+        "place": _any(places),
         "kind": _any(sorted(kinds)),
     }
     block = {"kind": "explorer", "choices": choices, "data": {"goals": goals}, "caption": sample}
@@ -128,12 +123,6 @@ def explorer_section(material: Material) -> Block:
 def _any(values: Sequence[str]) -> list[tuple[str, str]]:
     """Choices of a filter, each value's own name; none where there is nothing to choose."""
     return [("", "any"), *((value, value) for value in values)] if len(values) > 1 else []
-
-
-def _natural(place: str) -> tuple[int, str]:
-    """Layout 9 before layout 10."""
-    digits = "".join(character for character in place.partition("(")[0] if character.isdigit())
-    return int(digits or 0), place
 
 
 def _goal(material: Material, source: Entry, sub_goal: str) -> dict[str, Any]:
@@ -183,7 +172,7 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
         for run in agent["runs"]:
             goal = next((goal for goal in run["sub_goals"] if goal["sub_goal"] == sub_goal), None)
             if run["ensemble"] == ensemble and goal is not None:
-                options.append(_chosen(material, run, goal, member, settings_of(agent)))
+                options.append(_chosen(material, run, goal, member, agent["name"].removeprefix(LEARNED)))
     for row in material.metrics["distance"]["options"]:
         if row["ensemble"] == ensemble and row["sub_goal"] == sub_goal:
             options.append(_stopped(material, row, member))
@@ -192,11 +181,9 @@ def _options(material: Material, ensemble: str, sub_goal: str, member: int) -> l
 
 def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: str) -> dict[str, Any]:
     option = goal["members"][member]
-    counts = (material.arrays[f"choices/{run['path']}/{key}"] for key in ("chosen", "expected"))
-    parts = zip(*(count[:, option["option"]] for count in counts), strict=True)
     notes = [word for word in ("most", "least") if goal[word] == member]
     return {
-        "name": f"layout {run['layout_seed']}, run seed {run['seed']}{f', {settings}' if settings else ''}",
+        "name": f"layout {run['layout_seed']}, run seed {run['seed']}{settings}",
         "note": f"{notes[0]} preferred of its sub-goal" if notes else "",
         "facts": [
             ("chosen", f"{option['chosen']:,} of {option['offered']:,} offers"),
@@ -205,8 +192,6 @@ def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: 
             ("mean steps", page.fixed(option["duration"], 1)),
             ("match on this layout", page.fixed(option["match"], 2)),
         ],
-        # Preference in each part of training; None where it was not offered.
-        "over": [round(float(chosen / expected), 3) if expected > 0 else None for chosen, expected in parts],
         "png": _overlay(material, run["path"], option["option"]),
     }
 
@@ -224,7 +209,6 @@ def _stopped(material: Material, row: Entry, member: int) -> dict[str, Any]:
             ("timed out", page.percent(option["timed_out"])),
             ("mean steps", page.fixed(option["duration"], 1)),
         ],
-        "over": [],
         "png": _overlay(material, row["path"], option["option"]),
     }
 
@@ -237,5 +221,5 @@ def _overlay(material: Material, path: str, option: int) -> str:
 QUESTION = Question(
     look=look,
     numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
-    sections=lambda material: [] if material.of_numbers() else [explorer_section(material)],
+    sections=lambda material: [explorer_section(material)] if material.metrics["explorer"] else [],
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import combinations
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,6 @@ from hypogoal.hypotheses.scores import (
     by_member,
     mean_disagreement,
     member_scores,
-    pairwise_disagreement,
 )
 
 if TYPE_CHECKING:
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
 
 WHICH = ("best", "mean", "worst")
 COMPARED = ("best", "mean")
-ALL = "all sub-goals"
 STATES = ("unlabelled", "heldout")
 
 
@@ -43,18 +40,11 @@ def sub_goal_metrics(
 ) -> dict[str, Any]:
     """Spec F1, F2: one sub-goal's K members by their verdicts on N held-out states and on M unlabelled ones.
 
-    Scores of every member, pooled over layouts and, where these (N,) are known, per layout; best, mean and worst
-    balanced accuracy; the mean disagreement of two members on either set of states, and that of every pair.
+    Scores of every member, pooled over the layouts, which are told where they are known (N,); best, mean and worst
+    balanced accuracy; the mean disagreement of two members on either set of states.
     """
     scores, members = member_scores(heldout, labels), heldout.shape[1]
     says_yes = unlabelled.mean(0) if len(unlabelled) else np.full(members, math.nan)
-    by_layout = []
-    for seed in () if layout_seeds is None else np.unique(layout_seeds):
-        here = layout_seeds == seed
-        accuracy = member_scores(heldout[here], labels[here])["balanced_accuracy"].tolist()
-        counts = {"states": int(here.sum()), "positives": int(labels[here].sum())}
-        by_layout.append({"layout_seed": int(seed), **counts, "balanced_accuracy": accuracy})
-    rates = dict(zip(STATES, map(pairwise_disagreement, (unlabelled, heldout)), strict=True))
     return {
         "sub_goal": sub_goal,
         "states": len(labels),
@@ -64,15 +54,8 @@ def sub_goal_metrics(
             for member, row in enumerate(by_member(scores))
         ],
         "balanced_accuracy": best_mean_worst(scores["balanced_accuracy"]),
-        "by_layout": by_layout,
-        "disagreement": {
-            "unlabelled": mean_disagreement(unlabelled),
-            "heldout": mean_disagreement(heldout),
-            "pairs": [
-                {"members": list(pair), **{states: float(rates[states][pair]) for states in STATES}}
-                for pair in combinations(range(members), 2)
-            ],
-        },
+        "layouts": [] if layout_seeds is None else np.unique(layout_seeds).tolist(),
+        "disagreement": {"unlabelled": mean_disagreement(unlabelled), "heldout": mean_disagreement(heldout)},
     }
 
 
@@ -125,8 +108,7 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
 def against(ensembles: Sequence[Entry]) -> Rows:
     """Spec F1: the first kind of ensembles against each other by balanced accuracy on held-out layouts, paired by seed.
 
-    Rows over all sub-goals that both have, and for each by itself; units are seeds. Ensembles judged by room are left
-    out.
+    Rows are over all sub-goals that both have; units are seeds. Ensembles judged by room are left out.
     """
     found: Rows = []
     for which in COMPARED:
@@ -135,10 +117,7 @@ def against(ensembles: Sequence[Entry]) -> Rows:
             for ensemble, goal in of_layouts(ensembles)
         ]
         quantity = f"balanced accuracy, {which} member"
-        found += pairs(measured, quantity, ALL)
-        in_turn = [values for group in grouped(measured, itemgetter(0)).values() for values in group]
-        for sub_goal, values in grouped(in_turn, lambda value: value[1][0]).items():
-            found += pairs(values, quantity, sub_goal) if values[0][0] == measured[0][0] else []
+        found += pairs(measured, quantity)
     return found
 
 
@@ -164,16 +143,13 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """Of ensembles judged by layout, and of a run whose agents' are still to come."""
-    return [hypotheses_section(material)] if material.metrics["hypotheses"] or material.of_agents() else []
+    """Of ensembles judged by layout."""
+    return [hypotheses_section(material)] if material.metrics["hypotheses"] else []
 
 
 def hypotheses_section(material: Material) -> Block:
     """Figure 3's question on held-out layouts: best, mean and worst member, and how much members disagree."""
     metrics = material.metrics
-    if not metrics["ensembles"]:
-        nothing = Drawn("members", "Members' accuracy", None, missing="It needs an ensemble artefact: train-ensemble.")
-        return page.section("hypotheses", "Hypotheses", [], [page.shown(material, nothing)])
     if _has_layouts(metrics):
         judged = "Members are judged on layouts whose states were in no training set."
     else:
@@ -192,19 +168,17 @@ def hypotheses_section(material: Material) -> Block:
         caption="Balanced accuracy on held-out states of the best, mean and worst member, and the share of states "
         "on which two members disagree (mean over pairs); mean over ensemble seeds ± standard error.",
     )
-    over_all = [entry for entry in material.comparisons("hypotheses") if entry["where"] == ALL]
-    shared = "ensemble seed and sub-goal (each sub-goal by itself is in metrics.json)"
     blocks = [
         *(page.shown(material, figure) for figure in figures(material)),
         whole,
-        *page.comparison_tables(over_all, shared),
+        *page.comparison_tables(material.comparisons("hypotheses"), "ensemble seed and sub-goal"),
     ]
     return page.section("hypotheses", "Hypotheses", [text], blocks)
 
 
 def _has_layouts(metrics: Entry) -> bool:
     """Whether held-out states are of layouts, as collected ones are, and not only states, as imported ones."""
-    return any(goal["by_layout"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
+    return any(goal["layouts"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
 
 
 def figures(material: Material) -> list[Drawn]:

@@ -18,7 +18,7 @@ from hypogoal.core.compute import prepare
 from hypogoal.core.hdf5 import fixed
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
-from hypogoal.dataset import Observations, Split, open_dataset
+from hypogoal.dataset import Observations, States, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation.run import Contents
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
@@ -65,7 +65,7 @@ class Judgement:
 
     number: int  # the ensemble's, among those of the run
     case: Case  # the sub-goal's ensemble and its data
-    split: Split  # N held-out states
+    split: States  # N held-out states
     unlabelled: Unlabelled  # M states
     domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
@@ -130,8 +130,8 @@ class Work:
     metrics: dict[str, Any] = field(default_factory=dict)  # the numbers so far
 
     def kept(self, question: str, ensemble: int | None) -> dict[str, Any] | None:
-        """What a question keeps of the one ensemble whose states it looked at; None where there is none."""
-        if ensemble is None:
+        """What a question keeps of the one ensemble whose states it looked at; None where it looked at none."""
+        if ensemble is None or not self.looked[question]:
             return None
         source = self.ensembles[ensemble]
         about = {"ensemble": source["path"], "seed": source["seed"], "baseline": BASELINE}
@@ -192,7 +192,7 @@ def judge(case: Case) -> Judged:
 
 
 @lru_cache(maxsize=1)
-def states_of(data: Path, sub_goal: str) -> tuple[Split, Unlabelled]:
+def states_of(data: Path, sub_goal: str) -> tuple[States, Unlabelled]:
     """A sub-goal's held-out states and the unlabelled ones: the largest things here, read once for all ensembles."""
     dataset = open_dataset(data)
     return dataset.heldout(sub_goal), Unlabelled(dataset.unlabelled(), positions_of(dataset.unlabelled_origins()))

@@ -61,8 +61,8 @@ class Material:
     films: Sequence[Block] = ()  # of episodes, see :func:`film`
 
     def comparisons(self, of: str) -> list[Entry]:
-        """One method against the others; none in evaluations from before there were any."""
-        return list(self.metrics.get("comparisons", {}).get(of, ()))
+        """One method against the others."""
+        return list(self.metrics["comparisons"][of])
 
     def within(self, folder: str) -> dict[str, NDArray[Any]]:
         """The arrays of a folder, by their names in it."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.dataset import Split
+from hypogoal.dataset import States
 from hypogoal.evaluation.plots import PALETTE
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def overlay(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(varies, 255 * np.sqrt(mean / 255), mean).round().astype(np.uint8)
 
 
-def contact_sheets(split: Split, kinds: Sequence[str] = ()) -> dict[str, NDArray[np.uint8]]:
+def contact_sheets(split: States, kinds: Sequence[str] = ()) -> dict[str, NDArray[np.uint8]]:
     """Sheets of a split's states, one for each room and label, by names like ``room-01-positives``.
 
     Each, uint8 (height, width, 3), shows ``MOST_STATES`` states at most, spread evenly over those of the room and label

@@ -38,7 +38,6 @@ QUESTIONS: list[Question] = [
     choosing.QUESTION,
     zero_shot.QUESTION,
 ]
-OLDER = "; evaluated by an older hypogoal: its intervals are bootstraps, too narrow with few runs. Evaluate again"
 
 
 def agents_last() -> list[Question]:
@@ -72,8 +71,6 @@ def render(material: Material, version: str) -> str:
     count = len(metrics["provenance"]["artefacts"])
     evaluated = f"{count} artefact{'' if count == 1 else 's'} evaluated"
     subtitle = f"{listed(domains_of(metrics))}; {evaluated}; hypogoal {version}"
-    if metrics["quantities"].get("interval") != meanings()["interval"]:
-        subtitle += OLDER
     sections = [section for question in QUESTIONS for section in question.sections(material)]
     sections.sort(key=itemgetter("folded"))  # what is open comes first
     return draw_page(f"hypogoal: {metrics['run']}", subtitle, [*sections, provenance_section(material)], version)

@@ -37,15 +37,12 @@ def known(
     """
 
     def scores(inside: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
-        told = member_scores(verdicts[inside], labels[inside])
-        return {
-            "ranking": ranking(probabilities[inside], labels[inside]),
-            **{name: told[name] for name in ("balanced_accuracy", "recall")},
-        }
+        accuracy = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
+        return {"ranking": ranking(probabilities[inside], labels[inside]), "balanced_accuracy": accuracy}
 
     best, every = best_threshold(probabilities, labels)[1], scores(np.ones(len(labels), dtype=np.bool_))
     columns = {"ranking": every["ranking"], "at_best_threshold": best}
-    columns |= {"calibration_gap": best - every["balanced_accuracy"], "recall": every["recall"]}
+    columns["calibration_gap"] = best - every["balanced_accuracy"]
     first = None if contexts is None else halves(contexts)
     parts = None if first is None else (scores(first), scores(~first))
     return {
@@ -122,7 +119,7 @@ COLUMNS = (
 
 def sections(material: Material) -> list[Block]:
     """One table."""
-    if not material.metrics.get("ranking"):
+    if not material.metrics["ranking"]:
         return []
     text = (
         "Ranking is the area under the ROC curve: the share of pairs of a positive and a negative in which a member "

@@ -21,7 +21,6 @@ from rich.table import Table
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
 from hypogoal.evaluation.numbers import (
-    ORACLE,
     Metrics,
     Rows,
     by_method,
@@ -62,17 +61,16 @@ def room_metrics(
     verdicts: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
-    kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
 
-    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there are,
-    ``room`` and ``kind``, whose values have the names ``kinds``.
+    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
+    ``room``.
 
     Returns:
         ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
         of accuracy, balanced accuracy and ``ranking`` (area under the ROC curve); ``validated``: which member the rooms
-        of labelled groups pick; ``by_room``; ``false_positives``. NaN where not defined.
+        of labelled groups pick. NaN where not defined.
     """
     seen, rooms = origins["seen"], origins.get("room")
     validated = choose(verdicts, labels, seen)
@@ -88,12 +86,7 @@ def room_metrics(
             "members": [{"member": member, **row} for member, row in enumerate(by_member(scores))],
             "scores": {score: with_validated(scores[score], validated["member"]) for score in SCORED},
         }
-    return {
-        "scopes": scopes,
-        "validated": validated,
-        "by_room": [] if rooms is None else _by_room(verdicts, labels, rooms, seen),
-        "false_positives": _false_positives(verdicts, labels, origins, kinds),
-    }
+    return {"scopes": scopes, "validated": validated}
 
 
 def choose(
@@ -101,52 +94,19 @@ def choose(
 ) -> dict[str, int | float | None]:
     """Spec F1: the member with the highest balanced accuracy on held-out states in rooms of labelled groups.
 
-    Members' order is chance, so of several equally good ones the first is taken; ``tied`` says how many there are.
+    Members' order is chance, so of several equally good ones the first is taken.
     ``validation`` is its balanced accuracy there; ``member`` is None where those rooms lack a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
     scores = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
     if np.isnan(scores).all():
-        return {"member": None, "validation": math.nan, "tied": 0}
-    best = float(np.nanmax(scores))
-    return {"member": int(np.nanargmax(scores)), "validation": best, "tied": int((scores == best).sum())}
+        return {"member": None, "validation": math.nan}
+    return {"member": int(np.nanargmax(scores)), "validation": float(np.nanmax(scores))}
 
 
 def with_validated(scores: NDArray[np.float64], validated: Any) -> dict[str, float]:
     """Best, mean and worst of the members' scores (K,), and that of the member ``validated``; NaN where none is."""
     return {**best_mean_worst(scores), "validated": math.nan if validated is None else float(scores[validated])}
-
-
-def _by_room(
-    verdicts: NDArray[np.bool_], labels: NDArray[np.bool_], rooms: NDArray[np.int64], seen: NDArray[np.int64]
-) -> list[dict[str, Any]]:
-    rows = []
-    for room in np.unique(rooms):
-        here = rooms == room
-        scores = member_scores(verdicts[here], labels[here])
-        counts = {"states": int(here.sum()), "positives": int(labels[here].sum())}
-        told = {score: scores[score].tolist() for score in ("balanced_accuracy", "accuracy", "recall")}
-        rows.append({"room": int(room), "seen": int(seen[here].max()), **counts, **told})
-    return rows
-
-
-def _false_positives(
-    verdicts: NDArray[np.bool_],
-    labels: NDArray[np.bool_],
-    origins: Mapping[str, NDArray[np.int64]],
-    names: Sequence[str],
-) -> list[dict[str, Any]]:
-    if "kind" not in origins:
-        return []
-    rows = []
-    for scope in TABLED:
-        inside = np.isin(origins["seen"], SCOPES[scope]) & ~labels
-        for kind in np.unique(origins["kind"][inside]):
-            these = inside & (origins["kind"] == kind)
-            name = names[kind] if 0 <= kind < len(names) else str(kind)
-            share = verdicts[these].mean(0).tolist()
-            rows.append({"scope": scope, "kind": name, "negatives": int(these.sum()), "share": share})
-    return rows
 
 
 def of_rooms(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
@@ -159,8 +119,7 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
 
     Ensembles have ``method``, ``groups`` and ``sub_goals``, those with ``rooms``. Rows have ``scores``: scope -> score
     -> best, validated, mean, worst (see ``numbers.over``); ``positives`` and ``always_no`` (the accuracy of never
-    saying yes) per scope; ``tied``: mean number of members among which the validation rooms could not tell;
-    disagreement on unlabelled and held-out states.
+    saying yes) per scope; disagreement on unlabelled and held-out states.
     """
     table = []
     cells = grouped(of_rooms(ensembles), lambda of: (of[0]["method"], of[0]["groups"], of[1]["sub_goal"]))
@@ -179,7 +138,6 @@ def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
             }
             for scope in TABLED
         }
-        entry["tied"] = float(np.mean([goal["rooms"]["validated"]["tied"] for goal in goals]))
         for states in STATES:
             shares = [goal["disagreement"][states] for goal in goals]
             entry[f"disagreement_{states}"] = over(shares, SHARE, cell, SHARE, states, deviation=True)
@@ -196,8 +154,7 @@ def look(work: Work, judgement: Judgement) -> None:
     """Members room by room, where held-out states say which rooms training saw."""
     split, judged = judgement.split, judgement.judged
     if "seen" in split.origins:
-        states = (split.labels, split.origins, judgement.kinds)
-        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, *states)
+        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, split.labels, split.origins)
 
 
 def missing(work: Work) -> list[str]:
@@ -245,12 +202,13 @@ def summary(metrics: Metrics) -> list[Table]:
 
 
 def sections(material: Material) -> list[Block]:
-    """What was asked of ladders and what came out; Figure 3."""
-    return [ladders_section(material), rooms_section(material)] if material.of_ladders() else []
+    """What was asked of ladders; Figure 3."""
+    judged = [rooms_section(material)] if material.metrics["rooms"] else []
+    return [ladders_section(material), *judged] if material.of_ladders() else []
 
 
 def ladders_section(material: Material) -> Block:
-    """The question, and the answer in two sentences."""
+    """The question; the answers are in the tables below."""
     metrics = material.metrics
     asked = (
         "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
@@ -259,47 +217,12 @@ def ladders_section(material: Material) -> Block:
     )
     alone = not metrics["agents"]
     identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
-    answer = " ".join(filter(None, [_scored(metrics["rooms"]), _stopped(metrics["distance"]["over_ladders"])]))
-    return page.section(identity, title, [answer, asked], [], metrics["missing"] if alone else [])
-
-
-def _scored(rows: Sequence[Entry]) -> str:
-    few = [entry for entry in rows if entry["groups"] == min((row["groups"] or 0 for row in rows), default=0)]
-    parts = []
-    for entry in few:
-        found = entry["scores"]["unseen"]["balanced_accuracy"]
-        if found["best"]["mean"] is not None:
-            best, validated = (page.fixed(found[which]["mean"], 2) for which in ("best", "validated"))
-            parts.append(f"{entry['method']}: {best} (validated {validated})")
-    if not parts:
-        return ""
-    return (
-        f"With the fewest labels (N={few[0]['groups']}), balanced accuracy of the best member on rooms that training "
-        f"never saw: {'; '.join(parts)}; 0.5 is chance."
-    )
-
-
-def _stopped(rows: Sequence[Entry]) -> str:
-    there = [entry for entry in rows if entry["best"]["mean"] is not None]
-    learned = [entry for entry in there if not entry["method"].startswith(ORACLE)]
-    if not learned:
-        return ""
-    near = min(learned, key=lambda entry: entry["best"]["mean"])
-    oracle = next((entry for entry in there if entry["method"].startswith(ORACLE)), None)
-    beside = f"; options that end at the true sub-goal: {page.fixed(oracle['best']['mean'], 0)}" if oracle else ""
-    return (
-        f"The best member's options stop {page.fixed(near['best']['mean'], 0)} units of position from a true base at "
-        f"best, the mean member's {page.fixed(near['mean']['mean'], 0)} ({near['method']}, N={near['groups']}), mean "
-        f"over {len(near['ladders'])} ladders{beside}."
-    )
+    return page.section(identity, title, [asked], [], metrics["missing"] if alone else [])
 
 
 def rooms_section(material: Material) -> Block:
     """Figure 3 and its table; what else is known of members and rooms is in ``metrics.json``."""
     title = "Hypotheses against labelled ladders"
-    if not material.metrics["rooms"]:
-        lacking = ["Figure 3: it needs ensemble artefacts of data whose held-out states say which rooms training saw."]
-        return page.section("rooms", title, [], [], lacking)
     text = (
         "N is the number of ladder groups with labels. Members are judged on held-out states of rooms that no training "
         "state came from (unseen), and of all rooms, training rooms included, as in the paper. The best member is "

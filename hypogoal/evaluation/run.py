@@ -30,7 +30,10 @@ MOST = 2**53  # integers that a float holds
 MOST_OPTIONS = 2**16
 MAX_TABLE_BYTES = 2**30
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty, NaN
-PARTS = ("agents", "ensembles", "hypotheses", "rooms", "distance", "saliency", "selection", "settings", "provenance")
+PARTS = (  # of ``metrics.json``
+    *("agents", "layouts", "rooms", "distance", "exploits", "hypotheses", "ranking", "explorer", "saliency"),
+    *("selection", "choosing", "ensembles", "settings", "missing", "provenance", "quantities", "comparisons"),
+)
 Table = TypeVar("Table")
 
 
@@ -137,10 +140,6 @@ class Choices(Columns):
     expected: NDArray[np.float64]
     reached: NDArray[np.int64]
     duration: NDArray[np.int64]
-
-    def since(self, step: float) -> Choices:
-        """The windows that end after ``step``."""
-        return self.at(self.step > step)
 
     def total(self, name: str, options: int) -> NDArray[np.float64]:
         """The sum of column ``name`` over all windows, (O,)."""
@@ -273,7 +272,7 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     source = next((artefact for artefact in found if artefact.path == run / "evaluation"), found[0])
     source.whole()
     metrics = _metrics(source.path / "metrics.json")
-    metrics["missing"] = [*metrics.get("missing", ()), *_since(run, source)]
+    metrics["missing"] = [*metrics["missing"], *_since(run, source)]
     with open_hdf5(source.path / "arrays.h5", "the evaluation's arrays", AGAIN) as file:
         arrays = {name: read_array(file, name, "uibfS") for name in walk(file) if name.startswith(start)}
     return Evaluated(source, metrics, arrays)

@@ -17,7 +17,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
-from hypogoal.evaluation.curves import BANDITS, LEARNED, PRETRAINING, RANDOM, base_name, variants, which
+from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, THOMPSON, base_name, variants, which
 from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
@@ -29,10 +29,8 @@ from hypogoal.meta.config import layout_seeds
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
 
-LATE = 0.25  # the last part of training that is looked at by itself
 LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
-PARTS = 20  # of training, in which choices are counted apart
-SELECTED = (LEARNED, *BANDITS.values(), RANDOM, PRETRAINING)  # agents whose options are members: to select among
+SELECTED = (LEARNED, THOMPSON, RANDOM, PRETRAINING)  # agents whose options are members: to select among
 NUMBERED = {"open-red-door": "figure7", "go-to-goal": "figure8"}  # the sub-goals that the paper shows
 MOST = ("most", "least")  # preferred
 SCOPE = "layout"  # in numbers.csv: of choices, and of the match with the truth, on a run's layout
@@ -50,41 +48,20 @@ def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[n
     return np.where(expected > 0, chosen / safe, np.nan)
 
 
-def over_training(choices: Choices, options: int, parts: int = PARTS) -> dict[str, NDArray[np.float64]]:
-    """Spec E5, F6: choices counted in equal parts of training, in the order of time, each in the part in which it ends.
-
-    ``step``, where each part ends (P,), and ``chosen`` and ``expected``, (P, O) each; P is ``parts``, or as many as
-    there are choices where those are fewer.
-    """
-    windows = np.unique(choices.step)
-    parts = min(parts, len(windows))
-    ends = np.array([part[-1] for part in np.array_split(windows, parts)]) if parts else np.zeros(0)
-    part = np.searchsorted(ends, choices.step)
-    found = {"step": ends.astype(np.float64)}
-    for name in ("chosen", "expected"):
-        counts = np.bincount(part * options + choices.option, getattr(choices, name), minlength=parts * options)
-        found[name] = counts.reshape(parts, options).astype(np.float64)
-    return found
-
-
 def selection_of_run(
     choices: Choices, match: NDArray[np.float64], sub_goals: Sequence[str], members: int
 ) -> list[dict[str, Any]]:
     """Spec F6: how often each of K members of G sub-goals was offered and chosen, beside its ``match``, float (G*K,).
 
     A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option, offered,
-    chosen, reached, expected, mean duration in steps, match, preference and late_preference (the last quarter of
-    training). NaN where not defined.
+    chosen, reached, expected, mean duration in steps, match and preference. NaN where not defined.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
-    begin, end = (choices.step.min(), choices.step.max()) if len(choices.step) else (0, 0)
-    late = choices.since(end - LATE * (end - begin))
     duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
     counts = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")}
     columns = {**counts, "expected": totals["expected"], "duration": duration, "match": match}
     columns["preference"] = preference(totals["chosen"], totals["expected"])
-    columns["late_preference"] = preference(late.total("chosen", options), late.total("expected", options))
     by_goal = []
     for index, sub_goal in enumerate(sub_goals):
         start = index * members
@@ -119,8 +96,6 @@ def numbers(work: Work) -> dict[str, Any]:
                 place = f"terminations/{about['path']}/{option}"
                 work.arrays[place] = overlay(states)
                 work.arrays[place].attrs["states"] = len(states)
-            for column, counts in over_training(choices, len(config["sub_goals"]) * config["members"]).items():
-                work.arrays[f"choices/{about['path']}/{column}"] = counts
             of = {name: about[name] for name in ("path", "seed", "layout_seed")}
             chosen = selection_of_run(choices, match, config["sub_goals"], config["members"])
             rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})
@@ -192,7 +167,6 @@ MEMBERS = (
     page.number("chosen", "chosen"),
     page.number("expected", "expected", page.fixed, 0),
     page.number("preference", "preference", page.fixed, 2),
-    page.number("late", "late_preference", page.fixed, 2),
     page.number("steps", "duration", page.fixed, 1),
     page.number("match", "match", page.fixed, 2),
 )
@@ -200,16 +174,13 @@ MEMBERS = (
 
 def sections(material: Material) -> list[Block]:
     """Which options are chosen and where they stop, of a run with agents."""
-    return [choices_section(material)] if material.of_agents() else []
+    agent = _agent(material)
+    return [choices_section(material, agent)] if agent else []
 
 
 def _agent(material: Material) -> Entry | None:
     """The variant of the option agent that is shown."""
     return next(iter(variants(material.metrics["selection"])), None)
-
-
-def _name(run: Entry) -> str:
-    return f"layout seed {run['layout_seed']}, run seed {run['seed']}"
 
 
 def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, str, NDArray[np.uint8] | None]:
@@ -220,12 +191,8 @@ def _side(material: Material, path: str, goal: Entry, word: str) -> tuple[str, s
     return f"{word} preferred: member {goal[word]}", note, image
 
 
-def choices_section(material: Material) -> Block:
+def choices_section(material: Material, agent: Entry) -> Block:
     """Of the first run how often each member was chosen, over what a uniform choice would have; Figures 7 and 8."""
-    agent, title = _agent(material), "Which hypotheses are chosen, and where they stop"
-    if agent is None:
-        lacking = ["Choices and termination states: they need a meta artefact with learned terminations: train-meta."]
-        return page.section("choices", title, [], [], lacking, folded=True)
     run = agent["runs"][0]
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
@@ -244,16 +211,15 @@ def choices_section(material: Material) -> Block:
         words = {goal[word]: f" ({word})" for word in reversed(MOST)}
         for index, member in enumerate(goal["members"]):
             lines.append({**member, "sub_goal": goal["sub_goal"], "name": f"{index}{words.get(index, '')}"})
-    members = page.table(
-        MEMBERS,
-        lines,
-        caption=f"{run['path']}, {_name(run)}: decisions at which the option was offered and chosen; expected under "
-        "uniform choice; preference over all and over the last quarter of training; mean steps of an execution; match.",
+    caption = (
+        f"{run['path']}, layout seed {run['layout_seed']}, run seed {run['seed']}: decisions at which the option was "
+        "offered and chosen; expected under uniform choice; preference; mean steps of an execution; match."
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]  # none of numbers
-    rows = [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
+    blocks = [page.table(MEMBERS, lines, caption=caption)]
+    blocks += [{"kind": "row", "blocks": drawn, "caption": stops}] if drawn else []
     texts = [text, which(agent, material.metrics["selection"])]
-    return page.section("choices", title, texts, [members, *rows], folded=True)
+    return page.section("choices", "Which hypotheses are chosen, and where they stop", texts, blocks, folded=True)
 
 
 def figures(material: Material) -> Iterator[Drawn]:
@@ -261,6 +227,7 @@ def figures(material: Material) -> Iterator[Drawn]:
     agent, selection = _agent(material), material.metrics["selection"]
     run = agent["runs"][0] if agent and not material.of_numbers() else {"sub_goals": []}
     for goal in run["sub_goals"]:
+        where = f"layout seed {run['layout_seed']}, run seed {run['seed']}"
         sides = [_side(material, run["path"], goal, word) for word in MOST if goal[word] is not None]
         if not sides:
             continue
@@ -268,7 +235,7 @@ def figures(material: Material) -> Iterator[Drawn]:
         title = name.replace("figure", "Figure ") if name in NUMBERED.values() else "As Figures 7 and 8"
         caption = (
             f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
-            f"prefers most and of the one it prefers least ({run['path']}, {_name(run)}); the last states, 128 at "
+            f"prefers most and of the one it prefers least ({run['path']}, {where}); the last states, 128 at "
             "most, in which the member's classifier ended its option. Preference: chosen / expected under uniform "
             f"choice; match: balanced accuracy on that layout. {which(agent, selection) if agent else ''}"
         ).rstrip()

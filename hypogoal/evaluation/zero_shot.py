@@ -42,13 +42,12 @@ Played = dict[str, NDArray[np.float64]]  # a number of each layout (L,)
 
 def shortest_ways(engine: Engine) -> NDArray[np.float64]:
     """Steps from each environment's state to each true sub-goal and, last, to success: (E, G + 1); NaN if not known."""
-    from hypogoal.options.planned import FAR, distances  # with PyTorch, which a report needs not
+    from hypogoal.options.planned import FAR, distances, places_of  # with PyTorch, which a report needs not
 
     plan, labels = engine.plan(), engine.labels(engine.ids)
     if plan is None:
         return np.full((engine.count, labels.shape[1] + 1), np.nan)
-    place = np.full(engine.n_states, -1, dtype=np.int64)
-    place[plan.ids] = np.arange(len(plan.ids))
+    place = places_of(plan, engine)
     holds = np.column_stack([engine.labels(plan.ids), plan.solved])
     steps = distances(holds, place[plan.following], plan.final)[place[engine.ids]]
     return np.where(steps < FAR, steps, np.nan)

@@ -102,7 +102,7 @@ def _ratio(numerator: NDArray[np.int64], denominator: NDArray[np.int64]) -> NDAr
 
 def by_member(scores: Scores) -> list[dict[str, float]]:
     """Arrays (K,) of scores as K rows of numbers."""
-    return [{name: float(values[member]) for name, values in scores.items()} for member in range(len(scores["recall"]))]
+    return [dict(zip(scores, row, strict=True)) for row in zip(*(of.tolist() for of in scores.values()), strict=True)]
 
 
 def best_mean_worst(scores: NDArray[np.float64]) -> dict[str, float]:
@@ -121,17 +121,13 @@ def most_and_least(values: NDArray[np.float64]) -> tuple[int | None, int | None]
     return int(defined[values[defined].argmax()]), int(defined[values[defined].argmin()])
 
 
-def pairwise_disagreement(verdicts: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Spec F2: of verdicts (N, K) the share of states on which members i and j differ, (K, K); NaN without states."""
-    states, members = verdicts.shape
-    if states == 0:
-        return np.full((members, members), np.nan)
-    differ = verdicts[:, :, None] != verdicts[:, None, :]
-    return differ.mean(axis=0)
-
-
 def mean_disagreement(verdicts: NDArray[np.bool_]) -> float:
-    """Spec F2: the mean over all pairs of different members; NaN for a single member or without states."""
-    rates = pairwise_disagreement(verdicts)
-    pairs = rates[np.triu_indices(len(rates), k=1)]
-    return float(pairs.mean()) if len(pairs) else math.nan
+    """Spec F2: of verdicts (N, K) the share of states on which two members differ, mean over all pairs of members.
+
+    NaN for a single member or without states.
+    """
+    states, members = verdicts.shape
+    if states == 0 or members == 1:
+        return math.nan
+    rates = (verdicts[:, :, None] != verdicts[:, None, :]).mean(axis=0)
+    return float(rates[np.triu_indices(members, k=1)].mean())

@@ -1,12 +1,14 @@
-"""Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies and exploration schedules."""
+"""Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies, exploration schedules, and steps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
+
+from hypogoal.core.errors import NumericalError
 
 
 def double_q_targets(
@@ -57,9 +59,31 @@ def follow_tensors(ours: Sequence[Tensor], theirs: Sequence[Tensor], tau: float)
             a.copy_(b)
 
 
-def gradient_norm(network: nn.Module) -> float:
-    """The norm of all of a network's gradients together: NaN or Inf where one of them is (Spec G3)."""
-    return float(get_total_norm([weight.grad for weight in network.parameters() if weight.grad is not None]))
+def descend(
+    loss: Tensor, backward: Callable[[Tensor], Tensor], optimiser: torch.optim.Optimizer, whose: str, where: str
+) -> None:
+    """Spec G3: a step of ``optimiser`` down a loss; ``backward`` fills the gradients and returns their norm, ().
+
+    Where the loss or a gradient is NaN or Inf it is a ``NumericalError`` that says ``whose`` and ``where``, and the
+    weights stay as they are.
+    """
+    if not torch.isfinite(loss):
+        raise NumericalError(f"the loss of {whose} is {float(loss.detach())} {where}")
+    norm = backward(loss)
+    if not torch.isfinite(norm):
+        raise NumericalError(f"a gradient of {whose} is {float(norm)} {where}")
+    optimiser.step()
+
+
+def backward_of(network: nn.Module) -> Callable[[Tensor], Tensor]:
+    """For :func:`descend`, of a network whose gradients are taken as they are."""
+
+    def backward(loss: Tensor) -> Tensor:
+        network.zero_grad(set_to_none=True)
+        loss.backward()
+        return get_total_norm([weight.grad for weight in network.parameters() if weight.grad is not None])
+
+    return backward
 
 
 def linear_epsilon(steps: NDArray[np.int64], over: int, final: float) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import Observations
@@ -66,7 +67,9 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
             raise UserError(ONE_LAYOUT, domain.name, "Evaluate without --layouts.")
         settings |= {"layouts": "", "cap": 0.0}
         others = Layouts(layouts)
-    loop = assemble(domain, source.path, source.config, TrainMetaConfig(**settings), seed, layouts=others)
+    loop = assemble(
+        domain, source.path, source.config, from_values(TrainMetaConfig, settings, "train-meta"), seed, layouts=others
+    )
     learned = load_tensors(artefact.path / "options.safetensors")
     loop.learner.load(learned)
     loop.terminations.load(learned)

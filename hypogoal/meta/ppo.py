@@ -1,6 +1,7 @@
 """The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,14 @@ from torch import Tensor, nn
 
 from hypogoal.core.checkpoints import State
 from hypogoal.core.compute import tensor
-from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
 from hypogoal.domains.base import Engine
+from hypogoal.learners.double_dqn import descend
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
-from hypogoal.options.choosers import Chooser, Outcome
+from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
@@ -50,9 +51,7 @@ class MetaPolicy(Chooser):
         self._finished: list[Decisions] = []  # as they ended
         self.updates = 0
 
-    def choose(
-        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-    ) -> NDArray[np.int64]:
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         with torch.no_grad():
             scores = self._outputs(ids)[:, :-1].cpu()
             mask = torch.from_numpy(offered)
@@ -121,18 +120,13 @@ class MetaPolicy(Chooser):
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)
                 loss = loss + config.value_weight * (out[:, -1] - goal[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
-                self._step(loss, f"update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}")
+                self._step(loss, f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}")
                 entropy_seen = float(entropy.mean().detach())
         self.updates += 1
         return {"entropy": entropy_seen, "value": float(values.mean())}
 
     def _step(self, loss: Tensor, where: str) -> None:
-        if not torch.isfinite(loss):
-            raise NumericalError(f"the meta-policy's loss is {float(loss.detach())} in {where}")
-        norm = self._flat.backward(loss, GRADIENT_NORM)
-        if not torch.isfinite(norm):
-            raise NumericalError(f"a gradient of the meta-policy is {float(norm)} in {where}")
-        self.optimiser.step()
+        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, "the meta-policy", where)
 
     def state(self) -> dict[str, Tensor]:
         return {name: value.contiguous() for name, value in self.policy.state_dict().items()}

@@ -22,7 +22,6 @@ from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
 from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import STACK
 from hypogoal.options.initiation import Initiation
@@ -33,6 +32,7 @@ from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
+from hypogoal.options.thompson import ThompsonChooser
 from hypogoal.options.visited import Visited
 from hypogoal.options.windows import AgentWindows, localiser_of
 
@@ -68,8 +68,8 @@ def assemble(
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
     cut(engine, config.cap)
     if engine.observation_dtype != PICTURE:
-        for name in ("network", "meta_network"):
-            if getattr(config, name, "") == "paper":
+        for name in config.NETWORKS:
+            if getattr(config, name) == "paper":
                 raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
         view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
         engine.standard = view.standard if view else standard_of(engine.observation_shape)
@@ -84,7 +84,9 @@ def assemble(
         many = engine.layouts is not None and engine.layouts.many
         if not many and (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
-    _check_rule(terminations, config)
+    if config.network == "planned" and type(terminations) is not Terminations:
+        given = f"termination={config.termination}"
+        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
     seen = None
     if config.policy_view == "agent-crop":
         if config.network != "light":
@@ -97,8 +99,8 @@ def assemble(
         gamma = config.gamma
         if config.chooser == "ppo":
             chooser = MetaPolicy(engine, options, config, seed, device)
-        elif config.chooser in BANDITS:
-            chooser = BANDITS[config.chooser](options, engine.count, rng)
+        elif config.chooser == "thompson":
+            chooser = ThompsonChooser(options, engine.count, rng)
     loop = OptionLoop(
         engine,
         terminations,
@@ -153,16 +155,6 @@ def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence
             known = ", ".join(domain.engine_settings) or "none"
             raise UserError(f"{domain.name} has no such setting of its world", f"world={name}", f"It has {known}.")
     return {**collected, **domain.world(changed)}
-
-
-def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
-    """Whether the options can be learned that end so."""
-    given = f"termination={config.termination}"
-    if not terminations.SHARED and config.experience != "own":
-        what = "whether an execution has reached its sub-goal cannot be said of states that others visit"
-        raise UserError(what, f"{given}, experience={config.experience}", "Give --set experience=own.")
-    if config.network == "planned" and type(terminations) is not Terminations:
-        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
 
 
 def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:

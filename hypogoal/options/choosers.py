@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+Ids = NDArray[np.int64]  # (n,), of environments, states or options
+Offered = NDArray[np.bool_]  # (n, O), the options that may be chosen
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Finished option executions, arrays of length n."""
@@ -39,9 +43,7 @@ class Chooser(Resumable, ABC):
     """A policy over options."""
 
     @abstractmethod
-    def choose(
-        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-    ) -> NDArray[np.int64]:
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         """For each of n environments in states ``ids`` one of the options offered, bool (n, O): int64 (n,)."""
 
     def record(self, outcome: Outcome) -> None:
@@ -67,9 +69,7 @@ class RandomChooser(Chooser):
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
 
-    def choose(
-        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-    ) -> NDArray[np.int64]:
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
 
 
@@ -86,9 +86,7 @@ class EvenChooser(RandomChooser):
         super().__init__(rng)
         self.steps = np.zeros(options, dtype=np.int64)
 
-    def choose(
-        self, environments: NDArray[np.int64], ids: NDArray[np.int64], offered: NDArray[np.bool_]
-    ) -> NDArray[np.int64]:
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         """For each environment in turn, int64 (n,); an option that runs counts as one step more."""
         chosen = np.empty(len(environments), dtype=np.int64)
         for row in range(len(environments)):

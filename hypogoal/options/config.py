@@ -67,14 +67,6 @@ class OptionConfig:
         low=1,
         high=1_000,
     )
-    shaping: float = setting(
-        0.0,
-        "weight of how near a member is to a yes, as a potential: a reward for coming nearer that leaves the best "
-        "policy as it is (light, experience=own)",
-        source="Ng et al. 1999, in the form of Wiewiora 2003",
-        low=0.0,
-        high=1.0,
-    )
     policy_view: str = setting(
         "full",
         "what the policies see: full, the whole observation; agent-crop, the window around the agent, whom the "

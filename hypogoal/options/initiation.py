@@ -5,7 +5,6 @@ initiation classifiers of skill chaining (Konidaris and Barto 2009); here it is 
 all together.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -16,12 +15,11 @@ from torch import Tensor
 
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
-from hypogoal.core.errors import NumericalError
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import gradient_norm
+from hypogoal.learners.double_dqn import backward_of, descend
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import LightQNetwork, apply_to_states, standard_in
 
@@ -130,15 +128,8 @@ class Initiation(Resumable):
         of_option = logits.gather(1, tensor(self.option[drawn], self.device)[:, None])[:, 0]
         reached = tensor(self.reached[drawn], self.device).float()
         loss = torch.nn.functional.binary_cross_entropy_with_logits(of_option, reached)
-        where = f"of the initiation sets is {{}} after {self.count} executions"
-        if not torch.isfinite(loss):
-            raise NumericalError("the loss " + where.format(float(loss.detach())))
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = gradient_norm(self.network)
-        if not math.isfinite(norm):
-            raise NumericalError("a gradient " + where.format(norm))
-        self.optimiser.step()
+        where = f"after {self.count} executions"
+        descend(loss, backward_of(self.network), self.optimiser, "the initiation sets", where)
         return {"initiation_loss": float(loss.detach())}
 
     def state(self) -> dict[str, Tensor]:

@@ -17,6 +17,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import linear_epsilon
+from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
@@ -93,7 +94,7 @@ class Learner(Resumable, ABC):
         """How many states back the learner looks."""
 
     @abstractmethod
-    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
         """Which of its actions each option's policy prefers, int64 (E,); arguments as of :meth:`act`."""
 
     @abstractmethod
@@ -117,9 +118,7 @@ class Learner(Resumable, ABC):
         steps = self.steps_since_positive if self.config.epsilon_from == "first-positive" else self.option_steps
         return linear_epsilon(steps, self.config.epsilon_steps, self.config.epsilon_final)
 
-    def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
-    ) -> NDArray[np.int64]:
+    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
         """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
         chosen = self.greedy(ids, options, age)
         if explore:

@@ -8,6 +8,7 @@ only its verdicts are asked for; then a transition may reach several steps ahead
 
 import copy
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
-from hypogoal.learners.double_dqn import double_q_targets, follow_tensors
+from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tensors
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, StepsAhead
+from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
@@ -28,7 +30,7 @@ from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, a
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
 FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
+    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_,
     "steps": np.int16,  # from s to next
     "option": np.int16,
 }  # fmt: skip
@@ -50,10 +52,6 @@ class LightLearner(Learner):
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
-        if config.shaping and not self.running_only:
-            what = "only the running option's member says how near it is to a yes"
-            given = f"shaping={config.shaping:g}, experience={config.experience}"
-            raise UserError(what, given, "Give --set experience=own or --set shaping=0.")
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
@@ -76,12 +74,12 @@ class LightLearner(Learner):
         return config.replay + (2 * config.n_step + STACK) * config.environments
 
     @torch.no_grad()
-    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
         values = apply_to_states(self.online, self.pictures, ids).cpu().numpy()
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        last = {"option": moved.options, "end": moved.terminated, "timeout": moved.timed_out, "reached": moved.reached}
+        last = {"option": moved.options, "end": moved.terminated, "timeout": moved.timed_out}
         rows = self.ahead.add(moved.ids, self._index[moved.actions], moved.next_ids, moved.ended, **last)
         self.replay.add(**rows)
         here, reached = self._judged(rows)
@@ -104,7 +102,7 @@ class LightLearner(Learner):
             return self.terminations.of(s), self.terminations.of(following)
         option = rows["option"].astype(np.int64)
         owner = option[:, None] == np.arange(self.options)
-        here, reached = self.terminations.judged(option, s, following, rows["reached"])
+        here, reached = (self.terminations.of_running(ids, option) for ids in (s, following))
         return owner & here[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
@@ -150,14 +148,6 @@ class LightLearner(Learner):
         ahead = self.tensor(batch["steps"]).float()[:, None]
 
         values, next_online, next_target = self._values(s, following)
-        if self.config.shaping:
-            # A potential for a reward is the same as learning what is left of the values above it (Wiewiora 2003).
-            option = batch["option"].astype(np.int64)
-            near, next_near = (
-                self.config.shaping * self.tensor(self.terminations.nearness(ids, option))[:, None, None]
-                for ids in (s, following)
-            )
-            values, next_online, next_target = values + near, next_online + next_near, next_target + next_near
         with torch.no_grad():
             goal = double_q_targets(
                 self.tensor(reached) * self.config.option_gamma ** (ahead - 1),
@@ -192,14 +182,10 @@ class LightLearner(Learner):
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
         """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""
+        finite = bool(torch.isfinite(loss))
+        whose = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
         where = f"in the batch of update {self.updates}, step {self.steps}"
-        if not torch.isfinite(loss):
-            options = (~errors.isfinite()).any(0).nonzero().flatten().tolist()
-            raise NumericalError(f"the option loss is {float(loss.detach())}, from option {options}, {where}")
-        norm = self._flat.backward(loss, GRADIENT_NORM)
-        if not torch.isfinite(norm):
-            raise NumericalError(f"a gradient of the options is {float(norm)} {where}")
-        self.optimiser.step()
+        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, whose, where)
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
             follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine, Plan
+from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 
@@ -35,8 +37,7 @@ class PlannedLearner(Learner):
             what = "nobody knows what follows on each action in this domain"
             raise UserError(what, "network=planned", "Give --set network=light.")
         self.actions = plan.actions
-        self._place = np.full(self.engine.n_states, -1, np.int64)
-        self._place[plan.ids] = np.arange(len(plan.ids))
+        self._place = places_of(plan, self.engine)
         self._after = self._place[plan.following]
         self.steps = distances(self.terminations.of(plan.ids), self._after, plan.final)
 
@@ -44,14 +45,12 @@ class PlannedLearner(Learner):
     def reach(config: OptionConfig, options: int) -> int:
         return 0
 
-    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
         ahead = self.steps[self._after[self._place[ids]], options[:, None]]
         nearest: NDArray[np.int64] = ahead.argmin(axis=1)
         return nearest
 
-    def act(
-        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
-    ) -> NDArray[np.int64]:
+    def act(self, ids: Ids, options: Ids, age: Ids, *, explore: bool = True) -> Ids:
         """There is nothing to explore."""
         return self.actions[self.greedy(ids, options, age)]
 
@@ -69,6 +68,13 @@ class PlannedLearner(Learner):
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         """There are none."""
+
+
+def places_of(plan: Plan, engine: Engine) -> NDArray[np.int64]:
+    """Where in a plan each of the engine's states is, int64 (n_states,); -1 of those that are not in it."""
+    places = np.full(engine.n_states, -1, np.int64)
+    places[plan.ids] = np.arange(len(plan.ids))
+    return places
 
 
 def distances(reached: NDArray[np.bool_], after: NDArray[np.int64], final: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -5,27 +5,26 @@ learning samples a step and replays the option's execution up to it. Every membe
 """
 
 import copy
-import math
 from collections.abc import Mapping
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
 from hypogoal.domains.base import Engine
-from hypogoal.learners.double_dqn import double_q_targets, follow, gradient_norm
+from hypogoal.learners.double_dqn import backward_of, descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
+from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import PaperQNetwork
 
 FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
+    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_,
     "place": np.int16,  # steps since the option began
     "execution": np.int32,
 }  # fmt: skip
@@ -79,7 +78,7 @@ class RecurrentLearner(Learner):
         return options * config.replay + (config.option_timeout + STACK) * config.environments
 
     @torch.no_grad()
-    def greedy(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.int64]:
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
         """As of :class:`Learner`; moves each environment's hidden state one step on (BatchNorm in eval mode)."""
         chosen = np.empty(len(ids), dtype=np.int64)
         self.hidden[self.tensor(age == 0)] = 0.0
@@ -107,7 +106,7 @@ class RecurrentLearner(Learner):
         member = self.members[option]
         s, a, following, end, timeout, reached = (np.array(column) for column in zip(*steps, strict=True))
         member.replay.add(
-            s=s, a=a, next=following, end=end, timeout=timeout, reached=reached,
+            s=s, a=a, next=following, end=end, timeout=timeout,
             place=np.arange(len(s)), execution=np.full(len(s), member.executions),
         )  # fmt: skip
         member.executions += 1
@@ -157,7 +156,7 @@ class RecurrentLearner(Learner):
         pick = torch.arange(len(indices), device=self.device)
         of = np.full(len(indices), option)
         following = data["next"][indices].astype(np.int64)
-        reached = self.terminations.judged(of, states[rows, place], following, data["reached"][indices])[1]
+        reached = self.terminations.of_running(following, of)
         terminal = reached | data["end"][indices]
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]
@@ -174,14 +173,7 @@ class RecurrentLearner(Learner):
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber * self.tensor(weights)).mean()
         where = f"in the batch of its update {member.updates}, its step {self.option_steps[option]}"
-        if not torch.isfinite(loss):
-            raise NumericalError(f"the loss of option {option} is {float(loss.detach())} {where}")
-        member.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = gradient_norm(member.online)
-        if not math.isfinite(norm):
-            raise NumericalError(f"a gradient of option {option} is {norm} {where}")
-        member.optimiser.step()
+        descend(loss, backward_of(member.online), member.optimiser, f"option {option}", where)
         member.updates += 1
         if member.updates % config.target_interval == 0:
             follow(member.target, member.online, config.target_tau)

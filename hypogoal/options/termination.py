@@ -23,7 +23,6 @@ from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
-FAR = 20.0  # log-odds
 MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
 
 
@@ -41,7 +40,6 @@ class Terminations(Resumable):
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
-    SHARED = True  # whether it is enough to judge a state, so that options can learn from what others visit
 
     def __init__(
         self,
@@ -89,12 +87,6 @@ class Terminations(Resumable):
             self._log_odds[fresh, first : first + self.together] = judged
         return self._log_odds[ids, options]
 
-    def nearness(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.float32]:
-        """How near the options that run are to a yes, float32 (n,): 1 at the threshold, 0 from ``FAR`` below it on."""
-        below = self.log_odds(ids, options) - self.thresholds[options]
-        near: NDArray[np.float32] = np.clip(1 + below / np.float32(FAR), 0, 1)
-        return near
-
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether executions reach their sub-goals in the states they come to: bool (E,), asked once a step.
 
@@ -104,19 +96,6 @@ class Terminations(Resumable):
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
         """Executions (n,) that ended, and which of them reached their sub-goals."""
-
-    def judged(
-        self,
-        options: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        reached: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of transitions (n,) of the past, as of today: whether they begin and end in their option's sub-goal.
-
-        ``reached`` says whether its execution reached it then.
-        """
-        return self.of_running(ids, options), self.of_running(next_ids, options)
 
     def state(self) -> dict[str, torch.Tensor]:
         """What an artefact keeps."""
@@ -180,41 +159,15 @@ class Patience(Terminations):
         self._highest[due] = -np.inf
 
 
-class Dwell(Terminations):
-    """An execution ends where its sub-goal has held in so many states on end, ``length`` of them."""
-
-    CHANGING = (*Terminations.CHANGING, "_held")
-    SHARED = False
-
-    def __init__(self, *arguments: Any, **more: Any):
-        super().__init__(*arguments, **more)
-        self._held = np.zeros(self.environments, dtype=np.int64)
-
-    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        self._held = np.where(self.of_running(ids, options), np.where(age == 0, 0, self._held) + 1, 0)
-        long: NDArray[np.bool_] = self._held >= self.length
-        return long
-
-    def judged(
-        self,
-        options: NDArray[np.int64],
-        ids: NDArray[np.int64],
-        next_ids: NDArray[np.int64],
-        reached: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """As of :class:`Terminations`; a state alone says nothing."""
-        return np.zeros_like(reached), reached
-
-
-RULES: dict[str, type[Terminations]] = {"learned": Terminations, "patience": Patience, "dwell": Dwell}
+RULES: dict[str, type[Terminations]] = {"learned": Terminations, "patience": Patience}
 
 
 def rule_of(termination: str) -> tuple[type[Terminations], int]:
-    """The rule and its number of ``learned``, ``patience:10000``, ``dwell:3``; a ``UserError`` where it is none."""
+    """The rule and its number of ``learned``, ``patience:10000``; a ``UserError`` where it is none."""
     name, colon, number = termination.partition(":")
     known = name in RULES and (number.isdecimal() and int(number) > 0 if name != "learned" else not colon)
     if not known:
-        do = "Give learned, patience:STEPS, dwell:STEPS or oracle."
+        do = "Give learned, patience:STEPS or oracle."
         raise UserError("unknown termination", f"termination={termination}", do)
     return RULES[name], int(number or 0)
 

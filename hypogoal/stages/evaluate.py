@@ -13,7 +13,7 @@ from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.preflight import free_memory, preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import cores
-from hypogoal.evaluation.curves import GAMMA, SOLVED
+from hypogoal.evaluation.curves import SOLVED
 from hypogoal.evaluation.distance import INSIDE, NEAR
 from hypogoal.evaluation.judging import Case, Work, cases_of, judgements, processes_for
 from hypogoal.evaluation.numbers import Row, ensemble_names, groups_of, method_names, plain
@@ -27,7 +27,7 @@ from hypogoal.hypotheses.ensemble import THRESHOLD
 from hypogoal.meta.config import layout_seeds
 from hypogoal.needs import evaluation_needs
 
-SETTINGS = {"window": WINDOW, "solved": SOLVED, "gamma": GAMMA, "threshold": THRESHOLD}
+SETTINGS = {"window": WINDOW, "solved": SOLVED, "threshold": THRESHOLD}
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
 
 

@@ -20,7 +20,7 @@ from hypogoal.core.preflight import preflight
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
-from hypogoal.dataset import Dataset, Observations, Split, open_dataset
+from hypogoal.dataset import Dataset, Observations, States, open_dataset
 from hypogoal.diversity import load_objective
 from hypogoal.domains.base import installed_domain
 from hypogoal.hypotheses.config import TrainEnsembleConfig
@@ -128,7 +128,7 @@ def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, ND
 
 
 def score_rows(
-    ensemble: Ensemble, split: Split, unlabelled: Observations, positions: NDArray[np.int64] | None
+    ensemble: Ensemble, split: States, unlabelled: Observations, positions: NDArray[np.int64] | None
 ) -> Iterator[dict[str, Any]]:
     """What members know of the held-out states, one row a member and scope.
 

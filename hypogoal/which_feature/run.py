@@ -31,7 +31,6 @@ DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other one
     "batch_size": 32,
 }
 LABELLED, UNLABELLED = 256, 512  # states
-SHOWN = 4  # test states of each kind that a member is surest of
 COLUMNS = ("entry", "mix", "seed", "member", "factor", "ranking", "balanced_accuracy", "at_best", "labels")
 AGAIN = "Remove it and give the same command again, or choose another --out."
 
@@ -72,8 +71,6 @@ class Cell:
     balanced_accuracy: NDArray[np.float64]  # (K, F), at 0.5
     at_best: NDArray[np.float64]  # (K, F), at the best threshold
     labels: NDArray[np.int64]  # (F,), see ``scores.labels_needed``
-    # (K, 2, 4), the test states with the highest and with the lowest probability; empty where unknown.
-    surest: NDArray[np.int64]
 
 
 def copies(factors: Sequence[str]) -> int:
@@ -123,9 +120,7 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
     ranked = rankings(probabilities, test.factors)
     at_half, at_best = balanced_accuracies(probabilities, test.factors)
     labels = labels_needed(probabilities, test.factors, ranked, rng_for(seed, "which-feature", "labels"))
-    order = probabilities.argsort(axis=0, kind="stable").T
-    surest = np.stack([order[:, : -SHOWN - 1 : -1], order[:, :SHOWN]], axis=1)
-    return Cell(entry.name, mix, seed, ranked, at_half, at_best, labels, surest)
+    return Cell(entry.name, mix, seed, ranked, at_half, at_best, labels)
 
 
 def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: States) -> NDArray[np.float32]:
@@ -205,14 +200,14 @@ def _read(path: Path, factors: Sequence[str]) -> Cell:
     data = read_json(path, "the cell is", AGAIN)
     try:
         ranked, at_half, at_best = (np.array(data[name], dtype=np.float64) for name in COLUMNS[5:8])
-        labels, surest = (np.array(data[name], dtype=np.int64) for name in ("labels", "surest"))
+        labels = np.array(data["labels"], dtype=np.int64)
         named = str(data["entry"]), float(data["mix"]), int(data["seed"])
     except (TypeError, ValueError, KeyError, OverflowError):
         raise UserError("the cell is damaged", path, AGAIN) from None
     shape = (len(ranked) if ranked.ndim else 0, len(factors))
-    shapes = [array.shape for array in (ranked, at_half, at_best, labels, surest)]
-    fitting = shapes == [shape, shape, shape, shape[1:], (shape[0], 2, SHOWN)] and shape[0] > 0
+    shapes = [array.shape for array in (ranked, at_half, at_best, labels)]
+    fitting = shapes == [shape, shape, shape, shape[1:]] and shape[0] > 0
     within = all(((table >= 0) & (table <= 1)).all() for table in (ranked, at_half, at_best))
-    if not (fitting and within and surest.min() >= 0 and surest.max() < copies(factors) * 2 ** shape[1]):
+    if not (fitting and within):
         raise UserError("the cell is damaged", path, AGAIN)
-    return Cell(*named, ranked, at_half, at_best, labels, surest)
+    return Cell(*named, ranked, at_half, at_best, labels)

@@ -110,7 +110,7 @@ def test_nothing_in_results_drives_a_terminal(name: str, capsys: pytest.CaptureF
     hypotheses = dict.fromkeys(("best", "mean", "worst", "disagreement_heldout"), mean)
     agent = {"success": mean, "length": mean, "length_over_shortest": mean, "runs": [1]}
     numbers = {
-        "rooms": [], "distance": {"options": []}, "missing": [f"g{PAYLOADS[name]}"],
+        "rooms": [], "choosing": [], "distance": {"options": []}, "missing": [f"g{PAYLOADS[name]}"],
         "hypotheses": [{"name": f"h{PAYLOADS[name]}", "sub_goal": "[red]one", **hypotheses}],
         "agents": [{"name": f"i{PAYLOADS[name]}", "steps_to_95": {"reached": 0, "n": 1}, **agent}],
     }  # fmt: skip

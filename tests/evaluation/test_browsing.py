@@ -7,8 +7,6 @@ from PIL import Image
 
 from hypogoal.evaluation.explorer import pick_to_browse, take_turns
 from hypogoal.evaluation.pictures import attribution_png, brightness, flat, image_png, reduced, to_bytes
-from hypogoal.evaluation.run import Choices
-from hypogoal.evaluation.selection import over_training
 
 
 def test_groups_take_turns():
@@ -30,20 +28,6 @@ def test_every_outcome_and_place_is_among_the_states_to_browse():
     assert {500, 501} <= set(pick[0].tolist())
     assert np.bincount(rooms[pick[0]], minlength=4).min() >= 2
     assert len(pick_to_browse(verdicts[:5], labels[:5], [], 12, np.random.default_rng(0))) == 5
-
-
-def test_choices_over_training_by_hand():
-    """Spec E5, F6: three windows in two parts; each part ends with its last window."""
-    step = np.array([10, 10, 20, 20, 30, 30])
-    ones = np.ones(6, dtype=np.int64)
-    choices = Choices(step, np.array([0, 1] * 3), ones, np.array([1, 2, 3, 4, 5, 6]), 0.5 * ones, ones, ones)
-    found = over_training(choices, 2, parts=2)
-    assert found["step"].tolist() == [20, 30]
-    assert found["chosen"].tolist() == [[4, 6], [5, 6]]
-    assert found["expected"].tolist() == [[1, 1], [0.5, 0.5]]
-    assert over_training(choices, 2)["chosen"].shape == (3, 2)
-    nothing = Choices(*(np.zeros(0, dtype=np.int64) for _ in range(7)))
-    assert over_training(nothing, 2)["chosen"].shape == (0, 2)
 
 
 def test_attributions_as_bytes():

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import Collected, Split, States, write_dataset
+from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.evaluation.pictures import (
     BACKGROUND,
     CAPTION_HEIGHT,
@@ -69,11 +69,11 @@ def test_sheets_are_by_room_and_label() -> None:
     """Spec B5: a sheet for each room and label that there is, with no more states than fit, of every kind."""
     count = 3 * MOST_STATES
     kind = np.repeat([0, 1, 2], MOST_STATES)
-    split = Split(states(count, 1), np.arange(count) < MOST_STATES, {"room": np.where(kind < 2, 7, 12), "kind": kind})
+    split = States(states(count, 1), np.arange(count) < MOST_STATES, {"room": np.where(kind < 2, 7, 12), "kind": kind})
     sheets = contact_sheets(split, ("first", "second"))
     assert list(sheets) == ["room-07-positives", "room-07-negatives", "room-12-negatives"]
     assert len({sheet.shape for sheet in sheets.values()}) == 1, "each has as many as fit"
-    everywhere = Split(split.observations[:5], np.arange(5) < 5, {})
+    everywhere = States(split.observations[:5], np.arange(5) < 5, {})
     assert list(contact_sheets(everywhere)) == ["positives"]
 
 
@@ -83,7 +83,7 @@ def test_sheets_of_a_file(tmp_path: Path) -> None:
     files = write_contact_sheets(path, tmp_path / "sheets")
     names = ["room-01-positives", "room-01-negatives", "room-02-negatives"]
     assert files == [tmp_path / f"sheets/{split}/{name}.png" for split in ("labelled", "heldout") for name in names]
-    split = Split(states(5, 3), np.arange(5) < 2, {name: np.array([1, 1, 1, 2, 2]) for name in ("room", "x", "y")})
+    split = States(states(5, 3), np.arange(5) < 2, {name: np.array([1, 1, 1, 2, 2]) for name in ("room", "x", "y")})
     assert np.array_equal(np.asarray(Image.open(files[0])), contact_sheets(split)["room-01-positives"])
     several = write_contact_sheets(written(tmp_path / "two.h5", ("one", "two")), tmp_path / "two")
     assert len(several) == 12

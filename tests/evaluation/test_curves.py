@@ -5,7 +5,6 @@ import pytest
 
 from hypogoal.evaluation.curves import (
     curves,
-    discounted_return,
     near_shortest,
     run_numbers,
     steps_to_solve,
@@ -53,13 +52,6 @@ def test_steps_to_solve_needs_a_full_window():
     assert steps_to_solve(episodes([1] * 99)) is None
     assert steps_to_solve(episodes([1] * 100)) == 1000
     assert steps_to_solve(episodes([1, 0] * 100)) is None
-
-
-def test_discounted_return_tells_short_from_long():
-    """Spec F5: 0.99 ** (length - 1) for a success, 0 for a failure."""
-    assert discounted_return(episodes([1, 1], length=3)) == pytest.approx(0.9801)
-    assert discounted_return(episodes([1, 0], length=3)) == pytest.approx(0.9801 / 2)
-    assert np.isnan(discounted_return(episodes([])))
 
 
 def test_near_counts_successes_within_one_and_a_half_shortest_paths():

@@ -37,17 +37,16 @@ def test_agents_are_named_after_how_they_choose():
     runs = [
         made(kind="baseline", agent="dqn", setting="paper"),
         made(termination="oracle"),
-        made(chooser="exp3", termination="oracle"),
+        made(chooser="thompson", termination="oracle"),
         made(chooser="random"),
-        made(chooser="exp3"),
         made(chooser="thompson"),
         made(),
         made(layout_seed=101, seed=1),
         made(kind="baseline", agent="ppo", setting="tuned"),
     ]
     groups = group_runs(runs)
-    bandits, control = ["Thompson sampling", "Exp3"], "Exp3, oracle terminations"
-    assert list(groups) == [LEARNED, *bandits, RANDOM, ORACLE, "PPO tuned", "DQN paper", control]
+    bandit, control = "Thompson sampling", "Thompson sampling, oracle terminations"
+    assert list(groups) == [LEARNED, bandit, RANDOM, ORACLE, "PPO tuned", "DQN paper", control]
     assert len(groups[LEARNED]) == 2
     assert base_name("options", {}) == "random choice while options learn"
     assert missing(work_of(agents=named(*groups))) == [], "what nobody asked for is not missed"
@@ -116,7 +115,6 @@ def test_selection_of_a_run_by_hand():
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     first, second = selection_of_run(Choices(*columns), np.array([0.6, 0.9, 0.5, 1.0]), ("a", "b"), 2)
     assert [member["preference"] for member in first["members"]] == pytest.approx([10 / 30, 50 / 20])
-    assert [member["late_preference"] for member in first["members"]] == pytest.approx([0, 3])
     assert [member["match"] for member in first["members"]] == [0.6, 0.9]
     assert [member["option"] for member in second["members"]] == [2, 3]
     assert [member["chosen"] for member in second["members"]] == [0, 10]

@@ -1,7 +1,6 @@
 """What members know wherever their thresholds lie, against the scores it is made of."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,8 +35,3 @@ def test_the_best_is_picked_where_it_is_not_scored() -> None:
     assert found["cross_fitted_ranking"] == pytest.approx(expected)
     for contexts in (None, CONTEXTS * 0):
         assert math.isnan(question.known(PROBABILITIES, VERDICTS, LABELS, contexts)["cross_fitted_ranking"])
-
-
-def test_old_evaluations_have_no_such_section() -> None:
-    """An evaluation of before is drawn without it."""
-    assert question.sections(SimpleNamespace(metrics={})) == []  # type: ignore[arg-type]

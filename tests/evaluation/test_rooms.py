@@ -14,9 +14,7 @@ YES, NO = True, False
 ROOMS = np.array([1, 1, 1, 1, 9, 9, 9, 9, 6, 6, 6, 6, 20, 20])
 SEEN = np.array([2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0])
 LABELS = np.array([YES, YES, NO, NO] * 3 + [NO, NO])
-KIND = np.array([0, 0, 1, 2] * 3 + [1, 1])
-KINDS = ("base", "near-base", "on-ladder")
-ORIGINS = {"room": ROOMS, "seen": SEEN, "kind": KIND}
+ORIGINS = {"room": ROOMS, "seen": SEEN}
 VERDICTS = np.array(
     [
         # knows room 1 by heart; knows bases; says yes to all
@@ -30,7 +28,7 @@ VERDICTS = np.array(
 
 def test_each_scope_by_hand():
     """Spec F1: the member that knows the training room by heart is the best where that room counts least."""
-    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS, KINDS)
+    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS)
     unseen, everything, labelled = (found["scopes"][name] for name in ("unseen", "all", "labelled"))
     assert (unseen["states"], unseen["positives"], unseen["rooms"]) == (6, 2, [6, 20])
     assert (everything["states"], everything["positives"], everything["rooms"]) == (14, 6, [1, 6, 9, 20])
@@ -49,8 +47,8 @@ def test_each_scope_by_hand():
 
 def test_validation_picks_by_the_labelled_rooms_only():
     """Spec F1: the member chosen there may be the worst elsewhere; its score on unseen rooms is what it is."""
-    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS, KINDS)
-    assert found["validated"] == {"member": 0, "validation": 1.0, "tied": 1}
+    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS)
+    assert found["validated"] == {"member": 0, "validation": 1.0}
     scores = found["scopes"]["unseen"]["scores"]["balanced_accuracy"]
     assert scores == pytest.approx(
         {"best": 7 / 8, "validated": 1 / 4, "mean": (1 / 4 + 7 / 8 + 1 / 2) / 3, "worst": 1 / 4}
@@ -59,45 +57,19 @@ def test_validation_picks_by_the_labelled_rooms_only():
 
 
 def test_validation_says_when_it_cannot_choose():
-    """Spec F1: of members that are equally good the first, and how many there are; none without both classes."""
+    """Spec F1: of members that are equally good the first; none without both classes."""
     same = np.repeat(VERDICTS[:, :1], 3, axis=1)
-    assert choose(same, LABELS, SEEN) == {"member": 0, "validation": 1.0, "tied": 3}
+    assert choose(same, LABELS, SEEN) == {"member": 0, "validation": 1.0}
     nothing = choose(VERDICTS, LABELS, np.zeros_like(SEEN))
-    assert (nothing["member"], nothing["tied"]) == (None, 0)
+    assert nothing["member"] is None
     assert np.isnan(nothing["validation"])
     assert np.isnan(with_validated(np.array([0.5, 0.7]), None)["validated"])
-
-
-def test_false_positives_by_kind():
-    """Spec F1: the share of each kind of negatives that each member calls reached; the base is no kind of negative."""
-    rows = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS, KINDS)["false_positives"]
-    assert [(row["scope"], row["kind"], row["negatives"]) for row in rows] == [
-        ("unseen", "near-base", 3), ("unseen", "on-ladder", 1), ("all", "near-base", 5), ("all", "on-ladder", 3),
-    ]  # fmt: skip
-    assert rows[0]["share"] == pytest.approx([1 / 3, 0, 1])
-    assert rows[1]["share"] == pytest.approx([1, 1, 1])
-    assert rows[3]["share"] == pytest.approx([1 / 3, 2 / 3, 1])
-    unnamed = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS)["false_positives"]
-    assert [row["kind"] for row in unnamed] == ["1", "2", "1", "2"]
-    bare = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, {"seen": SEEN})
-    assert bare["false_positives"] == bare["by_room"] == bare["scopes"]["all"]["rooms"] == []
-
-
-def test_each_room():
-    """Spec F1: a room's scores are those of its states alone; without a base it has no balanced accuracy."""
-    rows = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS, KINDS)["by_room"]
-    assert [(row["room"], row["seen"], row["states"], row["positives"]) for row in rows] == [
-        (1, 2, 4, 2), (6, 0, 4, 2), (9, 1, 4, 2), (20, 0, 2, 0),
-    ]  # fmt: skip
-    assert rows[1]["balanced_accuracy"] == pytest.approx([1 / 4, 3 / 4, 1 / 2])
-    assert np.isnan(rows[3]["balanced_accuracy"]).all()
-    assert rows[3]["accuracy"] == pytest.approx([1 / 2, 1, 0])
 
 
 def test_no_positive_in_unseen_rooms_is_said():
     """Spec F1: with every ladder labelled balanced accuracy on unseen rooms is not a number, accuracy is."""
     seen = np.where(ROOMS == 20, 0, 2)
-    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, {**ORIGINS, "seen": seen}, KINDS)
+    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, {**ORIGINS, "seen": seen})
     unseen = found["scopes"]["unseen"]
     assert unseen["positives"] == 0
     assert np.isnan(list(unseen["scores"]["balanced_accuracy"].values())).all()
@@ -105,10 +77,10 @@ def test_no_positive_in_unseen_rooms_is_said():
     assert found["validated"]["member"] == 1
 
 
-def ensemble(groups, seed, best, method="dbat, K=2", tied=1, sub_goal="down"):
+def ensemble(groups, seed, best, method="dbat, K=2", sub_goal="down"):
     scores = {"best": best, "validated": best - 0.2, "mean": best - 0.1, "worst": best - 0.3}
     scope = {"states": 12, "positives": 3, "scores": dict.fromkeys(SCORED, scores)}
-    rooms = {"scopes": {"unseen": scope, "all": scope}, "validated": {"tied": tied}}
+    rooms = {"scopes": {"unseen": scope, "all": scope}}
     disagreement = {"unlabelled": 0.1 * seed, "heldout": 0.2}
     row = {"sub_goal": sub_goal, "rooms": rooms, "disagreement": disagreement}
     return {"method": method, "groups": groups, "seed": seed, "sub_goals": [row]}
@@ -119,7 +91,7 @@ def test_the_table_over_seeds():
     rows = rooms_table(
         [
             ensemble(2, 0, 0.9),
-            ensemble(1, 0, 0.6, tied=2),
+            ensemble(1, 0, 0.6),
             ensemble(1, 1, 0.8),
             ensemble(1, 2, float("nan")),
             ensemble(1, 0, 0.5, "single CNN"),
@@ -136,7 +108,6 @@ def test_the_table_over_seeds():
     assert found["interval"] == pytest.approx([0.7 - 12.706 * 0.1, 0.7 + 12.706 * 0.1], abs=1e-3)
     assert rows[0]["scores"]["all"]["accuracy"]["validated"]["mean"] == pytest.approx(0.5)
     assert rows[0]["always_no"] == {"unseen": 0.75, "all": 0.75}
-    assert rows[0]["tied"] == pytest.approx(4 / 3)
     assert rows[0]["disagreement_unlabelled"]["mean"] == pytest.approx(0.1)
     alone = rows[3]["scores"]["unseen"]["balanced_accuracy"]["best"]
     assert np.isnan(alone["standard_deviation"])

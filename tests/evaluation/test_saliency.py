@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from hypogoal.dataset import Split
+from hypogoal.dataset import States
 from hypogoal.evaluation.deep_lift import (
     DEEP_LIFT,
     INTEGRATED,
@@ -210,7 +210,7 @@ def test_attributions_are_to_what_members_see(tmp_path):
     ensemble = Windowed(nn.Sequential(nn.Flatten(), dense([1.0, 2.0])))
     observations = states([0.2, 0, 1], [0.4, 1, 0], [0, 0, 0])
     where = {name: np.arange(3) for name in ("room", "x", "y")}
-    split = Split(observations, np.array([True, False, False]), where)
+    split = States(observations, np.array([True, False, False]), where)
     yes = np.array([[True], [True], [False]])
     judged = Judged(np.array([[0.9], [0.8], [0.1]], np.float32), yes, yes[2:])
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:

@@ -54,7 +54,7 @@ COMPARED_BY = r"sub_goal$|domain$"
 UNSEEN = re.compile(  # what no page has
     r"^(?!metrics\.quantities).*\.(unit|interval_over)$|inputs\.\*\.|agents\.\*\.kind|runs\.\*\.(path|ensemble)"
     r"|comparisons\.agents"  # of three runs and more; drawn as those of hypotheses
-    r"|ensembles\.\*\.(method|name)|states\.\*\.method|distance\.(options|by_ladder)|explorer\.baseline|selection\.\*\.name|false_positives|arrays\.saliency.*kinds|attributes\.versions"
+    r"|ensembles\.\*\.(method|name)|states\.\*\.method|distance\.options|explorer\.baseline|selection\.\*\.name|false_positives|arrays\.saliency.*kinds|attributes\.versions"
     r"|^manifests\.[^.]*\.sha256"  # the sum of the others, made anew
 )
 

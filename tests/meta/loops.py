@@ -14,13 +14,13 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.meta import training
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.bandits import BANDITS
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
+from hypogoal.options.thompson import ThompsonChooser
 
 QUICK = {
     "environments": 3,
@@ -50,7 +50,6 @@ CASES: dict[str, tuple[Callable[[int], Any], str, dict[str, object], str]] = {
     "light, own, n steps, even": (LongCorridor, "light", {**FAR, "actions": "moves"}, "even"),
     "a Gymnasium environment, ppo": (gymnasium_corridor, "light", {}, "ppo"),
     "light, thompson": (Corridor, "light", {}, "thompson"),
-    "light, exp3": (Corridor, "light", {}, "exp3"),
     "DoorKey, many layouts, random": (partial(many, doorkey.DOMAIN.make_engine), "light", {}, "random"),
     "Gymnasium, many layouts, random": (partial(many, corridor_env.SWIFT.make_engine), "light", {}, "random"),
     "planned, ppo": (partial(DoorKeyEngine, 4), "planned", {}, "ppo"),
@@ -68,8 +67,8 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     chooser: Chooser = RandomChooser(rng_for(0, "choice"))
     if chooser_name == "even":
         chooser = EvenChooser(2, rng_for(0, "choice"))
-    elif chooser_name in BANDITS:
-        chooser = BANDITS[chooser_name](2, 3, rng_for(0, "choice"))
+    elif chooser_name == "thompson":
+        chooser = ThompsonChooser(2, 3, rng_for(0, "choice"))
     elif chooser_name != "random":
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=16, meta_batch=8)

@@ -1,4 +1,4 @@
-"""Bandits over options (Spec H4): what they find, by hand what they are credited with, and what stays of them."""
+"""A bandit over options (Spec H4): what it finds, by hand what it is credited with, and what stays of it."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from planted import NearPlanner, harsh, planted
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.choosing import play
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.options.bandits import BANDITS, MIXING, Bandit, Exp3Chooser, ThompsonChooser
 from hypogoal.options.choosers import Chooser, Outcome, RandomChooser
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.planned import PlannedLearner
 from hypogoal.options.recording import Recorder
+from hypogoal.options.thompson import ThompsonChooser
 
 HERE = np.arange(2)  # two environments
 ALL = np.ones((2, 3), np.bool_)  # three options
@@ -22,7 +22,7 @@ ALL = np.ones((2, 3), np.bool_)  # three options
 def loop_of(name: str, kind: type[PlannedLearner], seed: int, environments: int) -> OptionLoop:
     engine, config = harsh(220, environments), TrainMetaConfig(network="planned")
     terminations, rng = planted(engine), np.random.default_rng(seed)
-    chooser: Chooser = RandomChooser(rng) if name == "random" else BANDITS[name](15, environments, rng)
+    chooser: Chooser = RandomChooser(rng) if name == "random" else ThompsonChooser(15, environments, rng)
     learner = kind(engine, terminations, config, seed=0)
     return OptionLoop(engine, terminations, learner, chooser, Recorder(15, engine), config, config.gamma)
 
@@ -47,13 +47,7 @@ def test_thompson_finds_the_right_members_within_200_episodes() -> None:
     assert max(chance) <= 0.15
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_exp3_beats_uniform_choice(seed: int) -> None:
-    assert solved(loop_of("exp3", PlannedLearner, seed, 16), 2_000, 200) >= 0.7
-    assert solved(loop_of("random", PlannedLearner, seed, 16), 2_000, 200) <= 0.15
-
-
-def ended(bandit: Bandit, returned: list[float], terminated: list[bool], truncated: list[bool]) -> None:
+def ended(bandit: ThompsonChooser, returned: list[float], terminated: list[bool], truncated: list[bool]) -> None:
     """What the options that run in both environments came to."""
     no, one = np.zeros(2, np.bool_), np.ones(2)
     over = np.array(terminated), np.array(truncated)
@@ -93,10 +87,9 @@ def test_episodes_credit_what_was_chosen_in_them() -> None:
     assert bandit.credit.tolist() == [[1, 1, 1], [0, 2, 1]]
 
 
-@pytest.mark.parametrize("kind", BANDITS.values())
-def test_a_snapshot_holds_what_came_of_an_episode_so_far(kind: type[Bandit]) -> None:
+def test_a_snapshot_holds_what_came_of_an_episode_so_far() -> None:
     """Spec G1: what an episode has earned, and what is noted but not learned."""
-    one, other = (kind(3, 2, np.random.default_rng(seed)) for seed in (0, 1))
+    one, other = (ThompsonChooser(3, 2, np.random.default_rng(seed)) for seed in (0, 1))
     one.choose(HERE, HERE, only(0, 1))
     ended(one, [0.5, 0.0], [False, True], [False, False])
     other.restore(one.snapshot())
@@ -104,24 +97,6 @@ def test_a_snapshot_holds_what_came_of_an_episode_so_far(kind: type[Bandit]) -> 
         ended(bandit, [-0.25, 0.0], [True, False], [False, False])
         bandit.learn()
         np.testing.assert_array_equal(bandit.credit, [[1, 0, 0], [0, 1, 0]])
-
-
-def test_a_decision_of_exp3_counts_by_its_probability() -> None:
-    """Of three options one is not offered: by hand the shares, and what a solved decision gets, each time."""
-    bandit = Exp3Chooser(3, 2, np.random.default_rng(0))
-    bandit.credit[0] = np.array([0, 1000, np.log(3)]) * 3 / MIXING
-    offered = np.tile([True, False, True], (2, 1))
-    shares = (1 - MIXING) * np.array([0.25, 0, 0.75]) + MIXING / 2
-    chosen = np.concatenate([bandit.choose(HERE, HERE, offered) for _ in range(5_000)])
-    assert set(chosen) == {0, 2}
-    assert np.mean(chosen == 0) == pytest.approx(shares[0], abs=0.015)
-    before = bandit.credit.copy()
-    ended(bandit, [1.0, 0.0], [True, True], [False, False])
-    bandit.learn()
-    np.testing.assert_allclose(
-        (bandit.credit - before).sum(0)[[0, 2]], [(chosen == n).sum() / shares[n] for n in (0, 2)]
-    )
-    np.testing.assert_allclose((bandit.credit - before)[0, 0], (chosen[::2] == 0).sum() / shares[0])
 
 
 def test_thompson_draws_anew_for_every_episode() -> None:
@@ -137,14 +112,13 @@ def test_thompson_draws_anew_for_every_episode() -> None:
     assert not loop.chooser.credit.any()  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", BANDITS)
-def test_what_is_loaded_chooses_alike(name: str) -> None:
+def test_what_is_loaded_chooses_alike() -> None:
     """From the same draws as the one that learned; another's, or a damaged one, is one line."""
-    loop = loop_of(name, PlannedLearner, 3, 4)
+    loop = loop_of("thompson", PlannedLearner, 3, 4)
     solved(loop, 150, 1)
-    one, other = loop.chooser, BANDITS[name](15, 4, np.random.default_rng(7))
-    assert isinstance(one, Bandit) and one.credit[0].any()
-    fresh = BANDITS[name](15, 4, np.random.default_rng(7))
+    one, other = loop.chooser, ThompsonChooser(15, 4, np.random.default_rng(7))
+    assert isinstance(one, ThompsonChooser) and one.credit[0].any()
+    fresh = ThompsonChooser(15, 4, np.random.default_rng(7))
     other.load(one.state())
     one.rng, one._taken[:] = np.random.default_rng(7), 0.0
     where, offered = np.arange(4), np.ones((4, 15), np.bool_)

@@ -253,7 +253,7 @@ def test_a_nan_stops_training() -> None:
     learner = run_corridor(LightLearner, 80)
     with torch.no_grad():
         learner.online.heads.bias.fill_(float("nan"))
-    with pytest.raises(NumericalError, match="option loss"):
+    with pytest.raises(NumericalError, match="the loss of options"):
         learner._update()
 
 

@@ -23,8 +23,8 @@ from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
-from hypogoal.options.bandits import BANDITS
 from hypogoal.options.initiation import Initiation
+from hypogoal.options.thompson import ThompsonChooser
 from hypogoal.stages.collect import collect
 from hypogoal.stages.report import agents_of, play_films
 from hypogoal.stages.train_ensemble import train_ensemble
@@ -126,11 +126,10 @@ def test_options_are_held_back_as_in_training(run, tmp_path, monkeypatch):
     assert asked and film.gif.startswith(b"GIF")
 
 
-@pytest.mark.parametrize("name", BANDITS)
-def test_a_bandit_is_back_and_learns_no_more(run, tmp_path, name):
+def test_a_bandit_is_back_and_learns_no_more(run, tmp_path):
     """Spec E6, H4: its file is asked for, what it learned is in it, and playing changes nothing of that."""
     config = TrainMetaConfig(
-        steps=320, chooser=name, max_episode_steps=CAP, environments=4, random_episodes=1, warm_up=400
+        steps=320, chooser="thompson", max_episode_steps=CAP, environments=4, random_episodes=1, warm_up=400
     )
     train_meta(run / "ensemble", config, tmp_path / "meta", **QUIET)
     (artefact,) = agents_of(tmp_path)
@@ -138,7 +137,7 @@ def test_a_bandit_is_back_and_learns_no_more(run, tmp_path, name):
     kept = load_tensors(artefact.path / "meta.safetensors")["credit"].numpy()
     loops = [agent_of(artefact, seed=1) for _ in range(2)]
     first, second = ([frame.option for frame in play_episode(loop)] for loop in loops)
-    assert type(loops[0].chooser) is BANDITS[name] and kept.any() and first == second
+    assert type(loops[0].chooser) is ThompsonChooser and kept.any() and first == second
     np.testing.assert_array_equal(loops[0].chooser.credit, kept)
     work = Work(Contents(tmp_path, [], [artefact], [], [], []), None, None, metrics={})
     run_of = {"path": work.contents.name(artefact), "seed": 0, "layout_seed": 100}

@@ -11,10 +11,10 @@ import pytest
 
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
-from hypogoal.which_feature.page import summary, told
 from hypogoal.which_feature.run import parse_entry, resolved, run_cell
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS, KNOWN
+from hypogoal.which_feature.table import summary, told
 
 COMMAND = ["benchmark", "which-feature", "--quiet", "--set", "steps=2", "--members", "2"]
 OWN = """
@@ -44,13 +44,12 @@ def test_one_member_covers_one_factor_at_most_and_the_same_seed_gives_the_same()
     assert first.ranking.shape == (1, 4)
     assert owned(first.ranking).sum() <= 1
     assert (first.ranking == again.ranking).all()
-    assert (first.surest == again.surest).all()
 
 
 def test_end_to_end_and_on_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Table, CSV and page; cells that are there are kept; an objective of one's own is scored like the others."""
+    """Table and CSV; cells that are there are kept; an objective of one's own is scored like the others."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_apart.py").write_text(OWN)
     out = tmp_path / "bench"
@@ -62,7 +61,7 @@ def test_end_to_end_and_on_again(
 
     assert main([*command, "--mix", "0,0.5", "--diversity", "dbat:0.1,mine_apart:apart:0.5,mine_apart:apart"]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert printed[-1] == str(out / "page.html")
+    assert printed[-1] == str(out / "results.csv")
     assert max(map(len, printed[:-1])) <= 80
     assert all(path.read_bytes() == before for path, before in kept.items())
     found = rows(out)
@@ -72,14 +71,10 @@ def test_end_to_end_and_on_again(
     }
     assert len(found) == 4 + 6 * 8
     assert all(0 <= float(row[name]) <= 1 for row in found for name in ("ranking", "balanced_accuracy", "at_best"))
-    html = (out / "page.html").read_text(encoding="utf-8")
-    assert html.count("<svg") == 4
-    assert 'src="http' not in html
-    assert html.count("data:image/png") >= 4 * 2
 
 
-def test_the_page_is_of_two_frames_too(tmp_path: Path) -> None:
-    """Five factors, and pictures of the frame that is now."""
+def test_a_factor_of_two_frames_is_scored_too(tmp_path: Path) -> None:
+    """``moved``: the frame before and the one that is now."""
     out = tmp_path / "bench"
     assert main([*COMMAND, "--out", str(out), "--seeds", "0", "--diversity", "none", "--factors", "count,moved"]) == 0
     assert {row["factor"] for row in rows(out)} == {"count", "moved"}
@@ -130,10 +125,8 @@ def test_a_folder_of_other_settings_or_with_a_damaged_cell_is_refused(
     whole = json.loads(cell.read_text())
     for damage in (
         {"ranking": [[2, 0, 0, 0]]},
-        {"surest": []},
         {"labels": None},
         {"mix": "x"},
-        {"surest": [[[-1] * 4] * 2]},
     ):
         cell.write_text(json.dumps({**whole, **damage}))
         assert main(command) == 2

@@ -89,29 +89,6 @@
     return [heading, make("div", { class: "cards" }, ...cards)];
   };
 
-  /* Preference over training as bars; the line is 1, a chooser that does not care. */
-  const sparkline = (values) => {
-    const SVG = "http://www.w3.org/2000/svg";
-    const svg = document.createElementNS(SVG, "svg");
-    const top = Math.max(2, ...values.map((value) => value ?? 0));
-    const add = (tag, attributes) => {
-      const node = document.createElementNS(SVG, tag);
-      for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-      svg.append(node);
-    };
-    svg.setAttribute("viewBox", `0 0 ${values.length} 10`);
-    svg.setAttribute("preserveAspectRatio", "none");
-    svg.setAttribute("role", "img");
-    const told = values.map((value) => (value === null ? "not offered" : value.toFixed(1))).join(", ");
-    svg.setAttribute("aria-label", `Preference over training, part by part: ${told}`);
-    values.forEach((value, index) => {
-      const height = (10 * (value ?? 0)) / top;
-      add("rect", { x: index + 0.1, y: 10 - height, width: 0.8, height, fill: "var(--blue)" });
-    });
-    add("path", { d: `M0 ${10 - 10 / top}H${values.length}`, "vector-effect": "non-scaling-stroke", stroke: "var(--soft)" });
-    return make("div", { class: "spark" }, svg, soft(`preference over training; line: 1, top: ${top.toFixed(1)}`));
-  };
-
   const facts = (rows) => make("dl", {}, ...rows.flatMap(([key, value]) => [make("dt", {}, key), make("dd", {}, value)]));
 
   const memberPanel = () => {
@@ -121,7 +98,6 @@
         ? image(option.png, `Overlaid termination states: ${option.name}`)
         : make("div", { class: "nothing" }, "its classifier never ended it");
       const body = make("div", {}, make("h4", {}, option.name), ...(option.note ? [soft(option.note)] : []), facts(option.facts));
-      if (option.over.length) body.append(sparkline(option.over));
       return make("div", { class: "option card" }, drawn, body);
     });
     const none = "No agent of this run was learned with this ensemble.";
