@@ -473,6 +473,7 @@ FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
     "disk": disk,
     "signals": signals,
     "clock": clock,
+    "boards": files(hostile.boards),
     "minari": files(hostile.minari),
     "images": files(hostile.images),
     "arrays": files(hostile.arrays),
@@ -483,7 +484,7 @@ FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
 }
 
 
-RUN_FREE = ("minari", "images", "arrays", "toml")  # families that need no run
+RUN_FREE = ("boards", "minari", "images", "arrays", "toml")  # families that need no run
 
 
 def attack(box: Box, name: str, cases: range, seed: int) -> dict[str, Any]:

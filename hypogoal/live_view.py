@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,8 +18,8 @@ from rich.table import Table
 from hypogoal.core.artefacts import MANIFEST
 from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import PARTIAL
-from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, json_lines, plain_name, read_end
+from hypogoal.core.errors import UserError, printable
+from hypogoal.core.files import MOST_INTEGER, inside, json_lines, plain_name, read_end
 from hypogoal.core.terminal import draw, screen
 
 LOG = "metrics.jsonl"
@@ -40,6 +42,7 @@ class Progressing:
     step: int  # the last logged
     watched: str  # what is followed (one of ``WATCHED``), empty where there is nothing to follow
     series: tuple[float, ...]  # its values so far
+    lines: list[dict[str, Any]]  # its log so far, of an ensemble of all sub-goals
 
     @property
     def title(self) -> str:
@@ -47,15 +50,21 @@ class Progressing:
         return f"{self.name}: {self.sub_goal}" if self.sub_goal else self.name
 
 
-def watch(run: Path, *, once: bool = False) -> None:
+def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> None:
     """Show how a run's artefacts are doing, again and again until it is finished or interrupted.
 
     ``once``: print the view once; so it is done too where there is no terminal, and where the run is finished.
-    No such folder, or nothing in it that logs, is a ``UserError``.
+    ``boards`` get the logs too. No such folder, or nothing in it that logs, is a ``UserError``.
     """
     console = screen()
 
-    rows = read_progress(run)
+    def look() -> list[Progressing]:
+        rows = read_progress(run)
+        if boards is not None:
+            mirror(rows, boards)
+        return rows
+
+    rows = look()
     if once or not console.is_terminal or finished(run):
         draw(view(rows), WIDTH)
         return
@@ -63,9 +72,17 @@ def watch(run: Path, *, once: bool = False) -> None:
         with Live(view(rows, console.height - 3), console=console, screen=False, auto_refresh=False) as live:
             while not finished(run):
                 time.sleep(SECONDS)
-                live.update(view(read_progress(run), console.height - 3), refresh=True)
+                live.update(view(look(), console.height - 3), refresh=True)
     except KeyboardInterrupt:
         return
+
+
+def mirror(rows: Iterable[Progressing], boards: Boards) -> None:
+    """What is new in the logs to TensorBoard: a folder per artefact, of an ensemble one per sub-goal."""
+    for row in rows:
+        for goal in dict.fromkeys(line.get("sub_goal") for line in row.lines):
+            lines = [line for line in row.lines if line.get("sub_goal") == goal]
+            boards.add(row.name if goal is None else f"{row.name}/{goal}", lines, time.time())
 
 
 def finished(run: Path) -> bool:
@@ -100,7 +117,7 @@ def _read(log: Path, run: Path) -> Progressing:
         seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
     except OSError:  # renamed since: it has just become complete
         seconds = None
-    return Progressing(name, goal, seconds, int(last.get("step", 0)), watched, series)
+    return Progressing(name, goal, seconds, int(last.get("step", 0)), watched, series, lines)
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
@@ -154,3 +171,55 @@ def curve(values: Sequence[float], bounds: tuple[float, float] | None = None, wi
     span = (high - low) or 1.0
     places = (min(max((value - low) / span, 0.0), 1.0) for value in means)
     return "".join(BARS[int(place * (len(BARS) - 1) + 0.5)] for place in places)
+
+
+EVENTS = "events.out.tfevents.1.hypogoal"  # TensorBoard looks for such names; the number is a time to order them by
+
+
+class Boards:
+    """Event files of logs in a new folder ``out``, for TensorBoard: a folder per log, a tag per number.
+
+    Names of logs and of their numbers are a stranger's: none leads out of ``out``, and for none a file is kept open.
+    Where ``out`` is there, or the extra is not installed, it is a ``UserError``.
+    """
+
+    def __init__(self, out: Path):
+        try:
+            from tensorboard.compat.proto.event_pb2 import Event
+            from tensorboard.compat.proto.summary_pb2 import Summary
+            from tensorboard.summary.writer.record_writer import RecordWriter
+        except ImportError:
+            do = "Install it: pip install 'hypogoal[tensorboard]'."
+            raise UserError("TensorBoard is not installed", out, do) from None
+        if os.path.lexists(out):
+            raise UserError("the folder exists already", out, "Name another one, or remove it.")
+        self._event, self._summary, self._writer = Event, Summary, RecordWriter
+        self._out = out
+        self._steps: dict[Path, int] = {}
+
+    def add(self, place: str, lines: Iterable[Mapping[str, Any]], now: float) -> None:
+        """What is new in a log; one that was cut off and is written again has the same numbers at the same steps.
+
+        Its folder is ``place`` within ``out``, or ``out`` itself for a name that would lead out of it. TensorBoard
+        shows the time ``now``, in seconds since 1970.
+        """
+        folder = inside(self._out, printable(place)) or self._out
+        events = [] if folder in self._steps else [self._event(wall_time=now, file_version="brain.Event:2")]
+        for line in lines:
+            step = line.get("step")
+            if not isinstance(step, int) or step <= self._steps.get(folder, -1):
+                continue
+            values = [
+                self._summary.Value(tag=printable(key), simple_value=float(value))
+                for key, value in line.items()
+                if key != "step" and isinstance(value, int | float) and not abs(value) > sys.float_info.max
+            ]
+            events.append(self._event(wall_time=now, step=step, summary=self._summary(value=values)))
+            self._steps[folder] = step
+        if folder not in self._steps or not events:
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / EVENTS).open("ab") as file:
+            writer = self._writer(file)
+            for event in events:
+                writer.write(event.SerializeToString())

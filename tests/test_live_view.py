@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import MetricsLog
-from hypogoal.live_view import BARS, curve, finished, read_progress, view
+from hypogoal.live_view import BARS, Boards, curve, finished, mirror, read_progress, view
 
 
 def write(folder, rows):
@@ -48,7 +49,8 @@ def test_what_is_being_made_comes_first(run):
     assert ensemble.series == (0.1, 0.05)
 
 
-def test_a_damaged_log_is_read_as_far_as_it_goes(tmp_path):
+@pytest.mark.parametrize("boards", [False, True])
+def test_a_damaged_log_is_read_as_far_as_it_goes(tmp_path, boards):
     """Spec A6, G2: steps that are none, numbers that cannot be drawn, names that lead out of the folder."""
     lines = [{"step": step, "loss": 2.0} for step in ("x", None, float("nan"), 1e999, True, -1, 10**400)]
     lines += [{"step": 1, "loss": 2.0, "sub_goal": name} for name in ("../../out", 3, ["a"])]
@@ -60,6 +62,10 @@ def test_a_damaged_log_is_read_as_far_as_it_goes(tmp_path):
     rows = read_progress(tmp_path / "run")
     assert [(row.step, row.series) for row in rows] == [(4, (1.5, 0.5))]
     assert view(rows).row_count == 1
+    if boards:
+        pytest.importorskip("tensorboard")
+        mirror(rows, Boards(tmp_path / "boards"))
+        assert {path.name for path in tmp_path.iterdir()} == {"run", "boards"}
 
 
 def test_the_view_fits_80_columns(run):
@@ -133,3 +139,83 @@ def test_a_run_is_finished_when_it_says_so(tmp_path):
         (tmp_path / "run.json").write_text(json.dumps({}))
         assert not finished(tmp_path)
     assert finished(tmp_path)
+
+
+def events(folder):
+    """(step, tag, value) of all event files in a folder."""
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+    found = []
+    for path in sorted(folder.glob("events.*")):
+        for event in EventFileLoader(str(path)).Load():
+            found += [(event.step, value.tag, value.tensor.float_val[0]) for value in event.summary.value]
+    return found
+
+
+def test_tensorboard_reads_the_logs(run, tmp_path, capsys):
+    """Spec A6: every number of every log, an ensemble's by sub-goal, also while an agent is still learning."""
+    out = tmp_path / "boards"
+    assert main(["watch", str(run), "--once", "--tensorboard", str(out)]) == 0
+    agent = events(out / "meta/layout-100-seed-0")
+    assert [row for row in agent if row[1] == "success"] == [
+        (1_000 * s, "success", pytest.approx(s / 10)) for s in range(1, 10)
+    ]
+    assert {tag for _, tag, _ in agent} == {"success", "length"}
+    assert events(out / "ensemble/open-red-door") == [
+        (10, "loss", pytest.approx(0.1)),
+        (20, "loss", pytest.approx(0.05)),
+    ]
+    assert main(["watch", str(run), "--once", "--tensorboard", str(out)]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_tensorboard_gets_what_is_new_once(run, tmp_path):
+    """Spec A6: looking again writes only the lines that came since, a resumed stage's old ones not again."""
+    boards = Boards(tmp_path / "boards")
+    mirror(read_progress(run), boards)
+    log = next(run.glob("meta/.*/files/metrics.jsonl"))
+    kept = log.read_text().splitlines()[:5]
+    log.write_text("\n".join([*kept, '{"step": 6000, "success": 0.6}', '{"step": 10000, "success": 1.0}']) + "\n")
+    mirror(read_progress(run), boards)
+    found = [step for step, tag, _ in events(tmp_path / "boards/meta/layout-100-seed-0") if tag == "success"]
+    assert found == [1_000 * s for s in range(1, 11)]
+
+
+@pytest.mark.parametrize("name", ["...partial", "....partial"])
+def test_boards_stay_in_their_folder(tmp_path, name):
+    """Spec G2: the name of a draft is a stranger's: it may not climb."""
+    (tmp_path / "run" / name / "files").mkdir(parents=True)
+    (tmp_path / "run" / name / "files" / "metrics.jsonl").write_text('{"step": 1, "loss": 1}\n')
+    assert main(["watch", str(tmp_path / "run"), "--once", "--tensorboard", str(tmp_path / "boards")]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["boards", "run"]
+    assert sum(len(events(folder)) for folder in [tmp_path / "boards", *(tmp_path / "boards").rglob("*/")]) == 1
+
+
+def test_boards_of_whatever_is_in_a_log(tmp_path, capsys):
+    """Spec G2: names and keys that are no UTF-8, thousands of sub-goals; nothing is kept open for them."""
+    odd = tmp_path / "run" / "\udcff\udcfe"
+    odd.mkdir(parents=True)
+    (odd / "metrics.jsonl").write_text('{"step": 1, "\\ud800": 2}\n')
+    many = "".join(f'{{"step": 1, "loss": 1, "sub_goal": "g{number}"}}\n' for number in range(2000))
+    (tmp_path / "run" / "metrics.jsonl").write_text(many)
+    open_files, threads = len(os.listdir("/proc/self/fd")), threading.active_count()
+    boards = Boards(tmp_path / "boards")
+    mirror(read_progress(tmp_path / "run"), boards)
+    assert len(os.listdir("/proc/self/fd")) <= open_files + 1 and threading.active_count() == threads
+    assert events(tmp_path / "boards" / "??") == [(1, "?", 2.0)]
+    assert sum(len(events(folder)) for folder in (tmp_path / "boards").rglob("g*")) == 2000
+
+
+def test_boards_that_are_a_link_into_nothing(tmp_path, run, capsys):
+    """Spec G2: the folder would be made where the link leads."""
+    (tmp_path / "boards").symlink_to(tmp_path / "nothing")
+    assert main(["watch", str(run), "--once", "--tensorboard", str(tmp_path / "boards")]) == 2
+    assert "exists already" in capsys.readouterr().err and not (tmp_path / "nothing").exists()
+
+
+def test_without_the_extra(run, tmp_path, monkeypatch, capsys):
+    """Spec A6: one line that says what to install, and no folder."""
+    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.record_writer", None)
+    assert main(["watch", str(run), "--tensorboard", str(tmp_path / "boards")]) == 2
+    assert "pip install 'hypogoal[tensorboard]'" in capsys.readouterr().err
+    assert not (tmp_path / "boards").exists()

@@ -61,11 +61,13 @@ def verify(path: Made, as_json: cli.AsJson = False) -> None:
 def watch(
     run: Annotated[Path, Argument(help="A run, finished or not.")],
     once: Annotated[bool, Option("--once", help="Print it once instead of following it.")] = False,
+    tensorboard: Annotated[Path | None, Option(help="Logs for TensorBoard (an extra), into this new folder.")] = None,
 ) -> None:
     """Follow a run: steps, success or loss so far. Ctrl-C ends it."""
+    from hypogoal.live_view import Boards
     from hypogoal.live_view import watch as look
 
-    look(run, once=once)
+    look(run, once=once, boards=Boards(tensorboard) if tensorboard else None)
 
 
 @cli.command(cli.LOOK, "config train-ensemble --domain montezuma")
