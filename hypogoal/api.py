@@ -13,7 +13,7 @@ from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.policies import make_policies
-from hypogoal.options.termination import Patience, rule_of, thresholds_in
+from hypogoal.options.termination import Dwell, Patience, rule_of, thresholds_in
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 
@@ -67,7 +67,8 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     weights = load_tensors(artefact.path / "options.safetensors")
     policies = make_policies(config, weights, source.config, ensembles[0])
     goals, members = tuple(config["sub_goals"]), config["members"]
-    if rule_of(config["termination"])[0] is Patience:
+    rule, length = rule_of(config["termination"])
+    if rule is Patience:
         lowered = thresholds_in(weights, len(goals) * members).reshape(len(goals), members)
         for own, log_odds in zip(ensembles, lowered, strict=True):
             own.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
@@ -85,4 +86,5 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
         config["mask_reached"],
         domain=config["domain"],
         domain_config=config["domain_config"],
+        dwell=length if rule is Dwell else 1,
     )

@@ -4,11 +4,9 @@ The light recipe's are the defaults, those of Table 5 are in the ``paper`` prese
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from hypogoal.core.config import MAX_RANGE, parse_integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.learners.world import WorldConfig
 from hypogoal.options.config import OptionConfig
 
 
@@ -48,10 +46,8 @@ class MetaConfig:
 
 
 @dataclass(frozen=True)
-class PlayConfig(WorldConfig, OptionConfig):
+class PlayConfig(OptionConfig):
     """Where options are played, and for how long."""
-
-    NETWORKS: ClassVar[tuple[str, ...]] = ("network",)  # settings that choose one
 
     start: str = setting(
         "",
@@ -66,15 +62,30 @@ class PlayConfig(WorldConfig, OptionConfig):
         low=0.0,
         high=1.0,
     )
+    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     layouts: str = setting(
         "",
         "layouts of which each episode draws one: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: it",
         source="ours: the paper lives on one",
     )
+    max_episode_steps: int = setting(
+        500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
+    )
+    cap: float = setting(
+        0.0,
+        "an episode is cut after so many times the layout's shortest path; 0 for max_episode_steps",
+        source="ours: a task in which choosing decides",
+        low=0.0,
+    )
+    world: tuple[str, ...] = setting(
+        (),
+        "what is otherwise in the world than where the states were collected: settings of the domain as name=value",
+        source="ours: a task in which choosing decides",
+    )
     termination: str = setting(
         "learned",
         "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
-        "hardly ever gets there; or oracle, the true sub-goals (upper bound)",
+        "hardly ever gets there; dwell:N, N yes on end; or oracle, the true sub-goals (upper bound)",
         source="paper: learned; the others ours",
     )
     save_visited: int = setting(
@@ -83,6 +94,7 @@ class PlayConfig(WorldConfig, OptionConfig):
         source="the paper's suggestion",
         low=0,
     )
+    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
 
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
@@ -128,8 +140,6 @@ class TrainOptionsConfig(PlayConfig):
 @dataclass(frozen=True)
 class TrainMetaConfig(PlayConfig, MetaConfig):
     """How options are learned and chosen, and for how long."""
-
-    NETWORKS = ("network", "meta_network")
 
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1

@@ -68,8 +68,8 @@ def assemble(
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
     cut(engine, config.cap)
     if engine.observation_dtype != PICTURE:
-        for name in config.NETWORKS:
-            if getattr(config, name) == "paper":
+        for name in ("network", "meta_network"):
+            if getattr(config, name, "") == "paper":
                 raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
         view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
         engine.standard = view.standard if view else standard_of(engine.observation_shape)
@@ -84,9 +84,7 @@ def assemble(
         many = engine.layouts is not None and engine.layouts.many
         if not many and (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
-    if config.network == "planned" and type(terminations) is not Terminations:
-        given = f"termination={config.termination}"
-        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
+    _check_rule(terminations, config)
     seen = None
     if config.policy_view == "agent-crop":
         if config.network != "light":
@@ -155,6 +153,16 @@ def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence
             known = ", ".join(domain.engine_settings) or "none"
             raise UserError(f"{domain.name} has no such setting of its world", f"world={name}", f"It has {known}.")
     return {**collected, **domain.world(changed)}
+
+
+def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
+    """Whether the options can be learned that end so."""
+    given = f"termination={config.termination}"
+    if not terminations.SHARED and config.experience != "own":
+        what = "whether an execution has reached its sub-goal cannot be said of states that others visit"
+        raise UserError(what, f"{given}, experience={config.experience}", "Give --set experience=own.")
+    if config.network == "planned" and type(terminations) is not Terminations:
+        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
 
 
 def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:

@@ -32,6 +32,7 @@ class Options:
         policies: starts an option's greedy policy.
         timeout: steps after which an option ends.
         initiation: holds options back where they rarely reach their sub-goals (D7); None, it holds none back.
+        dwell: in so many states on end a sub-goal must hold for its option to end.
         mask_reached: options are not offered where their sub-goals hold already, as they were trained (D6).
         domain, domain_config: where they were trained, see :meth:`make_env`.
 
@@ -47,6 +48,7 @@ class Options:
     mask_reached: bool = True
     domain: str = ""
     domain_config: Mapping[str, Any] = field(default_factory=dict)
+    dwell: int = 1
 
     def __repr__(self) -> str:
         goals = ", ".join(self.sub_goals)
@@ -146,7 +148,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if option is None or not 0 <= option < self.options.count:
             raise UserError("no such option", repr(action), f"They are 0 to {self.options.count - 1}.")
         act = self.options.policies(option)
-        total, duration, reached, ended = 0.0, 0, False, False
+        total, duration, held, reached, ended = 0.0, 0, 0, False, False
         image, observation = self._current(), None
         terminated = truncated = False
         info: dict[str, Any] = {}
@@ -155,7 +157,8 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             image = self._look.read(self.env, observation)
             total += self.gamma**duration * reward
             duration += 1
-            reached = self.options.holds(option, image)
+            held = held + 1 if self.options.holds(option, image) else 0
+            reached = held >= self.options.dwell
             ended = reached or terminated or truncated or duration >= self.options.timeout
         self._image = image
         info = info | {"duration": duration, "reached": reached, "option": self.options.name(option)}

@@ -30,7 +30,7 @@ from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, a
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
 FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_,
+    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
     "steps": np.int16,  # from s to next
     "option": np.int16,
 }  # fmt: skip
@@ -79,7 +79,7 @@ class LightLearner(Learner):
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        last = {"option": moved.options, "end": moved.terminated, "timeout": moved.timed_out}
+        last = {"option": moved.options, "end": moved.terminated, "timeout": moved.timed_out, "reached": moved.reached}
         rows = self.ahead.add(moved.ids, self._index[moved.actions], moved.next_ids, moved.ended, **last)
         self.replay.add(**rows)
         here, reached = self._judged(rows)
@@ -102,7 +102,7 @@ class LightLearner(Learner):
             return self.terminations.of(s), self.terminations.of(following)
         option = rows["option"].astype(np.int64)
         owner = option[:, None] == np.arange(self.options)
-        here, reached = (self.terminations.of_running(ids, option) for ids in (s, following))
+        here, reached = self.terminations.judged(option, s, following, rows["reached"])
         return owner & here[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:

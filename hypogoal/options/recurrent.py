@@ -24,7 +24,7 @@ from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.networks import PaperQNetwork
 
 FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_,
+    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
     "place": np.int16,  # steps since the option began
     "execution": np.int32,
 }  # fmt: skip
@@ -106,7 +106,7 @@ class RecurrentLearner(Learner):
         member = self.members[option]
         s, a, following, end, timeout, reached = (np.array(column) for column in zip(*steps, strict=True))
         member.replay.add(
-            s=s, a=a, next=following, end=end, timeout=timeout,
+            s=s, a=a, next=following, end=end, timeout=timeout, reached=reached,
             place=np.arange(len(s)), execution=np.full(len(s), member.executions),
         )  # fmt: skip
         member.executions += 1
@@ -156,7 +156,7 @@ class RecurrentLearner(Learner):
         pick = torch.arange(len(indices), device=self.device)
         of = np.full(len(indices), option)
         following = data["next"][indices].astype(np.int64)
-        reached = self.terminations.of_running(following, of)
+        reached = self.terminations.judged(of, states[rows, place], following, data["reached"][indices])[1]
         terminal = reached | data["end"][indices]
         if not config.bootstrap_timeout:
             terminal = terminal | data["timeout"][indices]

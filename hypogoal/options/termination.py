@@ -40,6 +40,7 @@ class Terminations(Resumable):
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
+    SHARED = True  # whether it is enough to judge a state, so that options can learn from what others visit
 
     def __init__(
         self,
@@ -96,6 +97,19 @@ class Terminations(Resumable):
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
         """Executions (n,) that ended, and which of them reached their sub-goals."""
+
+    def judged(
+        self,
+        options: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        next_ids: NDArray[np.int64],
+        reached: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Of transitions (n,) of the past, as of today: whether they begin and end in their option's sub-goal.
+
+        ``reached`` says whether its execution reached it then.
+        """
+        return self.of_running(ids, options), self.of_running(next_ids, options)
 
     def state(self) -> dict[str, torch.Tensor]:
         """What an artefact keeps."""
@@ -159,15 +173,41 @@ class Patience(Terminations):
         self._highest[due] = -np.inf
 
 
-RULES: dict[str, type[Terminations]] = {"learned": Terminations, "patience": Patience}
+class Dwell(Terminations):
+    """An execution ends where its sub-goal has held in so many states on end, ``length`` of them."""
+
+    CHANGING = (*Terminations.CHANGING, "_held")
+    SHARED = False
+
+    def __init__(self, *arguments: Any, **more: Any):
+        super().__init__(*arguments, **more)
+        self._held = np.zeros(self.environments, dtype=np.int64)
+
+    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
+        self._held = np.where(self.of_running(ids, options), np.where(age == 0, 0, self._held) + 1, 0)
+        long: NDArray[np.bool_] = self._held >= self.length
+        return long
+
+    def judged(
+        self,
+        options: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        next_ids: NDArray[np.int64],
+        reached: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """As of :class:`Terminations`; a state alone says nothing."""
+        return np.zeros_like(reached), reached
+
+
+RULES: dict[str, type[Terminations]] = {"learned": Terminations, "patience": Patience, "dwell": Dwell}
 
 
 def rule_of(termination: str) -> tuple[type[Terminations], int]:
-    """The rule and its number of ``learned``, ``patience:10000``; a ``UserError`` where it is none."""
+    """The rule and its number of ``learned``, ``patience:10000``, ``dwell:3``; a ``UserError`` where it is none."""
     name, colon, number = termination.partition(":")
     known = name in RULES and (number.isdecimal() and int(number) > 0 if name != "learned" else not colon)
     if not known:
-        do = "Give learned, patience:STEPS or oracle."
+        do = "Give learned, patience:STEPS, dwell:STEPS or oracle."
         raise UserError("unknown termination", f"termination={termination}", do)
     return RULES[name], int(number or 0)
 

@@ -228,7 +228,7 @@ DOOR = "--domain doorkey --sub-goal go-to-goal"
         (f"{__name__}:left_end {DOOR} --set mend=0.4", "mends no threshold of 0.5"),
         (f"{__name__}:left_end {DOOR} --set termination=oracle", "an audit is of one classifier alone"),
         (f"{__name__}:left_end {DOOR} --set policy_view=agent-crop", "an audit is of one classifier alone"),
-        (f"{__name__}:left_end {DOOR} --set termination=dwell:2", "unknown termination: termination=dwell:2"),
+        (f"{__name__}:left_end {DOOR} --set termination=dwell:2", "Give --set experience=own."),
         (f"{__name__}:left_end --domain own_domain:DOMAIN --sub-goal left-end", "cannot begin an episode when asked"),
         ("{ensemble} --domain doorkey --sub-goal open-red-door --member 2", "no such member: 2"),
         ("{ensemble} --domain doorkey --sub-goal go-to-goal", "unknown sub-goal: go-to-goal"),

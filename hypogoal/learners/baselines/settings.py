@@ -7,7 +7,6 @@ read the two tables as theirs too. Where it is silent the value is stable-baseli
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
-from hypogoal.learners.world import WorldConfig
 
 
 @dataclass(frozen=True)
@@ -67,14 +66,30 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 
 
 @dataclass(frozen=True)
-class BaselineConfig(WorldConfig):
+class BaselineConfig:
     """Which agent, on which layout, for how long; the hyperparameters are those above."""
 
     agent: str = setting("ppo", "the algorithm", source="paper, Figure 6", choices=("ppo", "dqn"))
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
+    layout_seed: int = setting(100, "the layout to learn on", source="paper, Figure 6", low=0)
     environments: int = setting(0, "environments stepped together; 0 for the setting's own", low=0, high=4096)
+    max_episode_steps: int = setting(
+        500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
+    )
+    cap: float = setting(
+        0.0,
+        "an episode is cut after so many times the layout's shortest path; 0 for max_episode_steps",
+        source="ours: a task in which choosing decides",
+        low=0.0,
+    )
+    world: tuple[str, ...] = setting(
+        (),
+        "what is otherwise in the world than in the data, or by default: settings of the domain as name=value",
+        source="ours: a task in which choosing decides",
+    )
+    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
     # Last, because from here on the name means this field.
     setting: str = setting(
         "tuned",
