@@ -42,7 +42,8 @@ from hypogoal.evaluation.plots import (
     SKY,
     STYLES,
     VERMILLION,
-    drawing,
+    label_lines,
+    styled,
 )
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
 
@@ -383,6 +384,8 @@ def _answers(material: Material) -> list[str]:
     paragraphs = []
     for agent in shown:
         text = _achieved(agent, f"the agent '{agent['name']}'" if len(shown) > 1 else "the option agent")
+        if len(shown) == 1:
+            text += "".join(f" {_briefly(other)}" for other in material.metrics["agents"] if other is not agent)
         for entry in (entry for entry in material.metrics["choosing"] if entry["name"] == agent["name"]):
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
             text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
@@ -401,6 +404,13 @@ def _achieved(agent: Mapping[str, Any], name: str) -> str:
         f"{name[0].upper()}{name[1:]} reached the goal in {page.percent(success)} of its last "
         f"{_episodes(agent)}, in {page.fixed(agent['length']['mean'], 0)} steps{against} ({runs_of(agent)})."
     )
+
+
+def _briefly(agent: Entry) -> str:
+    """The same of another agent."""
+    success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
+    told = "no episode ended" if success is None else f"{page.percent(success)}, {steps} steps"
+    return f"{agent['name'][0].upper()}{agent['name'][1:]}: {told}."
 
 
 def _episodes(agent: Mapping[str, Any]) -> str:
@@ -500,7 +510,9 @@ def learning_curves(
     ``quantity`` is the y axis's label with its unit, ``references`` are horizontal lines with their names, and a bound
     of the y axis that is None is what fits the values.
     """
-    with drawing(2.9, 2, NARROW, handlelength=2.4) as (figure, axes):
+    with styled():
+        figure = Figure(figsize=(NARROW, 2.9), layout="constrained")
+        axes = figure.subplots()
         for line in lines:
             _draw_curve(axes, line)
         for name, value in references:
@@ -509,6 +521,7 @@ def learning_curves(
         axes.set_ylabel(quantity)
         axes.set_xlim(0, max(line.steps[-1] for line in lines) / 1000)
         axes.set_ylim(*bounds)
+        label_lines(figure, axes, 2, handlelength=2.4)
     return figure
 
 

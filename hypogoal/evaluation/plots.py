@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 INK, RULE = "#24272b", "#d4d7dc"
@@ -28,6 +29,8 @@ STYLES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))  # of lines; do
 METHOD_COLOURS = PALETTE[:-1]  # of methods in Figures 3 and 4; grey is for what is no method
 WIDTH, NARROW = 5.6, 4.6  # inches; readable on a phone where it is scaled to the screen, and where two are in a row
 UNNAMED = re.compile(r"_(child|container)\d+|_nolegend_|")  # labels that matplotlib gives of itself
+BESIDE, BESIDE_LINES = 19, 12  # of names beside lines: characters of one of theirs, and how many lines
+APART = 0.085  # from one to the next, of the axes' height
 LABEL = 60  # characters of a legend's line, which fits a figure of WIDTH also in capitals
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -96,6 +99,41 @@ def legend_below(figure: Figure, places: Sequence[Axes], most: int, **more: Any)
             figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
             return
         legend.remove()
+
+
+def label_lines(figure: Figure, axes: Axes, columns: int, **more: Any) -> None:
+    """Each line's name at its right end, a short piece of the line before it; :func:`legend_below` where too many.
+
+    Names stand in the order of the lines' last values, as near to them as their room lets them.
+    """
+    lines = [line for line in axes.lines if not UNNAMED.fullmatch(str(line.get_label()))]
+    names = [textwrap.fill(str(line.get_label()), BESIDE, break_long_words=False) for line in lines]
+    rows = [name.count("\n") + 1 for name in names]
+    if sum(rows) > BESIDE_LINES or any(len(row) > LABEL // 2 for name in names for row in name.split("\n")):
+        legend_below(figure, [axes], columns, **more)
+        return
+    low, high = axes.get_ylim()
+    ends = []
+    for line in lines:
+        known = np.asarray(line.get_ydata(), dtype=np.float64)
+        known = known[np.isfinite(known)]
+        ends.append((known[-1] - low) / (high - low) if len(known) else 0.0)
+    order, free, places = np.argsort(ends, kind="stable").tolist(), 0.0, np.zeros(len(lines))
+    for index in order:  # from below, each pushed up as far as it must be; then down again what is above the plot
+        half = APART * rows[index] / 2
+        places[index] = max(ends[index], free + half)
+        free = places[index] + half
+    free = 1 + APART
+    for index in reversed(order):
+        half = APART * rows[index] / 2
+        places[index] = min(places[index], free - half)
+        free = places[index] - half
+    for line, name, place in zip(lines, names, places.tolist(), strict=True):
+        piece = Line2D([1.02, 1.1], [place, place])
+        piece.update_from(line)
+        piece.set(transform=axes.transAxes, clip_on=False)
+        axes.add_artist(piece)
+        axes.annotate(name, (1.115, place), xycoords=axes.transAxes, annotation_clip=False, va="center", fontsize=9)
 
 
 def grid_of_pictures(rows: int, columns: int, below: float = 0.0) -> tuple[Figure, list[Axes]]:
