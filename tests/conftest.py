@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections.abc import Iterator
 
 os.environ["OMP_NUM_THREADS"] = "1"
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: tests of Ctrl-C would wait for ever
@@ -11,6 +12,17 @@ import pytest
 import torch
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_states_to_browse() -> Iterator[None]:
+    """Evaluations explain 10 states instead of 120, which takes most of their time, and show 60 instead of 300."""
+    from hypogoal.evaluation import explorer
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(explorer, "MOST_STATES", 60)
+        patch.setattr(explorer, "MOST_EXPLAINED", 10)
+        yield
 
 
 @pytest.fixture
