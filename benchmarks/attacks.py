@@ -515,7 +515,6 @@ def measure() -> None:
 def prepare() -> None:
     """Load what commands load, so that those forked from this process need not."""
     import torch
-    import torch._dynamo  # which every process would load with its first optimiser
 
     import hypogoal.stages.evaluate
     import hypogoal.stages.report

@@ -13,6 +13,33 @@ import torch
 
 torch.set_num_threads(1)
 
+# Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
+LONGEST = (
+    "test_sweep",
+    "test_examples",
+    "test_evaluate_report",
+    "test_stopping",
+    "test_cli",
+    "test_attacks",
+    "test_trust",
+    "test_docs",
+    "test_loop",
+    "test_strange_texts",
+    "test_verification",
+    "test_exploits",
+    "test_many_layouts_example",
+    "test_rooms_domain",
+    "test_explorer",
+    "test_videos",
+    "test_terminal",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; the rest as they are."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+
 
 @pytest.fixture(scope="session", autouse=True)
 def few_states_to_browse() -> Iterator[None]:
