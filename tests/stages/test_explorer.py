@@ -22,7 +22,7 @@ from hypogoal.stages.train_meta import train_meta
 QUIET = {"quiet": True}
 MEMBERS = 2
 GOAL = "collect-red-key"
-GOALS = ("open-red-door", GOAL)
+GOALS = ("collect-blue-key", GOAL)
 
 
 @pytest.fixture(scope="module")
