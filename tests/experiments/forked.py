@@ -43,7 +43,7 @@ class Forked:
                 os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
                 os.dup2(stdout.fileno(), 1)
                 os.dup2(1, 2)
-                sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
+                sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
                 os.environ.clear()
                 os.environ.update(env)
                 preexec_fn()
@@ -79,7 +79,7 @@ class Forked:
 @contextmanager
 def forked() -> Iterator[None]:
     """Within it, runners fork the cells that they start."""
-    import torch._dynamo  # which the first optimiser of a process loads, for two seconds
+    import torch._dynamo  # noqa: F401 - which the first optimiser of a process loads, for two seconds
 
     import hypogoal.stages.evaluate
     import hypogoal.stages.train_ensemble  # noqa: F401
