@@ -40,15 +40,16 @@ demo: $(USER) ## where an ensemble is needed, in runs/rooms, then three-key Door
 	$(BIN)/hypogoal run which-feature --preset demo --out $(ROOMS) $(if $(wildcard $(ROOMS)),--resume)
 	$(BIN)/hypogoal run doorkey --preset demo --out $(DEMO) $(if $(wildcard $(DEMO)),--resume)
 
+# A file's tests share what they made; files in the order that tests/conftest.py gives them, the longest first.
+PARALLEL := -n $(JOBS) --dist loadfile --no-loadscope-reorder
 test: $(STAMP) ## the tests, without those marked slow or slurm
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(TESTS)
+	$(BIN)/python -m pytest $(PARALLEL) $(TESTS)
 
-# Other processors round otherwise: the oldest kernels, then (tests/uneven.py) any that depend on the batch around a state.
+# Other processors round otherwise: the oldest kernels, made (tests/uneven.py) to depend on the batch around a state.
 NUMERIC := tests/hypotheses tests/options/test_termination.py tests/meta/test_resuming.py
 OLDEST := ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 ONEDNN_MAX_CPU_ISA=SSE41
 kernels: $(STAMP) ## the tests of what is computed, as on other processors
-	$(OLDEST) $(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(NUMERIC)
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -p tests.uneven $(NUMERIC)
+	$(OLDEST) $(BIN)/python -m pytest $(PARALLEL) -p tests.uneven $(NUMERIC)
 
 slurm: $(STAMP) ## the test of sweeps on a real Slurm, where there is one (some minutes)
 	$(BIN)/python -m pytest -m slurm tests/experiments/test_slurm.py

@@ -293,6 +293,7 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, help="where to work; a temporary one where not given")
     given = parser.parse_args()
     import torch
+    import torch._dynamo  # which every process would load with its first optimiser
 
     import hypogoal.stages.train_baseline
     import hypogoal.stages.train_meta  # noqa: F401

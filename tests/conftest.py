@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections.abc import Iterator
 
 os.environ["OMP_NUM_THREADS"] = "1"
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: tests of Ctrl-C would wait for ever
@@ -11,6 +12,44 @@ import pytest
 import torch
 
 torch.set_num_threads(1)
+
+# Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
+LONGEST = (
+    "test_sweep",
+    "test_examples",
+    "test_evaluate_report",
+    "test_stopping",
+    "test_cli",
+    "test_attacks",
+    "test_trust",
+    "test_docs",
+    "test_loop",
+    "test_strange_texts",
+    "test_verification",
+    "test_exploits",
+    "test_many_layouts_example",
+    "test_rooms_domain",
+    "test_explorer",
+    "test_videos",
+    "test_terminal",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; the rest as they are."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_states_to_browse() -> Iterator[None]:
+    """Evaluations explain 10 states instead of 120, which takes most of their time, and show 60 instead of 300."""
+    from hypogoal.evaluation import explorer
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(explorer, "MOST_STATES", 60)
+        patch.setattr(explorer, "MOST_EXPLAINED", 10)
+        yield
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from forked import forked
 from toy import DATA, SMALL, write_toy
 
 from hypogoal.cli import main
@@ -43,7 +44,8 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``toy.toml`` and its unbroken sweep ``whole``."""
     folder = tmp_path_factory.mktemp("sweep")
     write_toy(folder / "toy.toml")
-    assert main(["sweep", str(folder / "toy.toml"), "--out", str(folder / "whole"), "-q"]) == 0
+    with forked():
+        assert main(["sweep", str(folder / "toy.toml"), "--out", str(folder / "whole"), "-q"]) == 0
     return folder
 
 
@@ -61,7 +63,10 @@ def killed(arguments: list[str], moment: Callable[[], bool]) -> None:
 
 
 def test_a_killed_sweep_ends_with_the_same_results(swept: Path) -> None:
-    """Spec G1, G4: SIGKILL while states are collected, and while an ensemble is trained; then the same bytes."""
+    """Spec G1, G4: SIGKILL while states are collected, and while an ensemble is trained; then the same bytes.
+
+    Here cells are started as a user's are; those of ``swept`` are forked, and make the same.
+    """
     out = swept / "broken"
     arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
     killed(arguments, lambda: draft_folder(out / "data.h5").exists())
@@ -92,8 +97,9 @@ def extended(swept: Path) -> tuple[list[str], dict[str, int]]:
     """The same sweep begun with one seed, started again, then given the other: its command, each cell's attempts."""
     out = swept / "extended"
     arguments = ["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]
-    for seeds in ("0", "0", "0-1"):
-        assert main([*arguments, "--seeds", seeds]) == 0
+    with forked():
+        for seeds in ("0", "0", "0-1"):
+            assert main([*arguments, "--seeds", seeds]) == 0
     return arguments, {cell.name: read_record(out, cell).attempts for cell in read_plan(out)[0].cells}
 
 
@@ -157,6 +163,7 @@ def test_a_lost_plan_is_told_with_what_goes_on(
         run(plan(str(swept / "toy.toml"), tmp_path), tmp_path, force=True, resume=True)
 
 
+@pytest.mark.usefixtures("forked_cells")
 def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(
     swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -229,6 +236,7 @@ command = "train-meta {{worse}} --seed {{seed}}"
 """
 
 
+@pytest.mark.usefixtures("forked_cells")
 def test_a_failed_cell_stops_only_those_that_need_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Spec G4: told with its log; exit code 2 and one line at the end; the status says who waits for whom."""
     toy, out = write_toy(tmp_path / "toy.toml", "0", FAILS), tmp_path / "out"
@@ -248,6 +256,7 @@ def test_a_failed_cell_stops_only_those_that_need_it(tmp_path: Path, capsys: pyt
     assert json.loads(capsys.readouterr().out)["counts"]["held"] == 1
 
 
+@pytest.mark.usefixtures("forked_cells")
 def test_what_was_changed_by_hand_is_not_replaced(
     swept: Path, extended: tuple[list[str], dict[str, int]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -264,6 +273,7 @@ def test_what_was_changed_by_hand_is_not_replaced(
     assert (out / "results.csv").read_bytes() == before
 
 
+@pytest.mark.usefixtures("forked_cells")
 def test_an_evaluation_of_less_is_not_done(swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec G4: neither in the status nor in the results, before it is made again; one that failed is tried again."""
     out, toy = tmp_path / "out", str(swept / "toy.toml")
@@ -314,6 +324,7 @@ def test_status_knows_what_runs_by_its_lock(swept: Path) -> None:
     assert not is_running(run, cell)
 
 
+@pytest.mark.usefixtures("forked_cells")
 def test_cells_are_run_in_the_plans_order(tmp_path: Path) -> None:
     """Spec G4: one that waits for nothing goes not before those that had to wait, nor when started again."""
     last = f'[[cells]]\nname = "more"\ncommand = "{DATA} --seed 1"'
@@ -331,6 +342,7 @@ def test_cells_are_run_in_the_plans_order(tmp_path: Path) -> None:
     assert started() == ["ensemble-seed-0", "more"]
 
 
+@pytest.mark.usefixtures("forked_cells")
 def test_what_was_to_be_made_anew_is_so_until_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

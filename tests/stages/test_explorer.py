@@ -22,7 +22,7 @@ from hypogoal.stages.train_meta import train_meta
 QUIET = {"quiet": True}
 MEMBERS = 2
 GOAL = "collect-red-key"
-FEW = {"MOST_STATES": 150, "MOST_EXPLAINED": 10}  # for the test's speed
+GOALS = ("collect-blue-key", GOAL)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def run(tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "browsed"
     collect(DOMAIN, DoorKeyConfig(heldout_layouts=3, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
     for seed in (0, 1):
-        config = TrainEnsembleConfig(steps=12, members=MEMBERS, workers=1)
+        config = TrainEnsembleConfig(steps=12, members=MEMBERS, workers=1, sub_goals=GOALS)
         train_ensemble(run / "data.h5", config, run / f"ensemble/seed-{seed}", seed=seed, **QUIET)
     short = TrainMetaConfig(steps=2_048, max_episode_steps=64, random_episodes=5, layout_seed=100)
     train_meta(run / "ensemble/seed-1", short, run / "meta", **QUIET)
@@ -40,10 +40,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def metrics(run):
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in FEW.items():
-            patch.setattr(f"hypogoal.evaluation.explorer.{name}", value)
-        return evaluate(run, run / "evaluation", **QUIET)
+    return evaluate(run, run / "evaluation", **QUIET)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +64,7 @@ def test_the_states_are_those_of_the_ensemble_that_was_used(run, metrics, data):
         "sub_goal": GOAL,
         "states": len(split.labels),
         "shown": 30,
-        "explained": 2,
+        "explained": 5,
         "reading": DOMAIN.reading,
     }
     with h5py.File(run / "evaluation" / "arrays.h5") as arrays:
@@ -78,11 +75,11 @@ def test_the_states_are_those_of_the_ensemble_that_was_used(run, metrics, data):
         np.testing.assert_array_equal(group["labels"][()], split.labels[rows])
         order = np.argsort(rows)
         verdicts, seeds = group["verdicts"][()][order], split.origins["layout_seed"][rows[order]]
-        assert group["attributions"].shape == (2, MEMBERS, 64, 64)
+        assert group["attributions"].shape == (5, MEMBERS, 64, 64)
         assert np.abs(group["attributions"][()].astype(int)).max() == 127
     assert [state["says"] for state in data[GOAL]["states"]] == verdicts.tolist()
     assert [state["place"] for state in data[GOAL]["states"]] == [f"layout {seed}" for seed in seeds]
-    assert sum(len(state["saliency"]) == MEMBERS for state in data[GOAL]["states"]) == 2
+    assert sum(len(state["saliency"]) == MEMBERS for state in data[GOAL]["states"]) == 5
     assert {state["truth"] for state in data[GOAL]["states"]} == {True, False}
 
 

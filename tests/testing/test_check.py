@@ -335,7 +335,10 @@ def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_own_objectives_and_networks_train(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec C1, C5: the examples are checked, trained with in processes of their own, read where they are allowed."""
+    """Spec C1, C5: the examples are checked, trained with, read where they are allowed.
+
+    In processes of their own ``test_own_code`` and ``test_trust`` have such code.
+    """
     from hypogoal import load_ensemble
 
     monkeypatch.chdir(TESTS.parent / "examples")
@@ -344,7 +347,7 @@ def test_own_objectives_and_networks_train(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.syspath_prepend(str(TESTS))
     assert main(["collect", "corridor_env:DOMAIN", "--out", str(data), "--set", "steps=150", "-q"]) == 0
     train = ["train-ensemble", str(data), "--out", str(out), "--diversity", "margin:pair_loss", "-q"]
-    few = [word for pair in ("steps=20", "members=2", "workers=2") for word in ("--set", pair)]
+    few = [word for pair in ("steps=20", "members=2", "workers=1") for word in ("--set", pair)]
     monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
     assert main([*train, *few, "--set", "network=wide_network:wide"]) == 0
     with pytest.raises(UserError, match=r"names code of its own as its network.*HYPOGOAL_TRUST=wide_network:wide"):
