@@ -100,7 +100,7 @@ def test_play_is_played_again_and_labelled_by_the_environment(tmp_path: Path) ->
 
 
 def test_play_goes_on_from_recorded_ways(tmp_path: Path) -> None:
-    """Spec B7: from somewhere on the way for as many steps as it has, in half of the steps; the others begin at first."""
+    """Spec B7: from somewhere on the way for as many steps as it has, in half of the steps."""
     steps: list[tuple[int, int]] = []  # of each step that is no recorded one, the height it began at, its action
 
     def fall(env: gymnasium.Env, observation: np.ndarray, rng: np.random.Generator) -> int:
@@ -253,7 +253,9 @@ def test_check_takes_few_states_and_says_what_all_need() -> None:
     """Spec B6: 2,000 pictures of each layout would be kept; of big ones that is more than a machine may have."""
 
     class Tall(CorridorEnv):
-        count = 0
+        def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
+            self.count = 0
+            return super().reset(**arguments)
 
         def image(self) -> np.ndarray:
             self.count += 1
@@ -262,7 +264,7 @@ def test_check_takes_few_states_and_says_what_all_need() -> None:
             return picture
 
     domain = GymnasiumDomain(Tall, corridor_env.SUB_GOALS)
-    config = GymnasiumConfig(states=2_000, steps=2_000, heldout_seeds=(4,))
+    config = GymnasiumConfig(states=2_000, steps=2_000, heldout_seeds=(4,), max_episode_steps=2_000)
     kept: list[int] = []
     collect = domain.collect
 
