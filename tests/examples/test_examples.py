@@ -175,7 +175,7 @@ def test_key_corridor_goes_through_all_stages(
         (tmp_path / name).write_bytes((EXAMPLES / name).read_bytes())
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYPOGOAL_TRUST", "key_corridor:DOMAIN")
-    short = {**SHORT, "collect": settings("steps=200")}
+    short = {**SHORT, "collect": settings("steps=60")}
     short["train-ensemble"] = settings("steps=20", "members=2", "workers=1")
     for words in (line.split() for line in text.splitlines() if line.startswith("    hypogoal")):
         assert main([*words[1:], *short.get(words[1], ()), *(["-q"] if words[1] != "report" else [])]) == 0, words
@@ -184,7 +184,7 @@ def test_key_corridor_goes_through_all_stages(
         assert all(row["positives"] >= 3 for row in data.counts()[split].values())
     assert [entry["path"] for entry in data.inputs] == ["key_corridor.json"]
     assert (tmp_path / "runs" / "corridor" / "report" / "index.html").is_file()
-    assert main(["collect", "key_corridor:DOMAIN", "--out", "plain.h5", "-q", *short["collect"]]) == 2
+    assert main(["collect", "key_corridor:DOMAIN", "--out", "plain.h5", "-q", *LAYOUTS]) == 2
     assert "hold-ball has no positives" in capsys.readouterr().err
 
 
