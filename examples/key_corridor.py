@@ -1,6 +1,7 @@
 """MiniGrid's KeyCorridor at 8 pixels a tile, where random play never gets to the ball: recorded play shows a way to it.
 
-Shows `collect --play`; up to the members 40 seconds of a core, all of it minutes. First `export HYPOGOAL_TRUST=key_corridor:DOMAIN`:
+Shows `collect --play`; 40 seconds of a core up to the members, minutes in all.
+First `export HYPOGOAL_TRUST=key_corridor:DOMAIN`:
 
     hypogoal collect key_corridor:DOMAIN --play key_corridor.json --out runs/corridor/data.h5
     hypogoal train-ensemble runs/corridor/data.h5 --out runs/corridor/ensemble
