@@ -28,10 +28,11 @@ from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, pl
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 ATTRIBUTES = (
-    "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "versions", "complete",
+    "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "inputs", "versions",
+    "complete",
 )  # fmt: skip
 AGAIN = "Collect it again."
-GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
+GET_MORE = "Collect more steps or other layouts, or bring recorded play (--play FILE) or a policy that gets there."
 FEW = 10  # labelled states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
@@ -156,6 +157,7 @@ def write_dataset(
     domain: str,
     config: Mapping[str, Any],
     seed: int,
+    inputs: Sequence[Mapping[str, str]] = (),
     force: bool = False,
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole.
@@ -177,6 +179,7 @@ def write_dataset(
         hdf5.set_attribute(file, "observation_dtype", str(collected.unlabelled.observations.dtype))
         hdf5.set_attribute(file, "config", json.dumps(dict(config)))
         hdf5.set_attribute(file, "seed", seed)
+        hdf5.set_attribute(file, "inputs", json.dumps(list(inputs)))
         hdf5.set_attribute(file, "versions", json.dumps(versions()))
         hdf5.set_attribute(file, "complete", False)  # in front: a file that is cut off keeps its attributes
         for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
@@ -251,6 +254,7 @@ class Dataset:
         dtype = self.attributes["observation_dtype"] or str(PICTURE)  # files from before there was another
         self.observation_dtype = NUMBERS if dtype == str(NUMBERS) else PICTURE
         self.config: dict[str, Any] = self._json("config", dict)
+        self.inputs: list[Any] = self._json("inputs", list) if self.attributes["inputs"] else []
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
         names = plain_names(self.sub_goals)

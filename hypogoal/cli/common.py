@@ -110,6 +110,8 @@ DOMAINS = "doorkey, montezuma, which-feature, or module:object."
 DomainName = Annotated[str, Argument(help=DOMAINS, autocompletion=offer("domain"))]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET, autocompletion=offer("setting"))]
+PLAYED = "States on this recorded way, too: a JSON file of actions, or a Minari dataset; own domains. Repeatable."
+Play = Annotated[list[str] | None, Option("--play", metavar="FILE", help=PLAYED)]
 Seed = Annotated[int, Option("--seed", min=0, max=MOST_INTEGER, help="Seed of everything that is random.")]
 Force = Annotated[bool, Option("--force", help="Replace what stands at --out.")]
 Resume = Annotated[bool, Option("--resume", help="Go on with what was begun; keep what is complete.")]
@@ -139,7 +141,7 @@ class Given:
     out: Path
     preset: str | None
     assignments: list[str]  # of --set
-    settings: Mapping[str, str | None]  # of the options that are settings
+    settings: Mapping[str, Any]  # of the options that are settings
     how: Mapping[str, Any]  # of every stage: seed, device, force, resume, quiet
 
     def config(self, domain: str, *, given: bool = False) -> Any:

@@ -14,6 +14,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import give, say
+from hypogoal.settings import configuration
 
 PLAYED = "a domain, a Gymnasium environment's id, or module:object."
 
@@ -87,6 +88,7 @@ def label(
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
     fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps a second; 0: a step for each key.")] = 0,
     resume: Annotated[bool, Option("--resume", help="Go on with a folder that there is.")] = False,
+    record: Annotated[Path | None, Option(help="Write what is played into this file, for 'collect --play'.")] = None,
 ) -> None:
     """Mark states by hand, in a window; 'import' takes them.
 
@@ -99,7 +101,7 @@ def label(
     with own_code.given(source):
         counts = stage(
             source, out, layout_seed=layout_seed, arguments=_arguments(arg or ()), heldout=heldout, fps=fps,
-            resume=resume,
+            resume=resume, record=record,
         )  # fmt: skip
     say(", ".join(f"{count} {kind}" for kind, count in counts.items()))
     if all(counts.values()):
@@ -127,13 +129,14 @@ def check(
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
     set_: cli.Set = None,
+    play: cli.Play = None,
     seed: cli.Seed = 0,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
 ) -> None:
     """Does an own domain, objective or network keep its contract?
 
-    Exit code 2 when not. --set changes how states of the domain are collected,
-    as for 'collect'; they are collected twice.
+    Exit code 2 when not. --set and --play change how states of the domain are
+    collected, as for 'collect'; a few are, twice.
     """
     from hypogoal.core import own_code
 
@@ -141,7 +144,8 @@ def check(
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
     kept = True
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
-        for verdict in _verdicts(domain, diversity, network, set_ or [], seed, layout_seed):
+        config = configuration("collect", domain, None, set_, {"play": play}, given=True) if domain else None
+        for verdict in _verdicts(domain, diversity, network, config, seed, layout_seed):
             for line in verdict.lines:
                 say(line)
             kept &= verdict.ok
@@ -150,9 +154,8 @@ def check(
 
 
 def _verdicts(
-    domain: str | None, diversity: str | None, network: str | None, assignments: list[str], seed: int, layout_seed: int
+    domain: str | None, diversity: str | None, network: str | None, config: Any, seed: int, layout_seed: int
 ) -> Iterator[Verdict]:
-    from hypogoal.core.config import resolve
     from hypogoal.testing import check_domain, check_network, check_objective
 
     seen: tuple[Any, ...] = ()
@@ -160,7 +163,6 @@ def _verdicts(
         from hypogoal.domains.base import load_domain
 
         found = load_domain(domain, given=True)
-        config: object = resolve(found.config_class, stage="collect", assignments=assignments)
         yield from check_domain(found, config, layout_seed=layout_seed, seed=seed)
         seen = tuple(found.observation_shape), found.observation_dtype
     if diversity is not None:

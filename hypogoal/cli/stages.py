@@ -1,5 +1,6 @@
 """The commands that make something: one stage each."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,13 +16,13 @@ FILMS = "RUN/report/videos/*.gif; the page shows the first. If not said: one, wh
 
 
 @cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
-def collect(given: cli.Given, domain: cli.DomainName) -> None:
+def collect(given: cli.Given, domain: cli.DomainName, play: cli.Play = None) -> None:
     """Collect labelled, unlabelled and held-out states."""
     from hypogoal.domains.base import load_domain
     from hypogoal.stages.collect import collect as collected
 
     found = load_domain(domain, given=True)
-    config = given.config(domain, given=True)
+    config = replace(given, settings={"play": play}).config(domain, given=True)
     cli.print_counts(collected(found, config, given.out, name=domain, **given.how), given.how["quiet"])
     given.end({}, "train-ensemble", given.out, "--out", cli.run_of(given.out) / "ensemble")
 

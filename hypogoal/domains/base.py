@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from math import prod
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -332,6 +333,14 @@ class Domain(ABC):
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked: Any = from_values(self.config_class, values, "collect") if values else None
         return {name: getattr(checked, name) for name in values}
+
+    def small(self, config: Any) -> Any:
+        """Settings with which ``check`` collects: those of ``config``, but for fewer states."""
+        return config
+
+    def inputs(self, config: Any) -> Sequence[Path]:
+        """Files that ``collect`` reads."""
+        return ()
 
     def collected_bytes(self, config: Any) -> int:
         """Bytes of observations that ``collect`` will make, at the most; 0 where nobody knows."""

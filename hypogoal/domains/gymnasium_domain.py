@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -15,12 +16,14 @@ from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import Collected, Observations, States, digest, require_classes
+from hypogoal.dataset import GET_MORE, Collected, Observations, States, digest, require_classes
 from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
+from hypogoal.domains.recorded_play import MINARI, Recorded, read_play
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 """What is played to collect states: (environment, observation, random numbers) -> action."""
+_Layout = tuple[int, list[Recorded]]  # its seed, and what was recorded on it
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,9 @@ class GymnasiumConfig:
     )
     explore: float = setting(0.25, "share of random actions, where the domain brings a policy", low=0.0, high=1.0)
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)
+    play: tuple[str, ...] = setting(
+        (), "files of recorded play, or folders of Minari datasets: half of the steps begin on the way that it went"
+    )
 
 
 class GymnasiumDomain(Domain):
@@ -60,7 +66,8 @@ class GymnasiumDomain(Domain):
         success: at the end of each episode of training, whether it was a success: a function of the environment, the
             last step's info, the episode's sum of rewards, and whether it terminated. None: where it terminated with a
             sum above 0.
-        policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play.
+        policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play. Policies by
+            sub-goal, one that gets there for each that is rare, share the steps evenly.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: distinct states that training keeps observations of, see ``GymnasiumEngine``.
         features: names of the numbers in observations that are no pictures; else those of a ``Dict``, or x0, x1, ...
@@ -83,7 +90,7 @@ class GymnasiumDomain(Domain):
         *,
         labels: engines.LabelAll | None = None,
         success: engines.Success | None = None,
-        policy: Policy | None = None,
+        policy: Policy | Mapping[str, Policy | None] | None = None,
         defaults: Mapping[str, Mapping[str, Any]] | None = None,
         memory: int = engines.MEMORY,
         features: Sequence[str] = (),
@@ -91,7 +98,7 @@ class GymnasiumDomain(Domain):
         name: str = "own",
         config_class: type[GymnasiumConfig] = GymnasiumConfig,
     ):
-        self.make, self.policy, self.memory, self.name = make, policy, memory, name
+        self.make, self.memory, self.name = make, memory, name
         self.success, self._named, self.resize = success, tuple(features), resize
         self.config_class = config_class
         generic = {field.name for field in fields(GymnasiumConfig)}
@@ -99,6 +106,10 @@ class GymnasiumDomain(Domain):
         self.engine_settings = tuple(self._own_settings)
         self._labels = engines.Labels(sub_goals, labels)
         self.sub_goals = self._labels.names
+        by_goal = policy if isinstance(policy, Mapping) else {}
+        self.policies = tuple(by_goal.values()) or (None if isinstance(policy, Mapping) else policy,)
+        if not set(by_goal) <= set(self.sub_goals):
+            raise UserError("policies are by sub-goal", ", ".join(by_goal), f"These are {', '.join(self.sub_goals)}.")
         self.defaults = dict(defaults or {})
 
     @cached_property
@@ -136,6 +147,12 @@ class GymnasiumDomain(Domain):
         told = {"max_steps": max_steps, "memory": memory, "success": self.success}
         return engines.GymnasiumEngine(make, self._labels, layouts, count, **told)
 
+    def small(self, config: GymnasiumConfig) -> GymnasiumConfig:
+        return replace(config, states=min(config.states, 200))
+
+    def inputs(self, config: GymnasiumConfig) -> list[Path]:
+        return [path / MINARI if path.is_dir() else path for path in map(Path, config.play)]
+
     def collected_bytes(self, config: GymnasiumConfig) -> int:
         layouts = len(config.labelled_seeds) + len(config.unlabelled_seeds) + len(config.heldout_seeds)
         return layouts * min(config.states, config.steps) * self.observation_bytes
@@ -147,17 +164,25 @@ class GymnasiumDomain(Domain):
         """Labelled, unlabelled and held-out states: what play on each layout meets, each picture once.
 
         Held-out states that look like one of those for learning are left out. Origins: ``layout_seed``, ``episode`` and
-        ``step``, counted from 0. Labelled states of one class only, no unlabelled or no held-out ones are a
-        ``UserError``.
+        ``step``, counted from 0. Labelled states of one class only, no unlabelled or no held-out ones, or recorded play
+        that cannot be played are a ``UserError``.
         """
         seeds_of_sets = config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds
-        progress.expect(sum(map(len, seeds_of_sets)) * config.steps)
         env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
+        recorded = [way for path in config.play for way in read_play(Path(path))]
+        for way in recorded:
+            most = int(env.action_space.n) - 1  # type: ignore[attr-defined]
+            if max(way.actions) > most or not any(way.layout_seed in seeds for seeds in seeds_of_sets):
+                what = f"recorded play has layout seed {way.layout_seed} and actions up to {max(way.actions)}"
+                do = f"The seed must be of labelled_seeds, unlabelled_seeds or heldout_seeds, actions 0 to {most}."
+                raise UserError(what, way.where, do)
+        progress.expect(sum(map(len, seeds_of_sets)) * config.steps + sum(len(way.actions) for way in recorded))
         learnt: set[bytes] = set()  # what the labelled and the unlabelled states look like
         sets: list[States] = []
         for seeds in seeds_of_sets:
             avoid = learnt if len(sets) == 2 else set()
-            met = [state for layout in seeds for state in self._play(env, config, layout, seed, avoid, progress)]
+            ways = [(layout, [way for way in recorded if way.layout_seed == layout]) for layout in seeds]
+            met = [state for way in ways for state in self._play(env, config, way, seed, avoid, progress)]
             sets.append(_states(met, self.look, len(self.sub_goals)))
             learnt.update(map(digest, sets[-1].observations))
         env.close()
@@ -167,17 +192,21 @@ class GymnasiumDomain(Domain):
             if not len(states.observations):
                 do = "Give other seeds, or more steps: states that look like those for learning do not count."
                 raise UserError(f"there are no {what} states", where, do)
-        do = "Give --set steps=N with more steps, other labelled_seeds, or the domain a policy that gets there."
-        require_classes(labelled.labels, self.sub_goals, where, do)
+        require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
         return Collected(self.look.shape, self.sub_goals, labelled, unlabelled, heldout, self.look.features)
 
     def _play(
-        self, env: gymnasium.Env, config: GymnasiumConfig, layout: int, seed: int, avoid: set[bytes], progress: Any
+        self, env: gymnasium.Env, config: GymnasiumConfig, on: _Layout, seed: int, avoid: set[bytes], progress: Any
     ) -> list[_Met]:
-        """The distinct states of one layout but those to ``avoid``: an even sample of each combination of sub-goals."""
+        """The distinct states of one layout but those to ``avoid``: an even sample of each combination of sub-goals.
+
+        Of its recorded play, whole; then of ``steps``, shared by the policies: half of them from the start, half from
+        somewhere on a recorded way, again and again for as many steps as that has.
+        """
+        layout, recorded = on
         rng, seen = rng_for(seed, "play", layout), set(avoid)
         groups: dict[bytes, _Sample] = {}
-        episode = step = 0
+        episode, step, last = -1, 0, 0
         actions = int(env.action_space.n)  # type: ignore[attr-defined]
 
         def look(observation: Any) -> None:
@@ -189,21 +218,36 @@ class GymnasiumDomain(Domain):
                 group = groups.setdefault(labels.tobytes(), _Sample(config.states))
                 group.offer(_Met(image, labels, (layout, episode, step)), rng)
 
-        observation, _info = engines.begun(env, seed=layout)
-        look(observation)
-        for _ in range(config.steps):
-            if self.policy is None or rng.random() < config.explore:
-                action = int(rng.integers(actions))
-            else:
-                with UsersCode("the domain's policy", self.policy) as code:
-                    action = code.choice(self.policy(env, observation, rng), "the action", actions)
-            observation, _reward, terminated, truncated, _info = engines.stepped(env, action)
-            step += 1
-            look(observation)  # the last state of an episode, too: a sub-goal may lie there
-            progress.advance()
-            if terminated or truncated or step >= config.max_episode_steps:
-                observation, _info = engines.begun(env, seed=layout)
-                episode, step = episode + 1, 0
+        kinds: list[tuple[Policy | None, list[Recorded], int]] = [(None, [one], len(one.actions)) for one in recorded]
+        whole, policies = len(kinds), self.policies * (2 if recorded else 1)
+        for number, policy in enumerate(policies):
+            first, end = (config.steps * place // len(policies) for place in (number, number + 1))
+            kinds.append((policy, recorded if number >= len(self.policies) else [], end - first))
+        for number, (policy, ways, steps) in enumerate(kinds):
+            over = True
+            for left in range(steps, 0, -1):
+                if over or step == last:
+                    observation, _info = engines.begun(env, seed=layout)
+                    episode, step = episode + 1, 0
+                    look(observation)
+                    way = ways[int(rng.integers(len(ways)))].actions if ways else ()
+                    ahead = len(way) if number < whole else int(rng.integers(len(way) + 1))
+                    last = ahead + (len(way) or config.max_episode_steps)
+                if step < ahead:
+                    action = way[step]
+                elif policy is None or rng.random() < config.explore:
+                    action = int(rng.integers(actions))
+                else:
+                    with UsersCode("the domain's policy", policy) as code:
+                        action = code.choice(policy(env, observation, rng), "the action", actions)
+                observation, _reward, terminated, truncated, _info = engines.stepped(env, action)
+                step += 1
+                look(observation)  # the last state of an episode, too: a sub-goal may lie there
+                progress.advance()
+                over = terminated or truncated or step >= config.max_episode_steps
+                if over and number < whole and left > 1:
+                    do = "Leave out the others, or give a larger max_episode_steps."
+                    raise UserError(f"the episode ends after {step} of {steps} actions", ways[0].where, do)
         return _shared_out(list(groups.values()), config.states, rng)
 
 

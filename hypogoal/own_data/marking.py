@@ -322,7 +322,7 @@ class Played(Source):
     """An environment that is played by keyboard; its states are those that an agent would see.
 
     ``make`` makes it: observations uint8 (H, W, C) or (H, W), actions ``Discrete``, else a ``UserError``. ``reset`` is
-    given ``layout_seed``; the next layout is one more.
+    given ``layout_seed``; the next layout is one more. ``recorded``: layout seed and actions of each episode.
     """
 
     def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
@@ -331,11 +331,13 @@ class Played(Source):
         _require_images(self._look.dtype, self._env.observation_space)
         self._names = action_names(self._env)
         self._layout = layout_seed
+        self.recorded: list[tuple[int, list[int]]] = []
         self.help = (*action_help(self._names), "r: begin again, l: next layout")
         self._begin()
 
     def _begin(self) -> None:
         observation, _info = begun(self._env, seed=self._layout)
+        self.recorded.append((self._layout, []))
         self._show(observation, 0, over=False)
 
     def _show(self, observation: Any, steps: int, *, over: bool) -> None:
@@ -362,6 +364,7 @@ class Played(Source):
             self._begin()
             return True
         observation, _reward, terminated, truncated, _info = stepped(self._env, action)
+        self.recorded[-1][1].append(action)
         self._show(observation, self._steps + 1, over=terminated or truncated)
         return True
 

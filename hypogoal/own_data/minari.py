@@ -15,10 +15,10 @@ from hypogoal.core.hdf5 import create_hdf5, find, members, open_hdf5, read_array
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE, write_observations
+from hypogoal.domains.recorded_play import MINARI
 from hypogoal.meta.episodes import Episode
 from hypogoal.own_data.parts import Parts, require_memory
 
-MAIN_FILE = Path("data") / "main_data.hdf5"
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
 MINARI_VERSION = "0.5.4"  # whose layout is written
@@ -39,7 +39,7 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
     stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
-    episodes = _episodes(folder / MAIN_FILE, key, _picture_shape(about.get("observation_space"), key))
+    episodes = _episodes(folder / MINARI, key, _picture_shape(about.get("observation_space"), key))
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
     order = rng_for(seed, "minari").permutation(len(episodes))
@@ -101,8 +101,8 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
     """
     seen: Any = None
     total = count = 0
-    (folder / MAIN_FILE).parent.mkdir(parents=True)
-    with create_hdf5(folder / MAIN_FILE) as file:
+    (folder / MINARI).parent.mkdir(parents=True)
+    with create_hdf5(folder / MINARI) as file:
         for episode in episodes:
             group, steps = file.create_group(f"episode_{count}"), len(episode.actions)
             seen = episode.observations

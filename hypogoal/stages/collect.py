@@ -4,7 +4,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import DATA, claim, versions
+import numpy as np
+
+from hypogoal.core.artefacts import DATA, claim, sha256_of, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
@@ -13,6 +15,7 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
 from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
 from hypogoal.domains.base import BUILT_IN, Domain
+from hypogoal.options.config import OptionConfig
 
 COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
 
@@ -36,10 +39,11 @@ def collect(
     require_names(domain.sub_goals)  # not after all the play, when the file is written
     given, out = out, claim(out, kind=DATA, force=force, resume=resume)
     about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
+    about["inputs"] = [{"path": str(path), "sha256": sha256_of(path)} for path in domain.inputs(config)]
     if resume and out.exists() and not unfinished(out):
         found = open_dataset(out)
         before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
-        raise check_complete(before, about, given)
+        raise check_complete({**before, "inputs": found.inputs}, about, given)
     size = domain.collected_bytes(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
@@ -53,4 +57,10 @@ def collect(
         told = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
         for line in told + hard_to_judge(collected.heldout.labels, collected.sub_goals):
             say(f"hypogoal: {line}", err=True)
+        if "step" in collected.labelled.origins and "option_timeout" not in domain.defaults.get("train-options", {}):
+            soonest = (collected.labelled.origins["step"][held].min() for held in collected.labelled.labels.T)
+            apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
+            if 2 * apart > OptionConfig.option_timeout and not quiet:
+                what = f"from one sub-goal to the next play took up to {apart} steps, each at its soonest"
+                say(f"hypogoal: {what}: --set option_timeout={2 * apart} gives options time for that", err=True)
     return open_dataset(out).counts()

@@ -15,7 +15,7 @@ from hypogoal.dataset import Collected, open_dataset, write_dataset
 from hypogoal.domains.base import IMPORTED, defaults_of
 from hypogoal.own_data.arrays import read_arrays, write_arrays
 from hypogoal.own_data.images import read_images
-from hypogoal.own_data.minari import MAIN_FILE, read_minari
+from hypogoal.own_data.minari import MINARI, read_minari
 from hypogoal.own_data.parts import collected_of
 
 LABELS = "hypogoal.labels"  # entry points of label functions
@@ -43,7 +43,7 @@ def import_data(
     are of, for later stages. Errors: see ``hypogoal.own_data``.
     """
     claim(out, kind=DATA, inputs=[source], force=force)
-    if (source / MAIN_FILE).exists():
+    if (source / MINARI).exists():
         functions = [load_own(name, "label function", LABELS, {}) for name in (labels or {}).values()]
         parts, sub_goals = read_minari(source, functions, key=key, seed=seed), tuple(labels or ())
     elif labels or key:

@@ -1,5 +1,6 @@
 """Spec B6: states marked by hand, in the folder of images that ``import`` takes."""
 
+import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ import gymnasium
 from hypogoal.core import own_code
 from hypogoal.core.drafts import sole_writer
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import replace_text
 from hypogoal.dataset import require_names
 from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS, Domain
 from hypogoal.own_data.marking import KINDS, Marks, Played, Recorded, Source, mark_states, recorded_states
@@ -26,18 +28,22 @@ def label(
     heldout: bool = False,
     fps: int = 0,
     resume: bool = False,
+    record: Path | None = None,
 ) -> dict[str, int]:
     """Show states in a window and keep what a person says of them; returns how many states of each kind are marked.
 
     ``source`` is a data file, a ``.npz`` file or a folder of images, whose states are shown one after another; or what
     is played: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
     environment, with ``arguments``. ``out`` is the folder, whose name is the sub-goal's; ``heldout``: the marks are for
-    evaluation, in ``out/heldout``. ``fps``: steps a second in real time; 0: a step for each key. No such source, an
-    ``out`` that exists and is not to be gone on with (``resume``), or no screen is a ``UserError``.
+    evaluation, in ``out/heldout``. ``fps``: steps a second in real time; 0: a step for each key. ``record``: the file
+    that what is played becomes, for ``collect --play``. No such source, an ``out`` that exists and is not to be gone on
+    with (``resume``), a ``record`` that exists, or no screen is a ``UserError``.
     """
     require_names([out.resolve().name])
     if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
         raise UserError("it exists already", out, "Give --resume to go on with it, or another --out.")
+    if record and (record.exists() or Path(source).exists()):
+        raise UserError("play is recorded in a new file, of what is played", record, "Give another --record, or none.")
     states: Source
     if Path(source).exists():
         states = Recorded(recorded_states(Path(source)))
@@ -46,7 +52,12 @@ def label(
     out.parent.mkdir(parents=True, exist_ok=True)
     with sole_writer(out):
         marks = Marks(out / HELD_OUT, KINDS[:2]) if heldout else Marks(out)
-        mark_states(states, marks, out.resolve().name, fps=fps)
+        try:
+            mark_states(states, marks, out.resolve().name, fps=fps)
+        finally:
+            if record and isinstance(states, Played):
+                played = [{"layout_seed": seed, "actions": actions} for seed, actions in states.recorded if actions]
+                replace_text(record, json.dumps(played) + "\n")
         return marks.counts()
 
 

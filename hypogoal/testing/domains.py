@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.config import from_values, meant, resolve
+from hypogoal.core.preflight import human
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import GET_MORE, NUMBERS, PICTURE, Collected, States, hard_to_learn, leave_out, require_names
@@ -23,8 +24,8 @@ GYMNASIUM_SAYS_NOT = ("is different from the unwrapped version",)  # of its chec
 def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, seed: int = 0) -> Iterator[Verdict]:
     """Whether a domain keeps to what the stages rely on.
 
-    States are collected twice, with ``config``, an instance of its ``config_class``, or the defaults where None; a
-    layout is played at random. ``seed`` is of both.
+    A few states are collected twice, with ``config``, an instance of its ``config_class``, or the defaults where None;
+    a layout is played at random. ``seed`` is of both.
     """
     return run(_Contract(domain, config, layout_seed, seed).tests())
 
@@ -184,7 +185,7 @@ class _Contract:
         return "a restored engine goes on as the one it was saved from"
 
     def collect(self) -> Collected:
-        return self.domain.collect(self.config, self.seed, Progress("check", total=1, quiet=True))
+        return self.domain.collect(self.domain.small(self.config), self.seed, Progress("check", total=1, quiet=True))
 
     def collection(self) -> str:
         self.collected = self.collect()
@@ -201,7 +202,9 @@ class _Contract:
             for origin, values in states.origins.items():
                 fits = values.shape == (count,) and values.dtype.kind in "iu"
                 promise(fits, f"{name} origin {origin} is {values.dtype} {values.shape}", f"Give int ({count},).")
-        return ", ".join(f"{len(states.observations)} {name}" for name, states in _sets(self.collected))
+        found = ", ".join(f"{len(states.observations)} {name}" for name, states in _sets(self.collected))
+        size = self.domain.collected_bytes(self.config)
+        return f"{found}; 'collect' keeps up to {human(size)}, twice that in memory" if size else found
 
     def classes(self) -> str:
         text = []

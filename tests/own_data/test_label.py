@@ -18,6 +18,7 @@ from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
+from hypogoal.domains.recorded_play import read_play
 from hypogoal.own_data.images import read_images
 from hypogoal.own_data.marking import GRID_KEYS, Marks, action_help, action_names, action_of, as_rgb
 from hypogoal.stages.label import environment_of
@@ -58,6 +59,20 @@ def test_a_domain_is_played_and_its_states_become_data(tmp_path: Path, capsys: p
     np.testing.assert_array_equal(data.unlabelled(), first[None])
     before, after = played([1], 7)
     np.testing.assert_array_equal(heldout.observations, np.stack([after, before]))
+
+
+def test_what_is_played_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec B7: each episode's layout seed and actions, in the form that ``collect --play`` reads; marks need not be."""
+    record, out = tmp_path / "play.json", tmp_path / "turned"
+    keys = "left up r up right x l right n e"  # x plays nothing, n marks, e picks up
+    assert label(keys, "doorkey", "--out", str(out), "--record", str(record), "--layout-seed", "4") == 0
+    assert [one[:2] for one in read_play(record)] == [(4, (0, 2)), (4, (2, 1)), (5, (1, 3))]
+    assert Marks(out).counts()["negative"] == 1
+    for source, do in (("doorkey", "--resume"), (str(out / "negative"), "--heldout")):
+        other = record if do == "--resume" else tmp_path / "other.json"
+        assert main(["label", source, "--out", str(out), do, "--record", str(other)]) == 2
+        assert "play is recorded in a new file, of what is played" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir() if path.suffix] == ["play.json"]
 
 
 def test_recorded_states_are_stepped_through(tmp_path: Path) -> None:
