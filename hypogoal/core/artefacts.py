@@ -9,7 +9,7 @@ import hashlib
 import os
 import platform
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -32,6 +32,8 @@ from hypogoal.core.manifests import (
     sealed,
 )
 
+CARD = "README.md"
+Card = Callable[[Mapping[str, Any], Path], str]  # from what the manifest will say, and the files, to the card's text
 DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
 DEPTH = 3  # of folders, in which a run's artefacts lie
@@ -211,8 +213,9 @@ def create_artefact(
     inputs: Sequence[Path] = (),
     force: bool = False,
     resume: bool = False,
+    card: Card | None = None,
 ) -> Iterator[Path]:
-    """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
+    """A folder to fill; at the end its ``card`` and its manifest are written and it is renamed to ``out``.
 
     ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are artefact folders or data files that
     were read. ``checkpoints_of`` knows where the checkpoints beside the folder are. When the block raises, ``out`` is
@@ -235,6 +238,8 @@ def create_artefact(
         raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
     with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
+        if card is not None:
+            (work.files / CARD).write_bytes(card({**about, "inputs": entries}, work.files).encode())
         made = sorted(file for file in work.files.rglob("*") if file.is_file())
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
         manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}

@@ -57,7 +57,7 @@ def look(work: Work, judgement: Judgement) -> None:
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
     if explained:
-        from hypogoal.evaluation.deep_lift import attributed, explanation
+        from hypogoal.hypotheses.deep_lift import attributed, explanation
 
         ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
         found = attributed(ensemble, seen, baseline)
