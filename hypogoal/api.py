@@ -50,21 +50,17 @@ class Made:
         """Its numbers: counts of states, the last of a training's logs, or all of an evaluation or a comparison."""
         return numbers_in(describe_path(self.path)["kind"], self.path)
 
-    def _lines(self) -> list[str]:
-        about = describe_path(self.path)
-        first, *more = lines({key: value for key, value in about.items() if key != "counts"})
-        return [*map(printable, [first, *outcome(about["kind"], self.path), *more])]
-
     def __repr__(self) -> str:
-        return self._lines()[0]
+        about = describe_path(self.path)
+        return "\n".join(map(printable, [lines(about)[0], *outcome(about["kind"], self.path)]))
 
     def _repr_html_(self) -> str:
-        told = "\n".join([repr(self), *map(printable, outcome(describe_path(self.path)["kind"], self.path))])
-        return f'<pre style="line-height: 1.2">{escape(told)}</pre>'
+        return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'
 
     def show(self) -> None:
         """Print what ``hypogoal show`` tells: what came out, configuration, inputs."""
-        for line in self._lines():
+        about = describe_path(self.path)
+        for line in [*repr(self).splitlines(), *lines({**about, "counts": None})[1:]]:
             say(line)
 
 
@@ -94,18 +90,18 @@ def train_meta(ensemble: Place, out: Place, *, options: Place | None = None, **g
 
 def evaluate(run: Place, out: Place | None = None, **given: Any) -> Made:
     """Compute every number of a run, into ``run/evaluation`` or ``out``; ``given``: ``layouts``, and no settings."""
-    from hypogoal.stages.evaluate import evaluate as evaluated
-
     place = Path(out or Path(run) / "evaluation")
-    return _called("evaluate", place, partial(evaluated, Path(run), place, **given), {"run": run, **given})
+    return _called(
+        "evaluate", place, partial(stages.named("evaluate"), Path(run), place, **given), {"run": run, **given}
+    )
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
     """Compare evaluated runs, the others with the first; it shows who wins, by how much, on what."""
-    from hypogoal.stages.compare import compare as compared
-
     paths = [*map(Path, runs)]
-    return _called("compare", Path(out), partial(compared, paths, Path(out), force=force), {"runs": paths})
+    return _called(
+        "compare", Path(out), partial(stages.named("compare"), paths, Path(out), force=force), {"runs": paths}
+    )
 
 
 def _made(stage: str, source: str | Path, out: Place, given: dict[str, Any], **own: Any) -> Made:

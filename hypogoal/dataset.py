@@ -156,13 +156,7 @@ def require_names(sub_goals: Sequence[str]) -> None:
 
 
 def write_dataset(
-    path: Path,
-    collected: Collected,
-    *,
-    domain: str,
-    config: Mapping[str, Any],
-    seed: int,
-    force: bool = False,
+    path: Path, collected: Collected, *, domain: str, config: Mapping[str, Any], seed: int, force: bool = False
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole.
 

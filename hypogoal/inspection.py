@@ -79,11 +79,11 @@ def outcome(kind: str, path: Path) -> list[str]:
         return count_lines(numbers)
     if kind == EVALUATION:
         return drawn(summary_of(numbers, path), 100).splitlines()
-    return (
-        winners(numbers["comparisons"])
-        if kind == "comparison"
-        else [f"{name}: {numbers[name]:.4g}" for name in numbers]
-    )
+    if kind == "comparison":
+        from hypogoal.evaluation.compare import winners
+
+        return winners(numbers["comparisons"])
+    return [f"{name}: {value:.4g}" for name, value in numbers.items()]
 
 
 def count_lines(counts: Mapping[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ import hashlib
 import os
 import platform
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -32,26 +32,15 @@ from hypogoal.core.manifests import (
     sealed,
 )
 
-CARD = "README.md"
-Card = Callable[[Mapping[str, Any], Path], str]  # from what the manifest will say, and the files, to the card's text
 DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
 DEPTH = 3  # of folders, in which a run's artefacts lie
 FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
-    "hypogoal",
-    "torch",
-    "numpy",
-    "gymnasium",
-    "minigrid",
-    "ale-py",
-    "opencv-python-headless",
-    "captum",
-    "h5py",
-    "safetensors",
-    "stable-baselines3",
-)
+    "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
+    "safetensors", "stable-baselines3",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -213,7 +202,7 @@ def create_artefact(
     inputs: Sequence[Path] = (),
     force: bool = False,
     resume: bool = False,
-    card: Card | None = None,
+    card: Callable[[dict[str, Any], Path], str] = lambda about, folder: "",
 ) -> Iterator[Path]:
     """A folder to fill; at the end its ``card`` and its manifest are written and it is renamed to ``out``.
 
@@ -238,8 +227,8 @@ def create_artefact(
         raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
     with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
-        if card is not None:
-            (work.files / CARD).write_bytes(card({**about, "inputs": entries}, work.files).encode())
+        if text := card({**about, "inputs": entries}, work.files):
+            (work.files / "README.md").write_bytes(text.encode())
         made = sorted(file for file in work.files.rglob("*") if file.is_file())
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
         manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}

@@ -30,11 +30,8 @@ METHOD_COLOURS = PALETTE[:-1]  # of methods in Figures 3 and 4; grey is for what
 WIDTH, NARROW = 5.6, 4.6  # inches; readable on a phone where it is scaled to the screen, and where two are in a row
 UNNAMED = re.compile(r"_(child|container)\d+|_nolegend_|")  # labels that matplotlib gives of itself
 LABEL = 60  # characters of a legend's line, which fits a figure of WIDTH also in capitals
-BESIDE, BESIDE_LINES, APART = (
-    19,
-    12,
-    0.085,
-)  # of names beside lines: characters of one of theirs, how many, how far apart
+# Of names beside lines: characters of one of theirs, how many, how far apart.
+BESIDE, BESIDE_LINES, APART = 19, 12, 0.085
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
     "font.size": 10.5,

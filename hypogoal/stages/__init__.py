@@ -19,7 +19,7 @@ def make(
     """
     from hypogoal.domains.base import defaults_of, load_domain
 
-    module, given = import_module(f"hypogoal.stages.{stage.replace('-', '_')}"), isinstance(source, str)
+    given = isinstance(source, str)
     domain = source if isinstance(source, str) else domain_of(source, stage)
     config = configuration(stage, domain, preset, (), settings, given=given)
     values = [part for value in settings.values() for part in (value.split(",") if isinstance(value, str) else ())]
@@ -28,7 +28,13 @@ def make(
     if stage == "collect":
         first, rest["name"] = load_domain(domain, given=True), domain
     with own_code.given(*map(str.strip, values)), own_code.vouched(*own):
-        return getattr(module, module.__name__.rpartition(".")[2])(first, config, out, **rest)
+        return named(stage)(first, config, out, **rest)
+
+
+def named(stage: str) -> Any:
+    """The function of a stage, which is imported where it is needed."""
+    name = stage.replace("-", "_")
+    return getattr(import_module(f"hypogoal.stages.{name}"), name)
 
 
 def domain_of(source: Path, stage: str) -> str:

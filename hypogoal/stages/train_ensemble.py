@@ -173,13 +173,7 @@ class _Report(Resumable):
 
 
 def _train_one(
-    data: Path,
-    others: Sequence[Path],
-    sub_goal: str,
-    config: TrainEnsembleConfig,
-    seed: int,
-    folder: Path,
-    device: str,
+    data: Path, others: Sequence[Path], sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path, device: str
 ) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()
