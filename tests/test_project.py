@@ -135,7 +135,7 @@ def loaded_by(code: str) -> set[str]:
 
 
 def test_versions_of_python_are_those_that_are_tested() -> None:
-    """Each version of the classifiers is in the CI, the first is the least allowed; an extra that a line names is there."""
+    """The classifiers' are the CI's, the first is the least allowed; extras that a line names are there."""
     named = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
     others = re.search(r"^for version in (.*); do$", (ROOT / ".ci/run").read_text(encoding="utf-8"), re.M)
     assert others and ["3.11", *others[1].split()] == named and PROJECT["requires-python"] == ">=3.11"
@@ -346,7 +346,7 @@ def test_one_way_to_print_and_one_to_open() -> None:
     printing = re.compile(r"typer\.echo\(|(?<![\w.])print\(|Console\(|sys\.std(out|err)\.write")
     opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
     own = {
-        "core/config.py", "core/drafts.py", "core/files.py", "core/preflight.py", "core/progress.py",
+        "cards.py", "core/config.py", "core/drafts.py", "core/files.py", "core/preflight.py", "core/progress.py",
         "core/terminal.py", "evaluation/page.py", "experiments/records.py", "live_view.py", "own_data/arrays.py",
         "own_data/images.py", "stages/train_ensemble.py",
     }  # fmt: skip

@@ -68,7 +68,7 @@ def screen(*, err: bool = False, width: int | None = None, **more: Any) -> Conso
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
 
-    return Screen(stderr=err, width=width, markup=False, emoji=False, highlight=False, **more)
+    return Screen(stderr=err, width=width, markup=False, emoji=False, highlight=False, force_jupyter=False, **more)
 
 
 def _silence(stream: TextIO) -> None:
