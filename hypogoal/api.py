@@ -90,18 +90,16 @@ def train_meta(ensemble: Place, out: Place, *, options: Place | None = None, **g
 
 def evaluate(run: Place, out: Place | None = None, **given: Any) -> Made:
     """Compute every number of a run, into ``run/evaluation`` or ``out``; ``given``: ``layouts``, and no settings."""
-    place = Path(out or Path(run) / "evaluation")
-    return _called(
-        "evaluate", place, partial(stages.named("evaluate"), Path(run), place, **given), {"run": run, **given}
-    )
+    path, place = Path(run), Path(out or Path(run) / "evaluation")
+    call = partial(stages.named("evaluate"), path, place, **given)
+    return _called("evaluate", place, call, {"run": path, **given})
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
     """Compare evaluated runs, the others with the first; it shows who wins, by how much, on what."""
     paths = [*map(Path, runs)]
-    return _called(
-        "compare", Path(out), partial(stages.named("compare"), paths, Path(out), force=force), {"runs": paths}
-    )
+    call = partial(stages.named("compare"), paths, Path(out), force=force)
+    return _called("compare", Path(out), call, {"runs": paths})
 
 
 def _made(stage: str, source: str | Path, out: Place, given: dict[str, Any], **own: Any) -> Made:
@@ -113,7 +111,8 @@ def _made(stage: str, source: str | Path, out: Place, given: dict[str, Any], **o
 
 def _called(stage: str, out: Path, run: Callable[[], object], words: Mapping[str, Any]) -> Made:
     """What a stage makes; the manifest's command is the call. What is to be resumed may be complete."""
-    told = (f"{name}={value}" for name, value in words.items() if value and name != "resume")
+    texts = {name: ",".join(map(str, of)) if isinstance(of, list | tuple) else of for name, of in words.items()}
+    told = (f"{name}={of}" for name, of in texts.items() if of not in (None, "") and name != "resume")
     token = drafts.COMMAND.set((f"hypogoal.{stage.replace('-', '_')}", f"out={out}", *told))
     try:
         with contextlib.suppress(Complete):

@@ -296,7 +296,7 @@ def test_a_current_folder_that_was_deleted(tmp_path: Path, line: str) -> None:
 def test_a_table_as_text_is_shown_nowhere_else(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same text in a terminal with colours, in a pipe and in a notebook, where Rich would show the table besides."""
+    """The same text in a terminal with colours, in a pipe and in a notebook, where Rich would show it besides."""
     from rich import console as of_rich
     from rich.table import Table
 

@@ -122,8 +122,10 @@ def test_settings_count_more_than_presets(run: Path, tmp_path: Path) -> None:
     """Precedence: settings, preset, default; tuples are lists."""
     preset = tmp_path / "mine.toml"
     preset.write_text("[train-ensemble]\nsteps = 7\nmembers = 3\nlearning_rate = 0.01\n")
-    given = {**FEW, "preset": str(preset), "steps": 4, "sub_goals": ["left-end"]}
-    config = open_artefact(hypogoal.train_ensemble(run / "data.h5", out=tmp_path / "ensemble", **given).path).config
+    given = {**FEW, "preset": str(preset), "steps": 4, "sub_goals": ["left-end"], "diversity_weight": 0}
+    made = open_artefact(hypogoal.train_ensemble(run / "data.h5", out=tmp_path / "ensemble", **given).path)
+    config = made.config
+    assert {"diversity_weight=0", "sub_goals=left-end", f"preset={preset}"} <= {*made.manifest["command"]}
     told = [config[name] for name in ("steps", "members", "learning_rate", "sub_goals")]
     assert told == [4, 2, 0.01, ["left-end"]]
 
@@ -167,4 +169,7 @@ def test_a_comparison_says_who_wins(run: Path, tmp_path: Path) -> None:
     made = hypogoal.compare(run, other, out=tmp_path / "both")
     assert made.metrics["comparisons"] and "no clear winner of run and other" in repr(made)
     assert check_files(open_artefact(made.path)) == []
+    command = open_artefact(made.path).manifest["command"]
+    assert command == ["hypogoal.compare", f"out={made.path}", f"runs={run},{other}"]
+    assert open_artefact(run / "evaluation").manifest["command"][-1] == "quiet=True"
     assert open_dataset(run / "data.h5").domain == NAME
