@@ -12,22 +12,17 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.10.0"
 
 if TYPE_CHECKING:
-    from hypogoal.api import OptionEnv, load_ensemble, load_options
+    from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options
+    from hypogoal.api import train_ensemble, train_meta, train_options  # isort: skip
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium_domain import GymnasiumDomain
     from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 
 _LAZY = {"GymnasiumDomain": "hypogoal.domains.gymnasium_domain", "UserError": "hypogoal.core.errors"}
 __all__ = [
-    "GymnasiumDomain",
-    "OptionEnv",
-    "SubgoalReward",
-    "SubgoalTermination",
-    "UserError",
-    "__version__",
-    "load_ensemble",
-    "load_options",
-]
+    "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "SubgoalTermination", "UserError", "__version__",
+    "collect", "compare", "evaluate", "load_ensemble", "load_options", "train_ensemble", "train_meta", "train_options",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -1,14 +1,30 @@
-"""The Python interface: load what was trained, predict, and play options as actions of a Gymnasium environment."""
+"""The Python interface: run stages, load what was trained, predict, play options as actions of an environment.
 
+The stages' functions do what their commands do. ``given`` is what these take: ``preset``, ``seed``, ``device``,
+``force``, ``resume``, ``quiet``, and every setting by its name. What would end a command is a ``UserError``.
+"""
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hypogoal import stages
+from hypogoal.core import drafts
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.tensors import load_tensors
+from hypogoal.core.terminal import printable, say
+from hypogoal.domains.base import BUILT_IN, Domain, here, load_domain
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
+from hypogoal.inspection import describe_path, lines, numbers_in, outcome
 from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Narrowed
@@ -16,6 +32,94 @@ from hypogoal.options.policies import make_policies
 from hypogoal.options.termination import Dwell, Patience, rule_of, thresholds_in
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
+Place = str | os.PathLike[str]
+HOW = ("preset", "seed", "device", "force", "resume", "quiet")  # of what is given: no settings
+
+
+class Made:
+    """A data file, an artefact or a run at a ``path``: a path wherever one is asked for, and something to look at."""
+
+    def __init__(self, path: Place):
+        self.path = Path(path)
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Its numbers: counts of states, the last of a training's logs, or all of an evaluation or a comparison."""
+        return numbers_in(describe_path(self.path)["kind"], self.path)
+
+    def __repr__(self) -> str:
+        about = describe_path(self.path)
+        return "\n".join(map(printable, [lines(about)[0], *outcome(about["kind"], self.path)]))
+
+    def _repr_html_(self) -> str:
+        return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'
+
+    def show(self) -> None:
+        """Print what ``hypogoal show`` tells: what came out, configuration, inputs."""
+        about = describe_path(self.path)
+        for line in [*repr(self).splitlines(), *lines({**about, "counts": None})[1:]]:
+            say(line)
+
+
+def collect(domain: str | Domain, out: Place, **given: Any) -> Made:
+    """Collect states into the HDF5 file ``out``; a domain itself is known in this process by its ``name``."""
+    if isinstance(domain, Domain):
+        if domain.name in BUILT_IN and load_domain(domain.name) is not domain:
+            raise UserError("an own domain is called like one of hypogoal's", domain.name, "Give it another name.")
+        here[domain.name] = domain
+    return _made("collect", domain if isinstance(domain, str) else domain.name, out, given)
+
+
+def train_ensemble(data: Place, out: Place, *, unlabelled: Iterable[Place] = (), **given: Any) -> Made:
+    """Train an ensemble for each sub-goal of a data file, perhaps with ``unlabelled`` states from elsewhere."""
+    return _made("train-ensemble", Path(data), out, given, unlabelled=[*map(Path, unlabelled)])
+
+
+def train_options(ensemble: Place, out: Place, *, options: Place | None = None, **given: Any) -> Made:
+    """Learn an option for every member of an ensemble, or go on with ``options`` of it."""
+    return _made("train-options", Path(ensemble), out, given, options=Path(options) if options else None)
+
+
+def train_meta(ensemble: Place, out: Place, *, options: Place | None = None, **given: Any) -> Made:
+    """Learn which options to choose, fresh ones or ``options`` that were trained, by the reward."""
+    return _made("train-meta", Path(ensemble), out, given, options=Path(options) if options else None)
+
+
+def evaluate(run: Place, out: Place | None = None, **given: Any) -> Made:
+    """Compute every number of a run, into ``run/evaluation`` or ``out``; ``given``: ``layouts``, and no settings."""
+    path, place = Path(run), Path(out or Path(run) / "evaluation")
+    call = partial(stages.named("evaluate"), path, place, **given)
+    return _called("evaluate", place, call, {"run": path, **given})
+
+
+def compare(*runs: Place, out: Place, force: bool = False) -> Made:
+    """Compare evaluated runs, the others with the first; it shows who wins, by how much, on what."""
+    paths = [*map(Path, runs)]
+    call = partial(stages.named("compare"), paths, Path(out), force=force)
+    return _called("compare", Path(out), call, {"runs": paths})
+
+
+def _made(stage: str, source: str | Path, out: Place, given: dict[str, Any], **own: Any) -> Made:
+    settings = {name: value for name, value in given.items() if name not in HOW}
+    how = {name: value for name, value in given.items() if name in HOW}
+    run = partial(stages.make, stage, source, Path(out), settings, **own, **how)
+    return _called(stage, Path(out), run, {"source": source, **own, **given})
+
+
+def _called(stage: str, out: Path, run: Callable[[], object], words: Mapping[str, Any]) -> Made:
+    """What a stage makes; the manifest's command is the call. What is to be resumed may be complete."""
+    texts = {name: ",".join(map(str, of)) if isinstance(of, list | tuple) else of for name, of in words.items()}
+    told = (f"{name}={of}" for name, of in texts.items() if of not in (None, "") and name != "resume")
+    token = drafts.COMMAND.set((f"hypogoal.{stage.replace('-', '_')}", f"out={out}", *told))
+    try:
+        with contextlib.suppress(Complete):
+            run()
+    finally:
+        drafts.COMMAND.reset(token)
+    return Made(out)
 
 
 def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:

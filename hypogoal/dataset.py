@@ -25,6 +25,9 @@ from hypogoal.core.artefacts import DATA, claim, versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
 
+if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # whose integers come out otherwise, deep in the work
+    raise UserError("hypogoal needs NumPy 2", f"here is {np.__version__}", "pip install 'numpy>=2,<3'")
+
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
 ATTRIBUTES = (

@@ -19,6 +19,7 @@ from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_t
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
+from hypogoal.core.terminal import drawn
 from hypogoal.dataset import PICTURE, SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
@@ -60,6 +61,36 @@ def result_of(path: Path) -> dict[str, float]:
             if type(value) in (int, float) and abs(value) < 1e300:
                 found[name][goal] = max(value, found[name].get(goal, value))
     return {told: sum(found[name].values()) / len(found[name]) for name, told in RESULTS.items() if found[name]}
+
+
+def numbers_in(kind: str, path: Path) -> dict[str, Any]:
+    """The numbers of a data file, or in an artefact's folder of a ``kind``: of a training the last of its logs."""
+    if kind == "data":
+        return open_dataset(path).counts()
+    if kind in (EVALUATION, "comparison"):
+        return dict(read_json(path / "metrics.json", "the numbers are", AGAIN))
+    return dict(result_of(path))
+
+
+def outcome(kind: str, path: Path) -> list[str]:
+    """What came out, from :func:`numbers_in`, in lines for people; none where there are no numbers."""
+    numbers = numbers_in(kind, path)
+    if kind == "data":
+        return count_lines(numbers)
+    if kind == EVALUATION:
+        return drawn(summary_of(numbers, path), 100).splitlines()
+    if kind == "comparison":
+        from hypogoal.evaluation.compare import winners
+
+        return winners(numbers["comparisons"])
+    return [f"{name}: {value:.4g}" for name, value in numbers.items()]
+
+
+def count_lines(counts: Mapping[str, Any]) -> list[str]:
+    """The numbers of states of a data file."""
+    rows = [(split, goal, *row.values()) for split in SPLITS for goal, row in counts[split].items()]
+    text = [f"{split:9s} {goal:20s} {states:7d} states {yes:7d} positives" for split, goal, states, yes in rows]
+    return [*text, f"unlabelled                     {counts['unlabelled']:7d} states"]
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:

@@ -134,6 +134,30 @@ def loaded_by(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
+def test_versions_of_python_are_those_that_are_tested() -> None:
+    """The classifiers' are the CI's, the first is the least allowed; extras that a line names are there."""
+    named = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
+    others = re.search(r"^for version in (.*); do$", (ROOT / ".ci/run").read_text(encoding="utf-8"), re.M)
+    assert others and ["3.11", *others[1].split()] == named and PROJECT["requires-python"] == ">=3.11"
+    told = {
+        name for path in PACKAGE.rglob("*.py") for name in re.findall(r"hypogoal\[(\w+)\]", path.read_text("utf-8"))
+    }
+    assert told == {"montezuma", "tensorboard"} and told <= PROJECT["optional-dependencies"].keys()
+
+
+def test_an_old_numpy_is_told_in_a_line(tmp_path: Path) -> None:
+    """Before any work, whichever way hypogoal is used."""
+    old = "import sys, numpy\nnumpy.__version__ = '1.26.4'\n"
+    for code in (
+        "from hypogoal.cli import main\nsys.exit(main(['collect', 'doorkey', '--out', 'x.h5']))",
+        "import hypogoal\nhypogoal.Made",
+    ):
+        done = subprocess.run([sys.executable, "-c", old + code], capture_output=True, text=True, cwd=tmp_path)
+        assert "hypogoal needs NumPy 2: here is 1.26.4. pip install 'numpy>=2,<3'" in done.stderr.splitlines()[-1]
+        assert done.returncode in (1, 2) and not list(tmp_path.iterdir())
+        assert len(done.stderr.splitlines()) == 1 or "Made" in code
+
+
 def test_import_is_light() -> None:
     """``import hypogoal`` and its command line load none of the heavy packages: they wait for the command."""
     assert "torch" in loaded_by("import torch"), "the check itself sees a loaded module"
@@ -322,7 +346,7 @@ def test_one_way_to_print_and_one_to_open() -> None:
     printing = re.compile(r"typer\.echo\(|(?<![\w.])print\(|Console\(|sys\.std(out|err)\.write")
     opening = re.compile(r"\.(read_text|read_bytes|open)\(|(?<![\w.])open\(|json\.load\(")
     own = {
-        "core/config.py", "core/drafts.py", "core/files.py", "core/preflight.py", "core/progress.py",
+        "cards.py", "core/config.py", "core/drafts.py", "core/files.py", "core/preflight.py", "core/progress.py",
         "core/terminal.py", "evaluation/page.py", "experiments/records.py", "live_view.py", "own_data/arrays.py",
         "own_data/images.py", "stages/train_ensemble.py",
     }  # fmt: skip

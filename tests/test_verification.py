@@ -20,7 +20,8 @@ from hypogoal.stages.train_ensemble import unlabelled_file
 TESTS = Path(__file__).parent
 FEW = ["--set", "environments=4", "--set", "warm_up=50", "--set", "steps=400", "-q"]
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
-MAY = {"executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")  # what settings do not say
+# What settings do not say.
+MAY = {"README.md", "executions.csv", "exploits.csv"}, ("figures/", "videos/", "before-", "mended-")
 
 
 @pytest.fixture(scope="module")

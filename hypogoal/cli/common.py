@@ -18,6 +18,7 @@ from hypogoal.core.config import parse_assignments
 from hypogoal.core.files import MOST_INTEGER
 from hypogoal.core.terminal import give, say
 from hypogoal.settings import CONFIGS, TABLES, configuration, options_of
+from hypogoal.stages import make
 
 GROUPS = MAKE, LOOK, OWN, MANY = "Make", "Look", "Own data and code", "Run many"  # of commands, as they are listed
 
@@ -140,13 +141,16 @@ class Given:
     stage: str
     out: Path
     preset: str | None
-    assignments: list[str]  # of --set
-    settings: Mapping[str, Any]  # of the options that are settings
+    settings: Mapping[str, Any]  # of options, and of --set, which counts more
     how: Mapping[str, Any]  # of every stage: seed, device, force, resume, quiet
+
+    def make(self, source: str | Path, **own: Any) -> Any:
+        """Run the stage, see :func:`hypogoal.stages.make`."""
+        return make(self.stage, source, self.out, self.settings, self.preset, **own, **self.how)
 
     def config(self, domain: str, *, given: bool = False) -> Any:
         """The stage's settings, see :func:`hypogoal.settings.configuration`."""
-        return configuration(self.stage, domain, self.preset, self.assignments, self.settings, given=given)
+        return configuration(self.stage, domain, self.preset, (), self.settings, given=given)
 
     def end(self, numbers: Mapping[str, Any], *then: object) -> None:
         """Say what it came to and which command follows, and print where it is."""
@@ -169,10 +173,10 @@ def stage(panel: str, name: str, example: str) -> Callable[[Callable[..., None]]
 
     def made(function: Callable[..., None]) -> None:
         def called(**values: Any) -> None:
-            chosen = {of.name: values.pop(of.name) for of in settings}
+            chosen = {of.name: value for of in settings if (value := values.pop(of.name)) is not None}
             told = {of.name: values.pop(of.name) for of in shared}
             out, preset, assignments = (told.pop(key) for key in ("out", "preset", "set_"))
-            function(Given(name, out, preset, assignments or [], chosen, told), **values)
+            function(Given(name, out, preset, chosen | parse_assignments(assignments or ()), told), **values)
 
         _, *own = inspect.signature(function).parameters.values()
         every = [one.replace(kind=KEYWORD) for one in (*own, *shared, *settings)]
@@ -189,14 +193,6 @@ def values_of(assignments: Iterable[str] | None) -> list[str]:
     return [value.strip() for text in texts for value in text.split(",")]
 
 
-def domain_of(artefact: Path, kind: str) -> str:
-    """The domain of a data file (kind ``data``) or of an artefact."""
-    from hypogoal.core.artefacts import open_artefact
-    from hypogoal.dataset import open_dataset
-
-    return open_dataset(artefact).domain if kind == "data" else str(open_artefact(artefact, kind).config["domain"])
-
-
 def run_of(data: Path) -> Path:
     """The run that a data file is of: the folder of a ``data.h5``, else a new one that is called as the file is."""
     return data.parent if data.name == "data.h5" else Path("runs", data.stem)
@@ -204,12 +200,10 @@ def run_of(data: Path) -> Path:
 
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
     """The numbers of states of a data file; nothing where there are none."""
-    if quiet or not counts:
-        return
-    for split in ("labelled", "heldout"):
-        for sub_goal, row in counts[split].items():
-            say(f"{split:9s} {sub_goal:20s} {row['states']:7d} states {row['positives']:7d} positives")
-    say(f"unlabelled                     {counts['unlabelled']:7d} states")
+    from hypogoal.inspection import count_lines
+
+    for line in [] if quiet or not counts else count_lines(counts):
+        say(line)
 
 
 def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:

@@ -9,6 +9,7 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 from hypogoal.settings import configuration
+from hypogoal.stages import domain_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
@@ -18,12 +19,8 @@ FILMS = "RUN/report/videos/*.gif; the page shows the first. If not said: one, wh
 @cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
 def collect(given: cli.Given, domain: cli.DomainName, play: cli.Play = None) -> None:
     """Collect labelled, unlabelled and held-out states."""
-    from hypogoal.domains.base import load_domain
-    from hypogoal.stages.collect import collect as collected
-
-    found = load_domain(domain, given=True)
-    config = replace(given, settings={"play": play}).config(domain, given=True)
-    cli.print_counts(collected(found, config, given.out, name=domain, **given.how), given.how["quiet"])
+    told = replace(given, settings={"play": play, **given.settings}) if play else given
+    cli.print_counts(told.make(domain), given.how["quiet"])
     given.end({}, "train-ensemble", given.out, "--out", cli.run_of(given.out) / "ensemble")
 
 
@@ -34,19 +31,12 @@ def train_ensemble(
     unlabelled: Annotated[list[Path] | None, Option(help=f"Take unlabelled states from elsewhere: {VISITED}")] = None,
 ) -> None:
     """Train diverse classifiers (members) of each sub-goal."""
-    from hypogoal.core import own_code
     from hypogoal.domains.base import installed_domain
     from hypogoal.inspection import result_of
-    from hypogoal.stages.train_ensemble import train_ensemble as trained
 
-    domain = cli.domain_of(data, "data")
-    config = given.config(domain)
-    installed = installed_domain(domain)
+    given.make(data, unlabelled=tuple(unlabelled or ()))
+    installed = installed_domain(domain_of(data, "train-ensemble"))
     defaults = installed.defaults if installed else {}
-    own = [value for value in defaults.get("train-ensemble", {}).values() if isinstance(value, str)]
-    typed = [*filter(None, given.settings.values()), *cli.values_of(given.assignments)]
-    with own_code.given(*typed), own_code.vouched(*own):  # and not what a preset says
-        trained(data, config, given.out, unlabelled=tuple(unlabelled or ()), **given.how)
     run, practised = given.out.parent, "train-options" in defaults or "train-meta" not in defaults
     then = ("train-options", given.out, "--out", run / "options")
     then = then if practised else ("train-meta", given.out, "--out", run / "meta")
@@ -61,11 +51,10 @@ def train_options(
 ) -> None:
     """Learn an option (a policy) for every member."""
     from hypogoal.stages.train_meta import FIXED
-    from hypogoal.stages.train_options import train_options as trained
 
-    domain = cli.domain_of(ensemble, "ensemble")
+    numbers = given.make(ensemble, options=options)
+    domain = domain_of(ensemble, "train-options")
     config = given.config(domain)
-    numbers = trained(ensemble, config, given.out, options=options, **given.how)
     plain = configuration("train-meta", domain, given.preset, ())
     fixed = [f"--set={name}={getattr(config, name)}" for name in FIXED if getattr(config, name) != getattr(plain, name)]
     preset, run = ["--preset", given.preset] if given.preset else [], given.out.parent
@@ -80,10 +69,7 @@ def train_meta(
     options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
 ) -> None:
     """Learn which options to choose, by the reward."""
-    from hypogoal.stages.train_meta import train_meta as trained
-
-    config = given.config(cli.domain_of(ensemble, "ensemble"))
-    given.end(trained(ensemble, config, given.out, options=options, **given.how), "evaluate", given.out.parent)
+    given.end(given.make(ensemble, options=options), "evaluate", given.out.parent)
 
 
 @cli.stage(cli.MAKE, "train-baseline", "train-baseline doorkey --agent ppo --out runs/mine/ppo")
@@ -93,10 +79,7 @@ def train_baseline(
     data: Annotated[Path | None, Option(help="Play in the world in which these states were collected.")] = None,
 ) -> None:
     """Train PPO or DQN on primitive actions, to compare."""
-    from hypogoal.stages.train_baseline import train_baseline as trained
-
-    config = given.config(domain, given=True)
-    given.end(trained(domain, config, given.out, data=data, **given.how), "evaluate", given.out.parent)
+    given.end(given.make(domain, data=data), "evaluate", given.out.parent)
 
 
 @cli.stage(cli.OWN, "audit", "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out audit")
@@ -183,11 +166,10 @@ def compare(
     force: cli.Force = False,
 ) -> None:
     """Evaluated runs side by side: what differs, who wins."""
-    from hypogoal.core.files import read_json
-    from hypogoal.evaluation.compare import winners
+    from hypogoal.inspection import outcome
     from hypogoal.stages.compare import compare as compared
 
     page = compared(runs, out, force=force)
-    for line in winners(read_json(out / "metrics.json", "the comparison is", "Compare again.")["comparisons"]):
+    for line in outcome("comparison", out):
         say(line)
     give(page)

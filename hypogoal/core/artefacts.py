@@ -9,7 +9,7 @@ import hashlib
 import os
 import platform
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -38,18 +38,9 @@ DEPTH = 3  # of folders, in which a run's artefacts lie
 FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
-    "hypogoal",
-    "torch",
-    "numpy",
-    "gymnasium",
-    "minigrid",
-    "ale-py",
-    "opencv-python-headless",
-    "captum",
-    "h5py",
-    "safetensors",
-    "stable-baselines3",
-)
+    "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
+    "safetensors", "stable-baselines3",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -211,8 +202,9 @@ def create_artefact(
     inputs: Sequence[Path] = (),
     force: bool = False,
     resume: bool = False,
+    card: Callable[[dict[str, Any], Path], str] = lambda about, folder: "",
 ) -> Iterator[Path]:
-    """A folder to fill; at the end its manifest is written and it is renamed to ``out``.
+    """A folder to fill; at the end its ``card`` and its manifest are written and it is renamed to ``out``.
 
     ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are artefact folders or data files that
     were read. ``checkpoints_of`` knows where the checkpoints beside the folder are. When the block raises, ``out`` is
@@ -235,6 +227,8 @@ def create_artefact(
         raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
     with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
+        if text := card({**about, "inputs": entries}, work.files):
+            (work.files / "README.md").write_bytes(text.encode())
         made = sorted(file for file in work.files.rglob("*") if file.is_file())
         files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
         manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}

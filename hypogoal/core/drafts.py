@@ -15,6 +15,7 @@ import stat
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -34,6 +35,7 @@ FILES, BEGUN, LOCK, OLD = "files", "begun.json", "lock", ".old"
 PATIENCE_SECONDS = 2.0  # for whoever is just letting go
 LOCKED_BYTE = 1 << 30
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that cannot lock
+COMMAND: ContextVar[tuple[str, ...]] = ContextVar("COMMAND", default=())  # a program's call, where it was no command
 GO_ON = "give the same command with --resume to go on"
 
 
@@ -87,9 +89,12 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
     unfinished that was begun otherwise, or of which it was not said what to do with it, is a ``UserError``.
     """
     folder = draft_folder(out)
-    words = [word for word in sys.argv[1:] if word != "--resume"]  # of which nothing depends
     called = Path(sys.argv[0]).name
-    fresh = {"identity": identity, "command": ["hypogoal" if called == "__main__.py" else called, *words]}
+    words = COMMAND.get() or ("hypogoal" if called == "__main__.py" else called, *sys.argv[1:])
+    fresh = {
+        "identity": identity,
+        "command": [word for word in words if word != "--resume"],
+    }  # of which nothing depends
     fresh = parse_json(
         json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
     )

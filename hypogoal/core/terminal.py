@@ -7,6 +7,7 @@ one of standard output is told as what it is, since what was to be done is done 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 import unicodedata
@@ -51,7 +52,14 @@ def draw(table: Any, width: int) -> None:
         raise Unprinted(error.errno, error.strerror) from None
 
 
-def screen(*, err: bool = False, width: int | None = None) -> Console:
+def drawn(table: Any, width: int) -> str:
+    """A table as plain text, the same wherever it is made."""
+    console = screen(width=width, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text().rstrip("\n")
+
+
+def screen(*, err: bool = False, width: int | None = None, **more: Any) -> Console:
     """Where tables and bars are drawn; brackets in a text are brackets, and it is made :func:`printable`."""
     from rich.console import Console
     from rich.text import Text
@@ -60,7 +68,7 @@ def screen(*, err: bool = False, width: int | None = None) -> Console:
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str("\n".join(map(printable, text.split("\n"))), **options)
 
-    return Screen(stderr=err, width=width, markup=False, emoji=False, highlight=False)
+    return Screen(stderr=err, width=width, markup=False, emoji=False, highlight=False, force_jupyter=False, **more)
 
 
 def _silence(stream: TextIO) -> None:

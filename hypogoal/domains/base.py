@@ -29,6 +29,7 @@ BUILT_IN = {
 }
 ENTRY_POINTS = "hypogoal.domains"
 STEP_KINDS = (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b"))
+here: dict[str, Domain] = {}  # a program's own domains, by name
 IMPORTED = "imported"  # what states are of where 'hypogoal import' was not told
 
 
@@ -396,7 +397,7 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
     """
     try:
         with own_code.given(*([name] if given else [])):
-            domain = own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
+            domain = here.get(name) or own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
     except UserError:
         if name != IMPORTED:
             raise

@@ -99,7 +99,7 @@ def load_ale(seed: int) -> Any:
         from ale_py.roms import get_rom_path
     except ImportError as error:
         what = f"Montezuma's Revenge cannot be played ({error})"
-        raise UserError(what, GAME, "pip install ale-py opencv-python-headless.") from None
+        raise UserError(what, GAME, "pip install 'hypogoal[montezuma]'.") from None
     rom = get_rom_path(GAME)
     if rom is None or not rom.is_file():
         raise UserError("the emulator has no ROM of the game", GAME, "Install ale-py 0.11 or newer: its wheel has it.")

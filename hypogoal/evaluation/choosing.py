@@ -283,9 +283,4 @@ def sections(material: Material) -> list[Block]:
     return [page.section("choosing", TITLE, [text], [table])]
 
 
-QUESTION = Question(
-    numbers=numbers,
-    rows=rows,
-    summary=summary,
-    sections=sections,
-)
+QUESTION = Question(numbers=numbers, rows=rows, summary=summary, sections=sections)

@@ -499,10 +499,7 @@ def reward_bounds(lines: Sequence[Line]) -> Bounds:
 
 
 def learning_curves(
-    lines: Sequence[Line],
-    quantity: str,
-    references: Sequence[tuple[str, float]] = (),
-    bounds: Bounds = (0.0, None),
+    lines: Sequence[Line], quantity: str, references: Sequence[tuple[str, float]] = (), bounds: Bounds = (0.0, None)
 ) -> Figure:
     """Figure 6: a quantity of episodes against environment steps, a line per agent; the mean, and of few layouts or
     runs each, of more a band of one standard error.

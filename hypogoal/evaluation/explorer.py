@@ -35,7 +35,7 @@ def look(work: Work, judgement: Judgement) -> None:
     """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
     if judgement.number != work.browsed or judgement.split.observations.dtype != PICTURE:
         return
-    from hypogoal.evaluation.deep_lift import DEEP_LIFT, attributed, method_of
+    from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, method_of
 
     split, sub_goal, verdicts = judgement.split, judgement.case.sub_goal, judgement.judged.verdicts
     sub_goals = len(judgement.case.config["sub_goals"])

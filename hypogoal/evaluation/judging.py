@@ -79,7 +79,7 @@ class Judgement:
 
     def see(self, states: NDArray[np.int64]) -> tuple[Ensemble, Any, Any]:
         """The ensemble, what it sees of some held-out states (n, ...), and of the unlabelled ones on average (...)."""
-        from hypogoal.evaluation.deep_lift import mean_state
+        from hypogoal.hypotheses.deep_lift import mean_state
 
         ensemble, positions = self.case.read(), positions_of(self.split.origins)
         seen = ensemble.see(self.split.observations[states], None if positions is None else positions[states])

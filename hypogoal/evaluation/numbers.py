@@ -37,10 +37,7 @@ NOT_A_VARIANT = frozenset(
     }
 )
 # Settings of ensembles without effect.
-IDLE = {
-    "single CNN": {"diversity", "diversity_weight", "schedule", "members"},
-    "no diversity": {"diversity_weight"},
-}
+IDLE = {"single CNN": {"diversity", "diversity_weight", "schedule", "members"}, "no diversity": {"diversity_weight"}}
 METHODS = {"dbat": "D-BAT", "no diversity": "an ensemble without diversity", "single CNN": "a single CNN"}
 ORACLE = "oracle termination"
 
@@ -152,11 +149,7 @@ def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[flo
 
 
 def over(
-    values: Sequence[float],
-    unit: str,
-    *cell: str,
-    layouts: Sequence[Hashable] = (),
-    deviation: bool = False,
+    values: Sequence[float], unit: str, *cell: str, layouts: Sequence[Hashable] = (), deviation: bool = False
 ) -> dict[str, Any]:
     """Spec F5: everything said of a number over runs, of which those of one layout count once, by their mean.
 
@@ -244,11 +237,7 @@ def pairs_by_groups(
 
 
 def compare_pairs(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    units: Sequence[Hashable],
-    *,
-    higher: bool = True,
+    first: NDArray[np.float64], second: NDArray[np.float64], units: Sequence[Hashable], *, higher: bool = True
 ) -> dict[str, Any]:
     """Spec F5: the first of two methods against the second over n pairs of runs that share layout and seed.
 

@@ -25,19 +25,8 @@ from hypogoal.evaluation.page import Drawn, Material, Question, draw_page, liste
 from hypogoal.evaluation.provenance import domains_of, provenance_section
 
 # In the order of the page; the numbers of one are there for those below it.
-QUESTIONS: list[Question] = [
-    curves.QUESTION,
-    rooms.QUESTION,
-    distance.QUESTION,
-    exploits.QUESTION,
-    hypotheses.QUESTION,
-    ranking.QUESTION,
-    explorer.QUESTION,
-    saliency.QUESTION,
-    selection.QUESTION,
-    choosing.QUESTION,
-    zero_shot.QUESTION,
-]
+PARTS = curves, rooms, distance, exploits, hypotheses, ranking, explorer, saliency, selection, choosing, zero_shot
+QUESTIONS: list[Question] = [part.QUESTION for part in PARTS]
 
 
 def agents_last() -> list[Question]:

@@ -134,9 +134,4 @@ def sections(material: Material) -> list[Block]:
     return [page.section("ranking", TITLE, [text], blocks, folded=True)]
 
 
-QUESTION = Question(
-    look=look,
-    numbers=numbers,
-    rows=rows,
-    sections=sections,
-)
+QUESTION = Question(look=look, numbers=numbers, rows=rows, sections=sections)

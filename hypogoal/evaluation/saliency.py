@@ -24,11 +24,7 @@ if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
 
 SPREAD = "spread"  # a state as any other
-KINDS = {
-    "true positive": "a true positive",
-    "disagree": "members disagree",
-    "false positive": "a false positive",
-}
+KINDS = {"true positive": "a true positive", "disagree": "members disagree", "false positive": "a false positive"}
 NEEDED = "an ensemble artefact on pictures with a member that calls a held-out state reached: train-ensemble"
 SIGNED = LinearSegmentedColormap.from_list("against-for", [BLUE, "white", VERMILLION])
 EXPLAINED = ("observations", "seen", "attributions", "probabilities", "verdicts", "labels")  # what figures are of
@@ -57,7 +53,7 @@ def look(work: Work, judgement: Judgement) -> None:
     judgement.write_states(work.arrays.create_group(f"saliency/{sub_goal}"), picked)
     states: list[dict[str, Any]] = []
     if explained:
-        from hypogoal.evaluation.deep_lift import attributed, explanation
+        from hypogoal.hypotheses.deep_lift import attributed, explanation
 
         ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
         found = attributed(ensemble, seen, baseline)

@@ -15,9 +15,7 @@ class EnsembleConfig:
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(
-        "dbat",
-        "diversity objective: dbat, none, another of docs/concepts.md, or module:function",
-        source="Eq. (1)",
+        "dbat", "diversity objective: dbat, none, another of docs/concepts.md, or module:function", source="Eq. (1)"
     )
     diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     schedule: str = setting(

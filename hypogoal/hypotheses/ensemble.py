@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -188,6 +189,21 @@ class Ensemble(nn.Module):
         if was_training:
             self.train()
         return logits
+
+    def attributions(self, observations: Observations, against: Observations) -> NDArray[np.float32]:
+        """Spec F2, Figure 2: what each member goes by in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
+
+        ``against`` are others, unlabelled ones, say, whose mean is the baseline. Returns float32 (N, K, *what members
+        see, of pictures (H, W, C)), in log-odds, for "reached" where positive: a state's sum is its log-odds less the
+        baseline's. A ``UserError`` as of :meth:`predict`, or with no states.
+        """
+        from hypogoal.hypotheses.deep_lift import AT_ONCE, attributed, mean_state
+
+        if not (len(observations) and len(against)):
+            raise UserError("attributions need states, and others to compare with", None, "Give one or more of each.")
+        seen, baseline, still = self.see(observations), mean_state(self.see(against)), copy.deepcopy(self).cpu().eval()
+        parts = (seen[start : start + AT_ONCE] for start in range(0, len(seen), AT_ONCE))
+        return np.concatenate([attributed(still, part, baseline).values.astype(np.float32) for part in parts])
 
     def _logits(self, observations: Observations) -> Tensor:
         """(K, N, 2), each image's distinct patches computed once where that pays."""

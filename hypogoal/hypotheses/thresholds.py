@@ -61,10 +61,7 @@ NEED_UNLABELLED = ("unlabelled-q95", "unlabelled-split")
 
 
 def thresholds(
-    name: str,
-    labelled: NDArray[np.float32],
-    labels: NDArray[np.bool_],
-    unlabelled: NDArray[np.float32],
+    name: str, labelled: NDArray[np.float32], labels: NDArray[np.bool_], unlabelled: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """The thresholds float32 (K,) that a rule sets.
 

@@ -21,10 +21,7 @@ class MetaConfig:
         choices=("light", "paper"),
     )
     head: str = setting(
-        "categorical",
-        "distribution over options",
-        source="gaussian: paper",
-        choices=("categorical", "gaussian"),
+        "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")
     )
     gamma: float = setting(
         0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="paper: not given"

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import claim, create_artefact, open_artefact
+from hypogoal.cards import create_artefact
+from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.errors import UserError

@@ -7,7 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hypogoal.core.artefacts import Artefact, claim, create_artefact, find_artefacts, versions
+from hypogoal.cards import create_artefact
+from hypogoal.core.artefacts import Artefact, claim, find_artefacts, versions
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation

@@ -4,7 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim, create_artefact
+from hypogoal.cards import create_artefact
+from hypogoal.core.artefacts import claim
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict

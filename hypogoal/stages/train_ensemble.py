@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.artefacts import claim, create_artefact, open_artefact
+from hypogoal.cards import create_artefact
+from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import FOLDER, Resumable, checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
@@ -181,13 +182,7 @@ class _Report(Resumable):
 
 
 def _train_one(
-    data: Path,
-    others: Sequence[Path],
-    sub_goal: str,
-    config: TrainEnsembleConfig,
-    seed: int,
-    folder: Path,
-    device: str,
+    data: Path, others: Sequence[Path], sub_goal: str, config: TrainEnsembleConfig, seed: int, folder: Path, device: str
 ) -> dict[str, Any]:
     """Train one sub-goal's ensemble; runs in its own process."""
     prepare()

@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from hypogoal.core.artefacts import claim, create_artefact, open_artefact
+from hypogoal.cards import create_artefact
+from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.preflight import preflight

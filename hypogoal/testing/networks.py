@@ -10,7 +10,7 @@ from torch import nn
 
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import NUMBERS, PICTURE, standard_of
-from hypogoal.evaluation.deep_lift import method_of
+from hypogoal.hypotheses.deep_lift import method_of
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, build_network
 from hypogoal.hypotheses.stacked import StackedMembers

@@ -11,7 +11,7 @@ from toy_data import fill, write
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact
-from hypogoal.core.terminal import draw, printable
+from hypogoal.core.terminal import draw, drawn, printable
 from hypogoal.experiments.records import LOGS, PLAN
 
 TESTS = Path(__file__).parents[1]
@@ -291,3 +291,19 @@ def test_a_current_folder_that_was_deleted(tmp_path: Path, line: str) -> None:
     done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "hypogoal: the current folder is not there any more. Change to another one.\n"
+
+
+def test_a_table_as_text_is_shown_nowhere_else(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same text in a terminal with colours, in a pipe and in a notebook, where Rich would show it besides."""
+    from rich import console as of_rich
+    from rich.table import Table
+
+    table = Table("a", "b")
+    table.add_row("1", "[bold]\x1b[2J")
+    plain = drawn(table, 40)
+    assert "│ 1 │ [bold]?[2J" in plain
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(of_rich, "_is_jupyter", lambda: True)
+    assert drawn(table, 40) == plain and capsys.readouterr().out == ""

@@ -290,7 +290,7 @@ def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     for module in ("cv2", "ale_py"):
         with monkeypatch.context() as patched:
             patched.setitem(sys.modules, module, None)
-            with pytest.raises(UserError, match=r"cannot be played .*pip install ale-py opencv") as error:
+            with pytest.raises(UserError, match=r"cannot be played .*pip install 'hypogoal\[montezuma\]'") as error:
                 load_ale(0)
             assert "\n" not in str(error.value)
     for rom in (None, tmp_path / "none.bin"):

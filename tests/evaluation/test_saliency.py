@@ -7,7 +7,11 @@ import torch
 from torch import nn
 
 from hypogoal.dataset import States
-from hypogoal.evaluation.deep_lift import (
+from hypogoal.evaluation.judging import Case, Judged, Judgement, Unlabelled, Work
+from hypogoal.evaluation.pictures import attribution_png
+from hypogoal.evaluation.run import Contents
+from hypogoal.evaluation.saliency import look, pick_to_explain
+from hypogoal.hypotheses.deep_lift import (
     DEEP_LIFT,
     INTEGRATED,
     Attributions,
@@ -18,10 +22,6 @@ from hypogoal.evaluation.deep_lift import (
     mean_state,
     method_of,
 )
-from hypogoal.evaluation.judging import Case, Judged, Judgement, Unlabelled, Work
-from hypogoal.evaluation.pictures import attribution_png
-from hypogoal.evaluation.run import Contents
-from hypogoal.evaluation.saliency import look, pick_to_explain
 from hypogoal.hypotheses.ensemble import Ensemble
 
 SHAPES = {"doorkey": (64, 64, 3), "montezuma": (84, 84, 4)}

@@ -16,9 +16,9 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.diversity import OBJECTIVES
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.evaluation.deep_lift import DEEP_LIFT, INTEGRATED, attributed, mean_state, method_of
 from hypogoal.hypotheses import batches
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.deep_lift import DEEP_LIFT, INTEGRATED, attributed, mean_state, method_of
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.networks import NETWORKS, as_input, build_network
 from hypogoal.hypotheses.stacked import StackedMembers

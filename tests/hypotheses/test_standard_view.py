@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.deep_lift import DEEP_LIFT, INTEGRATED, attributed, deep_lift, mean_state
 from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.deep_lift import DEEP_LIFT, INTEGRATED, attributed, deep_lift, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.training import fit

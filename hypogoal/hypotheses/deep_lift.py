@@ -122,10 +122,11 @@ def _of_member(
     member: nn.Module, inputs: Tensor, reference: Tensor
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Attributions (n, ...), log-odds (n,) and the baseline's (1,); in double, where rounding is no matter."""
-    from captum.attr import DeepLift
-
     network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
     with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's, of a bar that nobody draws
+        from captum.attr import DeepLift
+
         warnings.filterwarnings("ignore", message=r"\s*Setting forward, backward hooks", category=UserWarning)
         values = DeepLift(network).attribute(inputs, reference, target=0)
     with torch.no_grad():

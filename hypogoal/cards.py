@@ -1,0 +1,46 @@
+"""The card of an artefact, its ``README.md``: what it is, how it was made, what came out, how to load it (Spec A8).
+
+It says only what manifest and files say, so the same seed gives the same card. What is quoted, a stranger's names among
+it, stands in indented lines, in which Markdown knows no markup, each of them made printable.
+"""
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core import artefacts
+from hypogoal.core.config import as_dict
+from hypogoal.core.terminal import printable
+from hypogoal.inspection import outcome
+from hypogoal.settings import CONFIGS
+
+LONGEST = 300  # characters of a setting
+
+
+def card(about: Mapping[str, Any], folder: Path) -> str:
+    """The text, from what the manifest of the artefact in ``folder`` will say."""
+    texts = tomllib.loads((resources.files("hypogoal") / "cards.toml").read_text(encoding="utf-8"))
+    kind, config = about["kind"], about["config"]
+    of = {"load": "hypogoal.Made('.').metrics", **texts[kind]}
+    load = of.pop("load").format(goal=repr(next(iter(config.get("sub_goals", ())), "")))
+    defaults = as_dict(CONFIGS[of["stage"]]()) if of["stage"] in CONFIGS else {}
+    changed = {name: value for name, value in config.items() if name != "workers" and defaults.get(name) != value}
+    lines = {
+        "inputs": [f"{entry['relative']} ({entry['kind']})" for entry in about["inputs"]],
+        "settings": [f"{name} = {json.dumps(value, ensure_ascii=False)[:LONGEST]}" for name, value in changed.items()],
+        "outcome": outcome(kind, folder),
+        "load": ["import hypogoal", *load.splitlines()],
+    }
+    quoted = {name: _quoted(some or ["none"]) for name, some in lines.items()}
+    return str(texts["text"].lstrip().format(kind=kind, seed=about["seed"], **of, **quoted))
+
+
+def _quoted(lines: Iterable[str]) -> str:
+    return "\n".join(f"    {printable(line)}" for line in lines)
+
+
+create_artefact = partial(artefacts.create_artefact, card=card)  # what stages write
