@@ -11,7 +11,7 @@ USER := $(VENV)/.installed
 STAMP := $(VENV)/.installed-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test kernels slurm check bench docs clean
+.PHONY: help setup demo test kernels versions slurm check bench docs clean
 
 help: ## what one can make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -50,6 +50,15 @@ NUMERIC := tests/hypotheses tests/options/test_termination.py tests/meta/test_re
 OLDEST := ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 ONEDNN_MAX_CPU_ISA=SSE41
 kernels: $(STAMP) ## the tests of what is computed, as on other processors
 	$(OLDEST) $(BIN)/python -m pytest $(PARALLEL) -p tests.uneven $(NUMERIC)
+
+OTHERS := 3.12 3.13
+versions: ## the quick tests on the other versions of Python, where they are at hand
+	@for version in $(OTHERS); do \
+		if python$$version -c "" 2>/dev/null; then \
+			$(MAKE) test PYTHON=python$$version VENV=.venv-$$version \
+				TESTS="tests/core tests/hypotheses tests/library tests/test_cli.py tests/test_dataset.py" || exit 1; \
+		else echo "no Python $$version here"; fi; \
+	done
 
 slurm: $(STAMP) ## the test of sweeps on a real Slurm, where there is one (some minutes)
 	$(BIN)/python -m pytest -m slurm tests/experiments/test_slurm.py

@@ -135,9 +135,9 @@ def loaded_by(code: str) -> set[str]:
 
 
 def test_versions_of_python_are_those_that_are_tested() -> None:
-    """The classifiers' are the CI's, the first is the least allowed; extras that a line names are there."""
+    """Classifiers are those of ``make versions``, the first is the least allowed; extras that a line names exist."""
     named = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
-    others = re.search(r"^for version in (.*); do$", (ROOT / ".ci/run").read_text(encoding="utf-8"), re.M)
+    others = re.search(r"^OTHERS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)
     assert others and ["3.11", *others[1].split()] == named and PROJECT["requires-python"] == ">=3.11"
     told = {
         name for path in PACKAGE.rglob("*.py") for name in re.findall(r"hypogoal\[(\w+)\]", path.read_text("utf-8"))

@@ -81,8 +81,7 @@ def test_figure_6_shows_rewards_of_any_size(reward):
     axes = material.figures["reward"].axes[0]
     low, high = axes.get_ylim()
     assert low < reward < high
-    (legend,) = material.figures["reward"].legends
-    assert [text.get_text() for text in legend.get_texts()] == ["options (learned members)"]
+    assert [text.get_text() for text in axes.texts] == ["options (learned\nmembers)"]
     caption = next(block["caption"] for block in row["blocks"] if block.get("id") == "figure-reward")
     assert "random play" not in caption
 
@@ -182,6 +181,7 @@ def test_of_one_variant_nothing_is_said_of_variants():
     material = material_of(made(), made(chooser="random", reward=0.0))
     (text,) = summary_section(material)["paragraphs"]
     assert text.startswith("The option agent reached the goal")
+    assert "Random choice: 0 %" in text
     said = str(sections(material))
     assert "variant" not in said
     drawn, _ = paper_figures(material)
