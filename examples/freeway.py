@@ -1,4 +1,8 @@
-"""Atari's Freeway, a chicken that crosses a road: a domain with sub-goals read from the game's memory."""
+"""Atari's Freeway, a chicken that crosses a road: a domain with sub-goals read from the game's memory.
+
+Shows how any Atari game is brought; the wrappers need opencv: pip install 'hypogoal[montezuma]'. With the stages'
+defaults half an hour of a core, most of it learning options.
+"""
 
 import ale_py
 import gymnasium

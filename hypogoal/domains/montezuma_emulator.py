@@ -121,9 +121,9 @@ class Emulator:
     """
 
     def __init__(self, seed: int = 0):
+        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed; says it where cv2 is missing
         import cv2
 
-        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed
         self.actions = list(self.ale.getLegalActionSet())
         self.screens = True
         self._resize, self._area, self._brighter = cv2.resize, cv2.INTER_AREA, cv2.max

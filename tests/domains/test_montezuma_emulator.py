@@ -291,7 +291,7 @@ def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         with monkeypatch.context() as patched:
             patched.setitem(sys.modules, module, None)
             with pytest.raises(UserError, match=r"cannot be played .*pip install 'hypogoal\[montezuma\]'") as error:
-                load_ale(0)
+                Emulator(0)
             assert "\n" not in str(error.value)
     for rom in (None, tmp_path / "none.bin"):
         monkeypatch.setattr("ale_py.roms.get_rom_path", lambda name, rom=rom: rom)
