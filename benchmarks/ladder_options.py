@@ -215,8 +215,14 @@ def tables_that_hold(path: Path) -> Iterator[str]:
     yield from table(
         ["", *groups],
         (
-            [METHODS[method][0], *(_of_group(found, method, ladders) for ladders in groups.values())]
-            for method in methods
+            *(
+                [METHODS[method][0], *(_of_group(found, [method], ladders) for ladders in groups.values())]
+                for method in methods
+            ),
+            [
+                "no diversity minus D-BAT, same seeds",
+                *(_of_group(found, ["holds-none", "holds-dbat"], ladders) for ladders in groups.values()),
+            ],
         ),
     )
     parts = [method for method in ("holds-dbat", "no-context", "no-median", "no-patience") if _ladders(found, method)]
@@ -225,7 +231,11 @@ def tables_that_hold(path: Path) -> Iterator[str]:
         yield ""
         ladders = ("3-9", "2-6")
         seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in parts for ladder in ladders))
-        of = {key: {seed: members[seed] for seed in seeds} for key, members in found.items() if key[1] in ladders}
+        of = {
+            key: {seed: members[seed] for seed in seeds}
+            for key, members in found.items()
+            if key[0] in parts and key[1] in ladders
+        }
         rows = ([METHODS[method][0], *(_bold(of[method, ladder]) for ladder in ladders)] for method in parts)
         yield from table(["", *ladders], rows)
     if shaped := found.get(("shaped", "14-22")):  # by a setting that is gone: it gained nothing
@@ -256,11 +266,13 @@ def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
     return f"{best:.1f} / **{mean:.1f}** / {worst:.1f} ({len(seeds)})"
 
 
-def _of_group(found: Distances, method: str, ladders: list[str]) -> str:
-    seeds = set.intersection(*(set(found.get((method, ladder), {})) for ladder in ladders))
-    return interval(
-        np.array([np.mean([found[method, ladder][seed].mean() for ladder in ladders]) for seed in seeds]), 1
-    )
+def _of_group(found: Distances, methods: list[str], ladders: list[str]) -> str:
+    """The mean member's mean over ladders, of two methods the first's minus the second's; seeds that have all."""
+    seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in methods for ladder in ladders))
+    means = [
+        [np.mean([found[method, ladder][seed].mean() for ladder in ladders]) for method in methods] for seed in seeds
+    ]
+    return interval(np.array([each[0] - sum(each[1:]) for each in means]), 1) if means else "-"
 
 
 def _share(reached: Distances, found: Distances, method: str, ladder: str) -> str:
