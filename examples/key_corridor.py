@@ -1,6 +1,6 @@
 """MiniGrid's KeyCorridor at 8 pixels a tile, where random play never gets to the ball: recorded play shows a way to it.
 
-Shows `collect --play`; 40 seconds of a core up to the members, minutes in all.
+Shows `collect --play`; 40 seconds of a core up to the members. No agent has fetched the ball yet.
 First `export HYPOGOAL_TRUST=key_corridor:DOMAIN`:
 
     hypogoal collect key_corridor:DOMAIN --play key_corridor.json --out runs/corridor/data.h5

@@ -2,7 +2,7 @@
 
 In the labelled room the window is bright whenever the lamp is on, so the labels cannot tell which of the two is meant.
 Unlabelled pictures of other rooms make the members differ. With seed 1 one goes by the lamp and the other by the
-window; other seeds also find "both" and "either", which fit the labels as well.
+window; with seed 2 both go by "lamp or window", which fits the labels as well.
 
     python own_pictures.py
     hypogoal import pictures.npz --out runs/lamp/data.h5

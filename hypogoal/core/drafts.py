@@ -91,10 +91,8 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
     folder = draft_folder(out)
     called = Path(sys.argv[0]).name
     words = COMMAND.get() or ("hypogoal" if called == "__main__.py" else called, *sys.argv[1:])
-    fresh = {
-        "identity": identity,
-        "command": [word for word in words if word != "--resume"],
-    }  # of which nothing depends
+    told = [word for word in words if word != "--resume"]  # of which nothing depends
+    fresh = {"identity": identity, "command": told}
     fresh = parse_json(
         json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
     )

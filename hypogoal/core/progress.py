@@ -101,10 +101,9 @@ class Progress:
         seconds = max(self._last - self._start, 1e-9)
         rate = max(self.done - self._before, 0) / seconds
         speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""
-        left = (
-            f" ({speed}, {duration((self.total - self.done) / rate)} left)" if rate and self.done < self.total else ""
-        )
-        say(f"{self.title}: {self.done}/{self.total}{left}{f', {text}' if text else ''}", err=True)
+        left = self.total - self.done
+        known = f" ({speed}, {duration(left / rate)} left)" if rate and left > 0 else ""
+        say(f"{self.title}: {self.done}/{self.total}{known}{f', {text}' if text else ''}", err=True)
 
 
 def duration(seconds: float) -> str:
