@@ -180,7 +180,8 @@ class LightLearner(Learner):
         here, there = self.tensor(places).split(len(s))
         values, target = apply_all_to_states((self.online, self.target), self.pictures, distinct)
         # index_select, not indexing, whose gradient takes several times as long.
-        return values.index_select(0, here), *(x.detach().index_select(0, there) for x in (values, target))
+        next_online, next_target = (of.detach().index_select(0, there) for of in (values, target))
+        return values.index_select(0, here), next_online, next_target
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
         """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""

@@ -169,7 +169,7 @@ def test_the_tile_path_is_the_image_path() -> None:
 
 
 def test_the_paper_network_unrolls_its_memory() -> None:
-    """Spec D2: step by step with the hidden state, and the whole sequence at once, are the same function, PyTorch's own."""
+    """Spec D2: step by step with the hidden state, all at once, and PyTorch's own are the same function."""
     torch.manual_seed(0)
     network = PaperQNetwork((64, 64, 3), 7).eval()
     images = torch.randint(0, 256, (1, 5, 64, 64, 3), dtype=torch.uint8)
