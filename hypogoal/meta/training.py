@@ -34,7 +34,7 @@ from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
 from hypogoal.options.thompson import ThompsonChooser
 from hypogoal.options.visited import Visited
-from hypogoal.options.windows import AgentWindows, localiser_of
+from hypogoal.options.windows import AgentWindows, HalfPictures, localiser_of
 
 LOG_INTERVAL = 2_000  # environment steps
 ONE_LAYOUT = "an engine of this domain plays one layout"
@@ -85,12 +85,18 @@ def assemble(
         if not many and (reachable := engine.reachable()) is not None:
             terminations.of(reachable)  # most of what will be visited, judged at once
     _check_rule(terminations, config)
-    seen = None
+    windows = None
     if config.policy_view == "agent-crop":
         if config.network != "light":
             given = f"policy_view=agent-crop, network={config.network}"
             raise UserError("only the light network sees windows", given, "Give --set network=light.")
-        seen = AgentWindows(engine, localiser_of(read_ensemble(ensemble, dict(about), sub_goals[0])))
+        windows = AgentWindows(engine, localiser_of(read_ensemble(ensemble, dict(about), sub_goals[0])))
+    seen: AgentWindows | HalfPictures | None = windows
+    if config.policy_pixels == "half":
+        if config.network != "light" or engine.observation_dtype != PICTURE:
+            given = f"policy_pixels=half, network={config.network}"
+            raise UserError("only the light network sees half the pixels, of pictures", given, "Leave it out.")
+        seen = HalfPictures(engine, windows)
     gamma, rng = 1.0, rng_for(seed, "random-choice")
     chooser: Chooser = EvenChooser(options, rng) if config.chooser == "even" else RandomChooser(rng)
     if isinstance(config, TrainMetaConfig):

@@ -74,6 +74,13 @@ class OptionConfig:
         source="ours",
         choices=("full", "agent-crop"),
     )
+    policy_pixels: str = setting(
+        "all",
+        "the policies' pictures: all pixels, or half the side, means of 2 x 2 (light): faster where convolutions read "
+        "them",
+        source="ours: docs/performance.md",
+        choices=("all", "half"),
+    )
     exploration: str = setting(
         "independent",
         "a random action for one step, or kept for some",

@@ -22,7 +22,7 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
 from hypogoal.options.termination import Terminations
-from hypogoal.options.windows import AgentWindows
+from hypogoal.options.windows import AgentWindows, HalfPictures
 
 COUNTERS = ("option_steps", "steps_since_positive")
 
@@ -64,7 +64,7 @@ class Learner(Resumable, ABC):
         config: OptionConfig,
         seed: int,
         device: torch.device | str = "cpu",
-        windows: AgentWindows | None = None,
+        windows: AgentWindows | HalfPictures | None = None,
     ):
         self.engine, self.terminations, self.config, self.windows = engine, terminations, config, windows
         self.pictures: Pictures = windows or engine

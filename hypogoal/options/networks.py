@@ -13,7 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.dataset import Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.views import FullView
-from hypogoal.options.windows import AgentWindows
+from hypogoal.options.windows import AgentWindows, HalfPictures
 
 CELL = 8  # pixels
 WIDTH = 128  # of dense layers
@@ -208,7 +208,7 @@ class PaperQNetwork(nn.Module):
         return nn.functional.linear(inputs, weight, bias)
 
 
-Pictures = Engine | AgentWindows
+Pictures = Engine | AgentWindows | HalfPictures
 
 
 def apply_to_states(network: nn.Module, engine: Pictures, ids: NDArray[np.int64]) -> Tensor:

@@ -16,7 +16,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.options.exploration import actions_of
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, standard_in
-from hypogoal.options.windows import SIDE, around_agent, localiser_of
+from hypogoal.options.windows import SIDE, around_agent, halved, localiser_of
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
 Policies = Callable[[int], Callable[[Observations], int]]
@@ -47,7 +47,7 @@ def make_policies(
     if config["network"] != "light":
         return PaperPolicies(weights, shape, options, actions)
     around = localiser_of(ensemble) if ensemble and config.get("policy_view", "full") == "agent-crop" else None
-    return LightPolicies(weights, shape, options, actions, around)
+    return LightPolicies(weights, shape, options, actions, around, half=config.get("policy_pixels", "all") == "half")
 
 
 class LightPolicies:
@@ -60,9 +60,12 @@ class LightPolicies:
         options: int,
         actions: NDArray[np.int64],
         localiser: Localiser | None = None,
+        *,
+        half: bool = False,
     ):
-        self.localiser = localiser
+        self.localiser, self.half = localiser, half
         shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
+        shape = (shape[0] // 2, shape[1] // 2, *shape[2:]) if half else shape
         weights = below("online.", weights)
         make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape))
         self.network = load_fitting(make, weights, "options.safetensors")
@@ -76,6 +79,8 @@ class LightPolicies:
     def _act(self, option: int, observation: Any) -> int:
         if self.localiser:
             observation = around_agent(self.localiser, observation[None])[0]
+        if self.half:
+            observation = halved(observation[None])[0]
         values = self.network(_as_batch(observation))[0, option]
         return int(self.actions[int(values.argmax())])
 
