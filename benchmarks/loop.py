@@ -16,6 +16,7 @@ import io
 import statistics
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -32,7 +33,8 @@ from hypogoal.cli import main as hypogoal  # noqa: E402
 LAYOUT = 100
 WANTED = {"train-meta": 15.0}
 WANTED_SHARE = 0.1  # of verdicts, at most
-WANTED_OF_CEILING = 0.8
+CLIMBING = {"train-options at a ladder": (), "policy_pixels=half": ("policy_pixels=half",)}
+WANTED_OF_CEILING = dict.fromkeys(CLIMBING, 0.8)
 
 
 def quietly(*command: object) -> None:
@@ -109,9 +111,9 @@ def stage(steps: int, folder: Path, *command: object) -> float:
     return (seconds(steps) - seconds(few)) / (steps - few)
 
 
-def climbing(ensemble: Path, steps: int, folder: Path) -> float:
-    """An agent step of ``train-options`` at a ladder."""
-    changes = ("start=1L", "termination=oracle", "random_episodes=0")
+def climbing(ensemble: Path, steps: int, folder: Path, *more: str) -> float:
+    """An agent step of ``train-options`` at a ladder, with ``more`` settings."""
+    changes = ("start=1L", "termination=oracle", "random_episodes=0", *more)
     return stage(steps, folder, "train-options", ensemble, *(word for pair in changes for word in ("--set", pair)))
 
 
@@ -155,11 +157,14 @@ def main() -> None:
         climbed = timing.alternated(
             {
                 "the emulator's ceiling": lambda: ceiling(1_000),
-                "train-options at a ladder": lambda: climbing(folder / "climbers", climbs, folder),
+                **{
+                    name: partial(climbing, folder / "climbers", climbs, folder, *more)
+                    for name, more in CLIMBING.items()
+                },
             },
             repeats,
         )
-        climb = timing.rows_of(climbed, "the emulator's ceiling", {"train-options at a ladder": WANTED_OF_CEILING})
+        climb = timing.rows_of(climbed, "the emulator's ceiling", WANTED_OF_CEILING)
     timing.show(f"\nDoorKey: an environment step, learning included ({ours:,} of ours)", rows)
     share = statistics.median(shares)
     print(f"terminations and masks: {share:.1%} of train-meta's time (wanted: under {WANTED_SHARE:.0%})")
