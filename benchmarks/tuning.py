@@ -1,0 +1,227 @@
+"""A random search for the tuned settings of PPO and DQN on three-key DoorKey, and for the size of PPO's bonus.
+
+    python -m benchmarks.tuning docs/results/tuning-baselines.csv
+
+``TRIALS`` settings of each agent, number 0 the one that was tuned by hand, the others drawn from ``SPACE``, are tried for
+``SHORT`` steps on each of ``LAYOUTS``; the best ``FINALISTS`` and number 0 for ``LONG`` steps, with another seed. The
+best of these by ``rank`` is what ``HYPERPARAMETERS`` calls tuned. With PPO's, bonuses are tried for ``LONG`` steps. A
+trial's rows, one a layout, are appended as soon as it ends; what is there is not run again. ``--tables`` draws them.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.cells import Cell, Row, parser_of, run_cells, table
+from hypogoal.core.compute import prepare
+from hypogoal.core.config import as_dict
+from hypogoal.core.seeding import rng_for
+from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.learners.baselines.agents import train
+from hypogoal.learners.baselines.engine_env import EngineEnv
+from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
+
+Settings = PPOSettings | DQNSettings
+Draw = Callable[[np.random.Generator], float | int | str]
+
+LAYOUTS = (400, 401, 402)  # nothing else is learned or tested there
+TRIALS, FINALISTS = 30, 5
+SHORT, LONG = 60_000, 200_000  # environment steps on each layout
+SEEDS = {SHORT: 4000, LONG: 4001}
+EPISODE = 500  # steps at most, as in Figure 6
+KEYS = ("agent", "trial", "step")
+COLUMNS = (*KEYS, "layout", "settings", "episodes", "solved", "first", "seconds")
+AGENTS = {"ppo": "PPO", "dqn": "DQN"}
+# Number 0: what was called tuned before there was a search.
+BY_HAND: dict[str, Settings] = {
+    "ppo": PPOSettings(
+        network="cells", environments=32, rollout=512, batch=128, epochs=6, learning_rate=5e-4, gae_lambda=0.95
+    ),
+    "dqn": DQNSettings(
+        network="cells",
+        environments=32,
+        batch=128,
+        learning_rate=5e-4,
+        target_interval=1,
+        target_tau=0.01,
+        epsilon_from="first-goal",
+        epsilon_final=0.05,
+    ),
+}
+
+
+def one_of(*values: float | int | str) -> Draw:
+    """Each as likely as the others."""
+    return lambda rng: values[int(rng.integers(len(values)))]
+
+
+def between(low: float, high: float) -> Draw:
+    """Log-uniform, to two digits."""
+    return lambda rng: float(f"{np.exp(rng.uniform(np.log(low), np.log(high))):.1e}")
+
+
+# What is not named stays as in number 0.
+SPACE: dict[str, Mapping[str, Draw]] = {
+    "ppo": {
+        "learning_rate": between(1e-4, 2e-3),
+        "entropy": between(1e-3, 1e-1),
+        "gamma": one_of(0.95, 0.97, 0.98, 0.99, 0.995),
+        "gae_lambda": one_of(0.9, 0.95, 0.97, 0.99),
+        "environments": one_of(16, 32, 64),
+        "rollout": one_of(8, 16, 32),  # times the environments
+        "epochs": one_of(3, 4, 6, 8),
+        "batch": one_of(64, 128, 256),
+        "clip": one_of(0.1, 0.2, 0.3),
+    },
+    "dqn": {
+        "learning_rate": between(1e-4, 2e-3),
+        "gamma": one_of(0.9, 0.95, 0.97, 0.99),
+        "batch": one_of(32, 64, 128),
+        "target_tau": one_of(0.005, 0.01, 0.02, 0.05),
+        "epsilon_from": one_of("start", "first-goal"),
+        "epsilon_steps": one_of(8_000, 16_000, 32_000, 64_000, 128_000),
+        "epsilon_final": one_of(0.01, 0.02, 0.05, 0.1),
+        "environments": one_of(16, 32, 64),
+    },
+}
+
+
+def settings_of(agent: str, trial: int) -> Settings:
+    """The settings of a trial, by its number alone."""
+    if not trial:
+        return BY_HAND[agent]
+    rng = rng_for(trial, "tuning", agent)
+    drawn = {name: draw(rng) for name, draw in SPACE[agent].items()}
+    if "rollout" in drawn:
+        drawn["rollout"] = int(drawn["rollout"]) * int(drawn["environments"])
+        drawn["batch"] = min(int(drawn["batch"]), drawn["rollout"])
+    return dataclasses.replace(BY_HAND[agent], **drawn)  # type: ignore[arg-type]
+
+
+def text_of(agent: str, settings: Settings) -> str:
+    """The settings that are searched for, as ``name=value`` with spaces between."""
+    return " ".join(f"{name}={as_dict(settings)[name]}" for name in SPACE[agent])
+
+
+def run_trial(agent: str, trial: int, steps: int) -> list[Row]:
+    """Train on each layout; what the training episodes were like."""
+    prepare()
+    chosen = settings_of(agent, trial)
+    about = {"agent": agent, "trial": trial, "step": steps, "settings": text_of(agent, chosen)}
+    rows = []
+    for layout in LAYOUTS:
+        begun = time.process_time()
+        env = EngineEnv(DOMAIN.make_engine(layout, chosen.environments, EPISODE))
+        train(env, chosen, steps, SEEDS[steps])
+        rows.append({**about, "layout": layout, **told(env, steps), "seconds": time.process_time() - begun})
+    return rows
+
+
+def told(env: EngineEnv, steps: int) -> Row:
+    """The share of all episodes that were solved, and the step of the first; where none was, the last step."""
+    solved = [bool(row[4]) for row in env.episodes]
+    first = next((row[0] for row in env.episodes if row[4]), steps)
+    return {"episodes": len(solved), "solved": float(np.mean(solved)), "first": min(first, steps)}
+
+
+Found = dict[tuple[str, int], dict[int, list[dict[str, str]]]]  # by agent and step; by trial its rows
+
+
+def read(path: Path) -> Found:
+    """The trials there are."""
+    found: Found = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            found.setdefault((row["agent"], int(row["step"])), {}).setdefault(int(row["trial"]), []).append(row)
+    return found
+
+
+def mean(rows: list[dict[str, str]], name: str) -> float:
+    """Of a trial, over its layouts."""
+    return float(np.mean([float(row[name]) for row in rows]))
+
+
+def rank(trials: Mapping[int, list[dict[str, str]]]) -> list[int]:
+    """The rule: by the mean over layouts of the share of episodes solved; ties by the mean step of the first success."""
+    return sorted(trials, key=lambda trial: (-mean(trials[trial], "solved"), mean(trials[trial], "first"), trial))
+
+
+def finalists(found: Found, agent: str) -> list[int]:
+    """The best of the short trials, and number 0."""
+    return sorted({0, *rank(found[agent, SHORT])[:FINALISTS]})
+
+
+def best(path: Path, agent: str) -> Settings:
+    """What is called tuned."""
+    return settings_of(agent, rank(read(path)[agent, LONG])[0])
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the rows say, as lines of Markdown."""
+    found = read(path)
+    yield f"Short trials, {SHORT:,} steps on each of {len(LAYOUTS)} layouts: share of episodes solved, mean over layouts."
+    yield ""
+    yield from table(
+        ["", "trials", "some success", "best", "median", "by hand (0)", "core minutes, long ones too"],
+        (_round(found, agent) for agent in AGENTS),
+    )
+    for agent in AGENTS:
+        long = found[agent, LONG]
+        yield f"{AGENTS[agent]}, {LONG:,} steps, the best first."
+        yield ""
+        yield from table(
+            ["trial", "place in short trials", "solved", "layout by layout", "first success, mean", "settings"],
+            (
+                [
+                    f"{trial} (by hand)" if not trial else str(trial),
+                    str(1 + rank(found[agent, SHORT]).index(trial)),
+                    *_numbers(long[trial]),
+                    long[trial][0]["settings"],
+                ]
+                for trial in rank(long)
+            ),
+        )
+
+
+def _round(found: Found, agent: str) -> list[str]:
+    trials = found[agent, SHORT]
+    scores = {trial: mean(rows, "solved") for trial, rows in trials.items()}
+    seconds = sum(
+        float(row["seconds"]) for step in (SHORT, LONG) for rows in found[agent, step].values() for row in rows
+    )
+    some = sum(score > 0 for score in scores.values())
+    shown = (max(scores.values()), float(np.median(list(scores.values()))), scores[0])
+    return [AGENTS[agent], str(len(trials)), str(some), *(f"{score:.3f}" for score in shown), f"{seconds / 60:.0f}"]
+
+
+def _numbers(rows: list[dict[str, str]]) -> list[str]:
+    """Share solved, the same layout by layout, and the mean step of the first success."""
+    places = " ".join(f"{float(row['solved']):.3f}" for row in rows)
+    return [f"{mean(rows, 'solved'):.3f}", places, f"{mean(rows, 'first'):,.0f}"]
+
+
+def main() -> None:
+    """Run the trials that are not in the file yet."""
+    arguments = parser_of(__doc__, "0").parse_args()
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+        return
+
+    def run(cells: list[tuple[str, int, int]]) -> None:
+        jobs: dict[Cell, Callable[[], list[Row]]] = {tuple(map(str, cell)): partial(run_trial, *cell) for cell in cells}
+        run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda cell: (int(cell[2]),), arguments.workers)
+
+    for agent in AGENTS:
+        run([(agent, trial, SHORT) for trial in range(TRIALS)])
+        run([(agent, trial, LONG) for trial in finalists(read(arguments.csv), agent)])
+
+
+if __name__ == "__main__":
+    main()
