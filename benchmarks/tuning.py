@@ -2,31 +2,38 @@
 
     python -m benchmarks.tuning docs/results/tuning-baselines.csv
 
-``TRIALS`` settings of each agent, number 0 the one that was tuned by hand, the others drawn from ``SPACE``, are tried for
-``SHORT`` steps on each of ``LAYOUTS``; the best ``FINALISTS`` and number 0 for ``LONG`` steps, with another seed. The
-best of these by ``rank`` is what ``HYPERPARAMETERS`` calls tuned. With PPO's, bonuses are tried for ``LONG`` steps. A
-trial's rows, one a layout, are appended as soon as it ends; what is there is not run again. ``--tables`` draws them.
+``TRIALS`` settings of each agent, number 0 the one that was tuned by hand, the others drawn from ``SPACE``, are tried
+for ``SHORT`` steps on each of ``LAYOUTS``; the best ``FINALISTS`` and number 0 for ``LONG`` steps, with another seed.
+The best of these by ``rank`` is what ``HYPERPARAMETERS`` calls tuned. With PPO's, ``BONUSES`` are tried for ``LONG``
+steps. A trial's rows, one a layout, are appended as soon as it ends; what is there is not run again. ``--tables`` draws
+them.
 """
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.cells import Cell, Row, parser_of, run_cells, table
+from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.doorkey import DOMAIN
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.learners.baselines.agents import train
-from hypogoal.learners.baselines.engine_env import EngineEnv
+from hypogoal.learners.baselines.engine_env import Bonus, EngineEnv
 from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
+from hypogoal.meta.training import judged
+from hypogoal.stages.collect import collect
+from hypogoal.stages.train_ensemble import train_ensemble
 
 Settings = PPOSettings | DQNSettings
 Draw = Callable[[np.random.Generator], float | int | str]
@@ -39,6 +46,8 @@ EPISODE = 500  # steps at most, as in Figure 6
 KEYS = ("agent", "trial", "step")
 COLUMNS = (*KEYS, "layout", "settings", "episodes", "solved", "first", "seconds")
 AGENTS = {"ppo": "PPO", "dqn": "DQN"}
+BONUSES = (0.02, 0.05, 0.1, 0.2)
+BONUS = "ppo-bonus"  # the agent's name in the file; the trial is the bonus' place in BONUSES
 # Number 0: what was called tuned before there was a search.
 BY_HAND: dict[str, Settings] = {
     "ppo": PPOSettings(
@@ -112,13 +121,34 @@ def text_of(agent: str, settings: Settings) -> str:
 
 def run_trial(agent: str, trial: int, steps: int) -> list[Row]:
     """Train on each layout; what the training episodes were like."""
-    prepare()
     chosen = settings_of(agent, trial)
     about = {"agent": agent, "trial": trial, "step": steps, "settings": text_of(agent, chosen)}
+    return tried(chosen, steps, about)
+
+
+def run_bonus(trial: int, chosen: Settings, work: Path) -> list[Row]:
+    """PPO with its best setting and a bonus for the first yes of each member of the ensemble in ``work``."""
+    about = {"agent": BONUS, "trial": trial, "step": LONG, "settings": f"bonus={BONUSES[trial]}"}
+    ensemble = work / "ensemble"
+    if not ensemble.exists():
+        collect(DOMAIN, DoorKeyConfig(heldout_layouts=1), work / "data.h5", quiet=True)  # held-out ones nobody looks at
+        config = TrainEnsembleConfig(diversity="dbat", members=3, workers=1)
+        train_ensemble(work / "data.h5", config, ensemble, seed=4000, quiet=True)
+    return tried(chosen, LONG, about, BONUSES[trial], open_artefact(ensemble, "ensemble"))
+
+
+def tried(chosen: Settings, steps: int, about: Row, bonus: float = 0.0, ensemble: Artefact | None = None) -> list[Row]:
+    """A row of each layout: ``about``, and what training there was like."""
+    prepare()
     rows = []
     for layout in LAYOUTS:
         begun = time.process_time()
-        env = EngineEnv(DOMAIN.make_engine(layout, chosen.environments, EPISODE))
+        engine = DOMAIN.make_engine(layout, chosen.environments, EPISODE)
+        paid = None
+        if ensemble:
+            members = judged(engine, ensemble.path, ensemble.config, "cpu")
+            paid = Bonus(members.of, members.options, engine.count, bonus, members)
+        env = EngineEnv(engine, paid)
         train(env, chosen, steps, SEEDS[steps])
         rows.append({**about, "layout": layout, **told(env, steps), "seconds": time.process_time() - begun})
     return rows
@@ -149,7 +179,7 @@ def mean(rows: list[dict[str, str]], name: str) -> float:
 
 
 def rank(trials: Mapping[int, list[dict[str, str]]]) -> list[int]:
-    """The rule: by the mean over layouts of the share of episodes solved; ties by the mean step of the first success."""
+    """The rule: by the share of episodes solved, mean over layouts; ties by the mean step of the first success."""
     return sorted(trials, key=lambda trial: (-mean(trials[trial], "solved"), mean(trials[trial], "first"), trial))
 
 
@@ -163,10 +193,16 @@ def best(path: Path, agent: str) -> Settings:
     return settings_of(agent, rank(read(path)[agent, LONG])[0])
 
 
+def best_bonus(path: Path) -> float:
+    """What Figure 6 pays."""
+    return BONUSES[rank(read(path)[BONUS, LONG])[0]]
+
+
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown."""
     found = read(path)
-    yield f"Short trials, {SHORT:,} steps on each of {len(LAYOUTS)} layouts: share of episodes solved, mean over layouts."
+    where = f"{SHORT:,} steps on each of {len(LAYOUTS)} layouts"
+    yield f"Short trials, {where}: share of episodes solved, mean over layouts."
     yield ""
     yield from table(
         ["", "trials", "some success", "best", "median", "by hand (0)", "core minutes, long ones too"],
@@ -188,6 +224,15 @@ def tables(path: Path) -> Iterator[str]:
                 for trial in rank(long)
             ),
         )
+    none = rank(found["ppo", LONG])[0]
+    paid = [("none", found["ppo", LONG][none])]
+    paid += [(str(BONUSES[trial]), rows) for trial, rows in sorted(found[BONUS, LONG].items())]
+    yield f"PPO's best setting (trial {none}) with a bonus for each member's first yes in an episode, {LONG:,} steps."
+    yield ""
+    yield from table(
+        ["bonus", "solved", "layout by layout", "first success, mean"],
+        ([name, *_numbers(rows)] for name, rows in paid),
+    )
 
 
 def _round(found: Found, agent: str) -> list[str]:
@@ -207,6 +252,11 @@ def _numbers(rows: list[dict[str, str]]) -> list[str]:
     return [f"{mean(rows, 'solved'):.3f}", places, f"{mean(rows, 'first'):,.0f}"]
 
 
+def trials(agent: str, numbers: Iterable[int], steps: int) -> dict[Cell, Callable[[], list[Row]]]:
+    """What makes the rows of each of these trials."""
+    return {(agent, str(trial), str(steps)): partial(run_trial, agent, trial, steps) for trial in numbers}
+
+
 def main() -> None:
     """Run the trials that are not in the file yet."""
     arguments = parser_of(__doc__, "0").parse_args()
@@ -214,13 +264,16 @@ def main() -> None:
         print("\n".join(tables(arguments.csv)))
         return
 
-    def run(cells: list[tuple[str, int, int]]) -> None:
-        jobs: dict[Cell, Callable[[], list[Row]]] = {tuple(map(str, cell)): partial(run_trial, *cell) for cell in cells}
+    def run(jobs: Mapping[Cell, Callable[[], list[Row]]]) -> None:
         run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda cell: (int(cell[2]),), arguments.workers)
 
     for agent in AGENTS:
-        run([(agent, trial, SHORT) for trial in range(TRIALS)])
-        run([(agent, trial, LONG) for trial in finalists(read(arguments.csv), agent)])
+        run(trials(agent, range(TRIALS), SHORT))
+        run(trials(agent, finalists(read(arguments.csv), agent), LONG))
+    chosen = best(arguments.csv, "ppo")
+    with tempfile.TemporaryDirectory() as work:
+        sizes = range(len(BONUSES))
+        run({(BONUS, str(trial), str(LONG)): partial(run_bonus, trial, chosen, Path(work)) for trial in sizes})
 
 
 if __name__ == "__main__":

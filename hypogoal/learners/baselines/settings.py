@@ -89,6 +89,12 @@ class BaselineConfig:
         "what is otherwise in the world than in the data, or by default: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
+    bonus: float = setting(
+        0.0,
+        "reward for the first time in an episode that a member of --ensemble says yes; 0 for none",
+        source="ours: a flat agent with the same knowledge",
+        low=0.0,
+    )
     random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
     # Last, because from here on the name means this field.
     setting: str = setting(
