@@ -9,6 +9,7 @@ import pytest
 from benchmarks import (
     bandits,
     choosing,
+    figure6,
     hypotheses,
     labels,
     ladder_options,
@@ -85,6 +86,15 @@ def test_learned_options_stand_beside_planned_ones(tmp_path: Path) -> None:
     assert lines.count("| D-BAT, K = 6, learned options | 120 | 400 (limit) |") == 1
     (tmp_path / "one.csv").write_text("\n".join(row for row in rows if ",learned," not in row) + "\n")
     assert not any("options" in line.split("|")[1] for line in choosing.tables(tmp_path / "one.csv") if "|" in line)
+
+
+def test_agents_of_figure_6_are_told_apart() -> None:
+    """By the folders of ``examples/figure6.toml``, where the ensemble's name is in those of other agents, too."""
+    place = "method-dbat-k3-layout-300-seed-3000"
+    assert figure6.method_of({}, place) == "dbat-k3"
+    assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
+    assert figure6.method_of({"bonus": 0.1}, place) == "ppo-bonus"
+    assert figure6.method_of({"bonus": 0.0}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
