@@ -39,8 +39,8 @@ Settings = PPOSettings | DQNSettings
 Draw = Callable[[np.random.Generator], float | int | str]
 
 LAYOUTS = (400, 401, 402)  # nothing else is learned or tested there
-TRIALS, FINALISTS = 30, 5
-SHORT, LONG = 60_000, 200_000  # environment steps on each layout
+TRIALS, FINALISTS = 30, 3
+SHORT, LONG = 60_000, 150_000  # environment steps on each layout
 SEEDS = {SHORT: 4000, LONG: 4001}
 EPISODE = 500  # steps at most, as in Figure 6
 KEYS = ("agent", "trial", "step")
@@ -267,13 +267,16 @@ def main() -> None:
     def run(jobs: Mapping[Cell, Callable[[], list[Row]]]) -> None:
         run_cells(arguments.csv, COLUMNS, KEYS, jobs, lambda cell: (int(cell[2]),), arguments.workers)
 
-    for agent in AGENTS:
+    def search(agent: str) -> None:
         run(trials(agent, range(TRIALS), SHORT))
         run(trials(agent, finalists(read(arguments.csv), agent), LONG))
+
+    search("ppo")
     chosen = best(arguments.csv, "ppo")
     with tempfile.TemporaryDirectory() as work:
         sizes = range(len(BONUSES))
         run({(BONUS, str(trial), str(LONG)): partial(run_bonus, trial, chosen, Path(work)) for trial in sizes})
+    search("dqn")
 
 
 if __name__ == "__main__":
