@@ -188,14 +188,20 @@ def finalists(found: Found, agent: str) -> list[int]:
     return sorted({0, *rank(found[agent, SHORT])[:FINALISTS]})
 
 
-def best(path: Path, agent: str) -> Settings:
-    """What is called tuned."""
-    return settings_of(agent, rank(read(path)[agent, LONG])[0])
+def over(found: Found, agent: str) -> bool:
+    """Whether the search for an agent's settings came to its end."""
+    short = len(found.get((agent, SHORT), {})) >= TRIALS
+    return short and found.get((agent, LONG), {}).keys() >= set(finalists(found, agent))
 
 
-def best_bonus(path: Path) -> float:
+def best(found: Found, agent: str) -> int:
+    """The trial that is called tuned: the one by hand until the search is over."""
+    return rank(found[agent, LONG])[0] if over(found, agent) else 0
+
+
+def best_bonus(found: Found) -> float:
     """What Figure 6 pays."""
-    return BONUSES[rank(read(path)[BONUS, LONG])[0]]
+    return BONUSES[rank(found[BONUS, LONG])[0]]
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -206,9 +212,11 @@ def tables(path: Path) -> Iterator[str]:
     yield ""
     yield from table(
         ["", "trials", "some success", "best", "median", "by hand (0)", "core minutes, long ones too"],
-        (_round(found, agent) for agent in AGENTS),
+        (_round(found, agent) for agent in AGENTS if (agent, SHORT) in found),
     )
     for agent in AGENTS:
+        if not over(found, agent):
+            continue
         long = found[agent, LONG]
         yield f"{AGENTS[agent]}, {LONG:,} steps, the best first."
         yield ""
@@ -224,7 +232,9 @@ def tables(path: Path) -> Iterator[str]:
                 for trial in rank(long)
             ),
         )
-    none = rank(found["ppo", LONG])[0]
+    if (BONUS, LONG) not in found:
+        return
+    none = best(found, "ppo")
     paid = [("none", found["ppo", LONG][none])]
     paid += [(str(BONUSES[trial]), rows) for trial, rows in sorted(found[BONUS, LONG].items())]
     yield f"PPO's best setting (trial {none}) with a bonus for each member's first yes in an episode, {LONG:,} steps."
@@ -239,7 +249,10 @@ def _round(found: Found, agent: str) -> list[str]:
     trials = found[agent, SHORT]
     scores = {trial: mean(rows, "solved") for trial, rows in trials.items()}
     seconds = sum(
-        float(row["seconds"]) for step in (SHORT, LONG) for rows in found[agent, step].values() for row in rows
+        float(row["seconds"])
+        for step in (SHORT, LONG)
+        for rows in found.get((agent, step), {}).values()
+        for row in rows
     )
     some = sum(score > 0 for score in scores.values())
     shown = (max(scores.values()), float(np.median(list(scores.values()))), scores[0])
@@ -272,7 +285,7 @@ def main() -> None:
         run(trials(agent, finalists(read(arguments.csv), agent), LONG))
 
     search("ppo")
-    chosen = best(arguments.csv, "ppo")
+    chosen = settings_of("ppo", best(read(arguments.csv), "ppo"))
     with tempfile.TemporaryDirectory() as work:
         sizes = range(len(BONUSES))
         run({(BONUS, str(trial), str(LONG)): partial(run_bonus, trial, chosen, Path(work)) for trial in sizes})

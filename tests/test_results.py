@@ -16,9 +16,11 @@ from benchmarks import (
     ladders,
     many_layouts,
     thresholds,
+    tuning,
     which_feature,
 )
 from benchmarks.cells import run_cells
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
@@ -31,6 +33,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "options-that-hold": ladder_options.tables_that_hold,
     "preference-doorkey": choosing.tables,
     "thresholds-doorkey": thresholds.tables,
+    "tuning-baselines": tuning.tables,
     "which-feature": which_feature.tables,
     "which-feature-bandits": bandits.tables,
     "which-feature-rooms": choosing.rooms,
@@ -95,6 +98,17 @@ def test_agents_of_figure_6_are_told_apart() -> None:
     assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
     assert figure6.method_of({"bonus": 0.1}, place) == "ppo-bonus"
     assert figure6.method_of({"bonus": 0.0}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
+
+
+def test_tuned_is_what_the_search_found() -> None:
+    """By its rule, from the cells; the drawn settings are those that ran, and Figure 6 pays the best bonus."""
+    found = tuning.read(RESULTS / "tuning-baselines.csv")
+    for agent in tuning.AGENTS:
+        for trial, rows in found[agent, tuning.SHORT].items():
+            assert {row["settings"] for row in rows} == {tuning.text_of(agent, tuning.settings_of(agent, trial))}
+        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(found, agent))
+    figure = (RESULTS.parents[1] / "examples" / "figure6.toml").read_text(encoding="utf-8")
+    assert re.findall(r"bonus=(\S+)", figure) == [str(tuning.best_bonus(found))]
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:
