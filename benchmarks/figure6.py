@@ -3,6 +3,7 @@
 hypogoal sweep examples/figure6.toml --out runs/figure6
 python -m benchmarks.figure6 runs/figure6 docs/results/figure6-doorkey.csv
 python -m benchmarks.figure6 --tables docs/results/figure6-doorkey.csv
+python -m benchmarks.figure6 --tables --picture docs/results/figure6.png docs/results/figure6-doorkey.csv
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +39,18 @@ METHODS = {
     "dqn-paper": "DQN, the paper's setting",
 }
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
-POINTS = 50_000  # steps between two points of a curve
+POINTS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1000, 1250, 1500)  # thousands of steps: of a curve
+LINES = {  # colour, dashes
+    "dbat-k3": ("#0b5394", "-"),
+    "none-k3": ("#e69138", "--"),
+    "one": ("#38761d", "-."),
+    "oracle": ("#8a8a8a", ":"),
+    "ppo-tuned": ("#990000", (0, (6, 2))),
+    "dqn-tuned": ("#c27ba0", (0, (3, 1, 1, 1))),
+    "ppo-bonus": ("#000000", (0, (1, 1))),
+    "ppo-paper": ("#990000", (0, (1, 3))),
+    "dqn-paper": ("#c27ba0", (0, (1, 3))),
+}
 
 
 def collect(run: Path, path: Path) -> None:
@@ -84,11 +97,10 @@ def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
     for name in ("success", "length_over_shortest", "near"):
         yield "agent", name, float(found[name] or 0.0)
     yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
-    for step in range(POINTS, run.budget + 1, POINTS):
-        seen = run.episodes.at(run.episodes.step <= step)
-        if len(seen.step) >= WINDOW:
-            yield "agent", f"success_at_{step}", float(seen.last().succeeded.mean())
-            yield "agent", f"length_at_{step}", float(seen.last().length.mean())
+    for step in (1_000 * point for point in POINTS):
+        seen = run.episodes.at(run.episodes.step <= step).last()
+        yield "agent", f"success_at_{step}", float(seen.succeeded.mean())
+        yield "agent", f"length_at_{step}", float(seen.length.mean()) / shortest
     if artefact.kind == "meta":
         loop = agent_of(artefact, run.seed, ENVIRONMENTS)
         for who in ("frozen", UNIFORM):
@@ -170,6 +182,34 @@ def tables(path: Path) -> Iterator[str]:
     )
 
 
+def draw(path: Path, out: Path) -> None:
+    """The curves: means over the layouts of each method, in the last 100 episodes before a step."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    figure, places = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    titles = {"success": "share of episodes solved", "length": "episode length / shortest path"}
+    for axes, (quantity, title) in zip(places, titles.items(), strict=True):
+        for method, (colour, dashes) in LINES.items():
+            means = []
+            for point in POINTS:
+                name = f"{quantity}_at_{1_000 * point}"
+                found = [float(row["value"]) for row in rows if (row["method"], row["quantity"]) == (method, name)]
+                means.append(float(np.mean(found)) if found else math.nan)
+            if np.isfinite(means).any():
+                axes.plot(POINTS, means, color=colour, linestyle=dashes, lw=1.8, label=METHODS[method])
+        axes.set_xscale("log")
+        axes.set_xticks(POINTS[::2], [f"{point:,}" for point in POINTS[::2]], fontsize=8)
+        axes.minorticks_off()
+        axes.set_xlabel("environment steps, thousands", fontsize=9)
+        axes.set_title(title, fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+    places[1].set_yscale("log")
+    places[1].set_yticks([1, 2, 5, 10, 30], ["1", "2", "5", "10", "30"], fontsize=8)
+    places[1].minorticks_off()
+    figure.legend(*places[0].get_legend_handles_labels(), loc="outside right center", fontsize=8, frameon=False)
+    figure.savefig(out, dpi=150)
+
+
 def _thousands(steps: float) -> str:
     return "-" if math.isnan(steps) else "never" if math.isinf(steps) else f"{steps / 1000:.0f}"
 
@@ -180,9 +220,12 @@ def main() -> None:
     parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
     parser.add_argument("csv", type=Path, help="the file of rows")
     parser.add_argument("--tables", action="store_true", help="print the tables only")
+    parser.add_argument("--picture", type=Path, help="draw the curves, a .png file")
     arguments = parser.parse_args()
     if not arguments.tables:
         collect(arguments.run, arguments.csv)
+    if arguments.picture:
+        draw(arguments.csv, arguments.picture)
     print("\n".join(tables(arguments.csv)))
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
-from hypogoal.evaluation.run import Choices, read_choices, read_terminations, within
+from hypogoal.evaluation.run import Choices, read_choices, within
 from hypogoal.hypotheses.scores import member_scores, most_and_least
 from hypogoal.meta.config import layout_seeds
 
@@ -78,7 +78,7 @@ def numbers(work: Work) -> dict[str, Any]:
     """Spec F6: the choices of every run of each agent whose options are members."""
     found, metrics = work.contents, []
     artefacts = {found.name(artefact): artefact for artefact in found.agents}
-    match_of = cache(match_on_layout)
+    judged = cache(on_layout)
     for agent in work.metrics["agents"]:
         rows = []
         for about in agent["runs"]:
@@ -89,44 +89,53 @@ def numbers(work: Work) -> dict[str, Any]:
                 continue
             ensemble = artefact.input("ensemble")
             seeds = layout_seeds(config.get("layouts", ""), about["layout_seed"])[:LOOKED_AT]
-            match, choices = match_of(ensemble, tuple(seeds)), read_choices(folder / "choices.csv")
-            for option, states in read_terminations(folder / "terminations.h5").items():
-                if states.dtype != PICTURE:
-                    break
+            choices, members = read_choices(folder / "choices.csv"), judged(ensemble, tuple(seeds))
+            for option, (picture, count) in members.sets.items():
                 place = f"terminations/{about['path']}/{option}"
-                work.arrays[place] = overlay(states)
-                work.arrays[place].attrs["states"] = len(states)
+                work.arrays[place] = picture
+                work.arrays[place].attrs["states"] = count
             of = {name: about[name] for name in ("path", "seed", "layout_seed")}
-            chosen = selection_of_run(choices, match, config["sub_goals"], config["members"])
+            chosen = selection_of_run(choices, members.match, config["sub_goals"], config["members"])
             rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})
         if rows:
             metrics.append({"name": agent["name"], "runs": rows})
     return {"selection": metrics}
 
 
-def match_on_layout(path: Path, layouts: tuple[int, ...]) -> NDArray[np.float64]:
-    """Spec F6: the balanced accuracy of every member of an ensemble on the states of layouts, float (G*K,).
+class OnLayout(NamedTuple):
+    """The members of an ensemble, as options, on the states of layouts.
 
-    NaN where the domain does not have the sub-goal, which the user's own labels told: its truth there is not known.
+    ``match``, float (G*K,), is their balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal,
+    which the user's own labels told: its truth there is not known. ``sets`` has of options that say yes anywhere how it
+    looks there, an :func:`overlay`, and in how many states; of pictures only.
     """
+
+    match: NDArray[np.float64]
+    sets: dict[int, tuple[NDArray[np.uint8], int]]
+
+
+def on_layout(path: Path, layouts: tuple[int, ...]) -> OnLayout:
+    """Every member of an ensemble's artefact on the states of layouts."""
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
 
     source = open_artefact(path, "ensemble")
-    domain = load_domain(source.config["domain"])
+    domain, members = load_domain(source.config["domain"]), source.config["members"]
     arguments = domain.world(source.config["domain_config"])
     arguments |= {"layouts": Layouts(layouts)} if len(layouts) > 1 else {}
     engine = domain.make_engine(layouts[0], len(layouts), 500, **arguments)
     ids = states_of_layout(engine)
     images, labels = engine.images(ids), dict(zip(domain.sub_goals, engine.labels(ids).T, strict=True))
-    match = []
-    for sub_goal in source.config["sub_goals"]:
-        if sub_goal not in labels:
-            match.append(np.full(source.config["members"], np.nan))
-            continue
+    match, sets = np.full(len(source.config["sub_goals"]) * members, np.nan), {}
+    for index, sub_goal in enumerate(source.config["sub_goals"]):
         ensemble = read_ensemble(source.path, source.config, sub_goal)
         verdicts = ensemble.verdicts(images, engine.positions(ids) if ensemble.needs_positions else None)
-        match.append(member_scores(verdicts, labels[sub_goal])["balanced_accuracy"])
-    return np.concatenate(match)
+        options = range(index * members, (index + 1) * members)
+        if sub_goal in labels:
+            match[options] = member_scores(verdicts, labels[sub_goal])["balanced_accuracy"]
+        for option, says_yes in zip(options, verdicts.T, strict=True):
+            if says_yes.any() and images.dtype == PICTURE:
+                sets[option] = overlay(images[says_yes]), int(says_yes.sum())
+    return OnLayout(match, sets)
 
 
 def states_of_layout(engine: Engine) -> NDArray[np.int64]:
@@ -202,9 +211,9 @@ def choices_section(material: Material, agent: Entry) -> Block:
         f"'{choosing.TITLE}', of agents whose options can be asked anywhere."
     )
     stops = (
-        "The states in which a member's classifier ended its option are laid over each other: what all of them share "
-        "is sharp, what few of them show is dim. For each sub-goal the member that the agent prefers most and the one "
-        "that it prefers least."
+        "All states of the layout in which a member says yes, where its option ends, are laid over each other: what "
+        "all of them share is sharp, what few of them show is dim. For each sub-goal the member that the agent prefers "
+        "most and the one that it prefers least."
     )
     lines = []
     for goal in run["sub_goals"]:
@@ -235,8 +244,8 @@ def figures(material: Material) -> Iterator[Drawn]:
         title = name.replace("figure", "Figure ") if name in NUMBERED.values() else "As Figures 7 and 8"
         caption = (
             f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
-            f"prefers most and of the one it prefers least ({run['path']}, {where}); the last states, 128 at "
-            "most, in which the member's classifier ended its option. Preference: chosen / expected under uniform "
+            f"prefers most and of the one it prefers least ({run['path']}, {where}); all states of the layout, as far "
+            "as they can be reached or met, in which the member says yes. Preference: chosen / expected under uniform "
             f"choice; match: balanced accuracy on that layout. {which(agent, selection) if agent else ''}"
         ).rstrip()
         drawn = termination_states([(f"{title}\n{note}", image) for title, note, image in sides])
@@ -246,13 +255,13 @@ def figures(material: Material) -> Iterator[Drawn]:
 def termination_states(sides: Sequence[tuple[str, NDArray[np.uint8] | None]]) -> Figure:
     """Figures 7 and 8: overlaid termination states of some members, the most preferred first.
 
-    A side is a title and an overlay uint8 (H, W, C), None where its classifier never ended an execution.
+    A side is a title and an overlay uint8 (H, W, C), None where the member says yes nowhere.
     """
     figure, places = grid_of_pictures(1, max(2, len(sides)), PICTURE_TITLE)
     for place, (title, image) in zip(places, sides, strict=False):
         if image is None:
             place.set_title(title, fontsize=9)
-            place.text(0.5, 0.5, "never ended\nby its classifier", ha="center", va="center", color=GREY)
+            place.text(0.5, 0.5, "says yes\nnowhere", ha="center", va="center", color=GREY)
         else:
             show_picture(place, image, title)
     return figure

@@ -178,16 +178,34 @@ class PaperQNetwork(nn.Module):
         self.values = nn.Sequential(nn.Linear(self.HIDDEN, 128), nn.ReLU(), nn.Linear(128, actions))
 
     def embed(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> float32 (N, features): the part before the GRU."""
-        return self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+        """uint8 (N, H, W, C) -> float32 (N, 3 * 512): what the GRU's gates get from an image alone.
+
+        Nearly all of the network's arithmetic is in here, so that an image of several executions is looked at once.
+        """
+        features = self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+        return self._gates(features, "ih")
 
     def forward(self, embedded: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Unroll the GRU over an option's own steps, float32 (N, T, features), from :meth:`embed`.
+        """Unroll the GRU over an option's own steps, float32 (N, T, 3 * 512), from :meth:`embed`.
 
         Gives values float32 (N, T, actions) and the state after the last step (1, N, 512), ``hidden`` of the next call.
+        The equations are those of ``nn.GRU``, which would compute an image's part anew for every execution it is in.
         """
-        out, hidden = self.gru(embedded, hidden)
-        return self.values(out), hidden
+        state = embedded.new_zeros(len(embedded), self.HIDDEN) if hidden is None else hidden[0]
+        states = []
+        for step in embedded.unbind(1):
+            recurrent = self._gates(state, "hh")
+            both = (step + recurrent)[:, : 2 * self.HIDDEN].sigmoid()
+            reset, update = both.chunk(2, dim=1)
+            new = (step[:, 2 * self.HIDDEN :] + reset * recurrent[:, 2 * self.HIDDEN :]).tanh()
+            state = torch.lerp(new, state, update)
+            states.append(state)
+        return self.values(torch.stack(states, dim=1)), state[None]
+
+    def _gates(self, inputs: Tensor, of: str) -> Tensor:
+        """float32 (N, 3 * 512): what the gates get from images (``ih``) or from the state before (``hh``)."""
+        weight, bias = (self.gru.get_parameter(f"{kind}_{of}_l0") for kind in ("weight", "bias"))
+        return nn.functional.linear(inputs, weight, bias)
 
 
 Pictures = Engine | AgentWindows

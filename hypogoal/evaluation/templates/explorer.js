@@ -96,7 +96,7 @@
     const options = found.options.map((option) => {
       const drawn = option.png
         ? image(option.png, `Overlaid termination states: ${option.name}`)
-        : make("div", { class: "nothing" }, "its classifier never ended it");
+        : make("div", { class: "nothing" }, "no state in which it ends");
       const body = make("div", {}, make("h4", {}, option.name), ...(option.note ? [soft(option.note)] : []), facts(option.facts));
       return make("div", { class: "option card" }, drawn, body);
     });

@@ -1,0 +1,42 @@
+"""The light learner's fast path: each distinct state of a batch is looked at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.light import LightLearner
+from hypogoal.options.networks import apply_to_states
+from hypogoal.options.termination import oracle_terminations
+
+
+def test_values_and_gradients_are_those_of_every_row() -> None:
+    """As of both networks on the whole batch, rows that repeat included, up to rounding."""
+    rng = np.random.default_rng(0)
+    engine = DoorKeyEngine(5, 4)
+    for _ in range(50):
+        engine.step(rng.integers(engine.n_actions, size=4))
+    learner = LightLearner(engine, oracle_terminations(engine, range(5)), OptionConfig(environments=4), 0)
+    with torch.no_grad():
+        learner._flat_target.vector.mul_(0.9)  # so that the target is another network
+    s, following = rng.integers(20, size=(2, 64))
+    weights = torch.from_numpy(rng.normal(size=(64, 5, 7)).astype(np.float32))
+
+    def slopes(values: torch.Tensor) -> torch.Tensor:
+        assert learner._flat.vector.grad is not None
+        learner._flat.vector.grad.zero_()
+        (values * weights).sum().backward()
+        return learner._flat.vector.grad.clone()
+
+    here, next_online, next_target = learner._values(s, following)
+    fast = slopes(here)
+    plain = apply_to_states(learner.online, engine, s)
+    torch.testing.assert_close(here, plain)
+    torch.testing.assert_close(fast, slopes(plain))
+    torch.testing.assert_close(next_online, apply_to_states(learner.online, engine, following).detach())
+    torch.testing.assert_close(next_target, apply_to_states(learner.target, engine, following).detach())
+    assert not next_online.requires_grad
+    assert not next_target.requires_grad
+    assert not torch.allclose(next_online, next_target)
