@@ -11,8 +11,9 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,8 +32,11 @@ METHODS = {
     "none-k3": "no diversity, K = 3",
     "one": "one classifier, K = 1",
     "oracle": "true sub-goals",
+    "ppo-bonus": "PPO, D-BAT's verdicts as a bonus",
     "ppo-tuned": "PPO",
     "dqn-tuned": "DQN",
+    "ppo-paper": "PPO, the paper's setting",
+    "dqn-paper": "DQN, the paper's setting",
 }
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
 POINTS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1000, 1250, 1500)  # thousands of steps: of a curve
@@ -59,11 +63,7 @@ def collect(run: Path, path: Path) -> None:
     for kind in ("meta", "baseline"):
         for artefact in find_artefacts(run, kind):
             read = read_run(artefact, artefact.path.name)
-            method = (
-                "oracle"
-                if read.config.get("termination") == "oracle"
-                else next(name for name in METHODS if f"-{name}-" in f"-{artefact.path.name}-")
-            )
+            method = method_of(read.config, artefact.path.name)
             key = (method, str(read.layout["layout_seed"]))
             if key not in there:
                 about = dict(zip(COLUMNS, (*key, str(read.seed)), strict=False))
@@ -77,6 +77,13 @@ def collect(run: Path, path: Path) -> None:
         writer.writeheader()
         for place in sorted(there, key=lambda key: (order.index(key[0]), int(key[1]))):
             writer.writerows(there[place])
+
+
+def method_of(config: Mapping[str, Any], place: str) -> str:
+    """Which of ``METHODS`` an agent is, by its settings and the name of its folder."""
+    if config.get("termination") == "oracle":
+        return "oracle"
+    return "ppo-bonus" if config.get("bonus") else next(name for name in METHODS if f"-{name}-" in f"-{place}-")
 
 
 def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:

@@ -94,10 +94,10 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
     return Needs(memory, weights + packed + CHECKPOINTS * (state + packed) + LOGS)
 
 
-def baseline_needs(observation: int, replay: int) -> Needs:
-    """``train-baseline``: ``replay`` transitions of two observations of so many bytes."""
+def baseline_needs(observation: int, replay: int, members: int = 0) -> Needs:
+    """``train-baseline``: ``replay`` transitions of two observations of so many bytes; ``members`` who earn a bonus."""
     state = 2.0 * observation * replay
-    return Needs(BASE + 100e6 + 2 * state, CHECKPOINTS * (state + 50e6) + LOGS)
+    return Needs(BASE + 100e6 + 2 * state + members * (MEMBER + WINDOWS), CHECKPOINTS * (state + 50e6) + LOGS)
 
 
 def evaluation_needs(data: list[Path], workers: int = 1) -> Needs:

@@ -9,15 +9,18 @@ import pytest
 from benchmarks import (
     bandits,
     choosing,
+    figure6,
     hypotheses,
     labels,
     ladder_options,
     ladders,
     many_layouts,
     thresholds,
+    tuning,
     which_feature,
 )
 from benchmarks.cells import run_cells
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
@@ -30,6 +33,7 @@ PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "options-that-hold": ladder_options.tables_that_hold,
     "preference-doorkey": choosing.tables,
     "thresholds-doorkey": thresholds.tables,
+    "tuning-baselines": tuning.tables,
     "which-feature": which_feature.tables,
     "which-feature-bandits": bandits.tables,
     "which-feature-rooms": choosing.rooms,
@@ -85,6 +89,26 @@ def test_learned_options_stand_beside_planned_ones(tmp_path: Path) -> None:
     assert lines.count("| D-BAT, K = 6, learned options | 120 | 400 (limit) |") == 1
     (tmp_path / "one.csv").write_text("\n".join(row for row in rows if ",learned," not in row) + "\n")
     assert not any("options" in line.split("|")[1] for line in choosing.tables(tmp_path / "one.csv") if "|" in line)
+
+
+def test_agents_of_figure_6_are_told_apart() -> None:
+    """By the folders of ``examples/figure6.toml``, where the ensemble's name is in those of other agents, too."""
+    place = "method-dbat-k3-layout-300-seed-3000"
+    assert figure6.method_of({}, place) == "dbat-k3"
+    assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
+    assert figure6.method_of({"bonus": 0.1}, place) == "ppo-bonus"
+    assert figure6.method_of({"bonus": 0.0}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
+
+
+def test_tuned_is_what_the_search_found() -> None:
+    """By its rule, from the cells; the drawn settings are those that ran, and Figure 6 pays the best bonus."""
+    found = tuning.read(RESULTS / "tuning-baselines.csv")
+    for agent in tuning.AGENTS:
+        for trial, rows in found[agent, tuning.SHORT].items():
+            assert {row["settings"] for row in rows} == {tuning.text_of(agent, tuning.settings_of(agent, trial))}
+        assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(found, agent))
+    figure = (RESULTS.parents[1] / "examples" / "figure6.toml").read_text(encoding="utf-8")
+    assert re.findall(r"bonus=(\S+)", figure) == [str(tuning.best_bonus(found))]
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:

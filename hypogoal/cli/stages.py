@@ -77,9 +77,12 @@ def train_baseline(
     given: cli.Given,
     domain: cli.DomainName,
     data: Annotated[Path | None, Option(help="Play in the world in which these states were collected.")] = None,
+    ensemble: Annotated[
+        Path | None, Option(help="Pay --set bonus=X for its members' first yeses in an episode.")
+    ] = None,
 ) -> None:
     """Train PPO or DQN on primitive actions, to compare."""
-    given.end(given.make(domain, data=data), "evaluate", given.out.parent)
+    given.end(given.make(domain, data=data, ensemble=ensemble), "evaluate", given.out.parent)
 
 
 @cli.stage(cli.OWN, "audit", "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out audit")

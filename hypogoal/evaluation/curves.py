@@ -182,7 +182,7 @@ def run_numbers(episodes: Episodes, shortest_path: int | None, window: int = WIN
 def base_name(kind: str, config: Mapping[str, Any]) -> str:
     """Spec E6, E7: what an agent is called by how it chooses and what ends its options."""
     if kind == "baseline":
-        return f"{config['agent'].upper()} {config['setting']}"
+        return f"{config['agent'].upper()} {config['setting']}" + (", bonus" if config.get("bonus") else "")
     if kind == "options":
         return PRETRAINING
     if config["chooser"] == "thompson":

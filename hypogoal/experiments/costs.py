@@ -96,7 +96,8 @@ class Estimates:
             chosen = HYPERPARAMETERS[config.agent, config.setting]
             kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
-            return Cost(seconds, *baseline_needs(domain.observation_bytes, kept))
+            members = len(source.sub_goals or domain.sub_goals) * source.members if source else 0
+            return Cost(seconds, *baseline_needs(domain.observation_bytes, kept, members))
         for start in config.start.split(","):
             domain.rooms_of(start)  # which says so where there is no such start
         about: dict[str, Any] = {"sub_goals": domain.sub_goals, "members": 1}

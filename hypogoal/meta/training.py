@@ -78,12 +78,8 @@ def assemble(
     elif oracle:
         terminations = oracle_terminations(engine, columns)
     else:
-        ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in sub_goals]
         alone = config.experience == "own" and not config.mask_reached
-        terminations = learned_terminations(engine, ensembles, running_only=alone, rule=config.termination)
-        many = engine.layouts is not None and engine.layouts.many
-        if not many and (reachable := engine.reachable()) is not None:
-            terminations.of(reachable)  # most of what will be visited, judged at once
+        terminations = judged(engine, ensemble, about, device, running_only=alone, rule=config.termination)
     _check_rule(terminations, config)
     windows = None
     if config.policy_view == "agent-crop":
@@ -119,6 +115,16 @@ def assemble(
     if near := nearness(domain, engine, about, config):
         near(np.repeat(engine.ids[:1], options), np.arange(options))  # labels that fail do so before all is learned
     return loop
+
+
+def judged(engine: Engine, ensemble: Path, about: Mapping[str, Any], device: str, **how: Any) -> Terminations:
+    """An ensemble's ``learned_terminations``; ``about`` is its manifest's configuration."""
+    ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in about["sub_goals"]]
+    terminations = learned_terminations(engine, ensembles, **how)
+    many = engine.layouts is not None and engine.layouts.many
+    if not many and (reachable := engine.reachable()) is not None:
+        terminations.of(reachable)  # most of what will be visited, judged at once
+    return terminations
 
 
 def nearness(

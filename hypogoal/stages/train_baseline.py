@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.cards import create_artefact
-from hypogoal.core.artefacts import claim
+from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
@@ -16,7 +16,7 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig, DQNSettings
-from hypogoal.meta.training import cut, played_world, write_layout
+from hypogoal.meta.training import cut, judged, played_world, write_layout
 from hypogoal.needs import baseline_needs
 
 
@@ -26,6 +26,7 @@ def train_baseline(
     out: Path,
     *,
     data: Path | None = None,
+    ensemble: Path | None = None,
     seed: int = 0,
     force: bool = False,
     resume: bool = False,
@@ -34,18 +35,29 @@ def train_baseline(
 ) -> dict[str, Any]:
     """Train the agent and write the artefact ``out``: episodes.csv, layout.json, metrics.jsonl, policy.safetensors.
 
-    With ``data``, states of the domain, it plays in the world they are of, else in that of the domain's defaults.
-    Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states of
-    another domain, or an ``out`` that exists is a ``UserError``, NaN or Inf in a weight a ``NumericalError``.
+    With ``data``, states of the domain, it plays in the world they are of; without, in that of the ``ensemble``, whose
+    members' verdicts earn the bonus; else in that of the domain's defaults.
+    Returns steps, episodes, and success and length over the last 100 episodes. An unknown domain or device, states or
+    an ensemble of another domain, a bonus without an ensemble or the other way round, or an ``out`` that exists is a
+    ``UserError``, NaN or Inf in a weight a ``NumericalError``.
     """
     from hypogoal.learners.baselines.agents import train, weights
-    from hypogoal.learners.baselines.engine_env import EngineEnv
+    from hypogoal.learners.baselines.engine_env import Bonus, EngineEnv
 
     device = prepare(device)
-    inputs = [data] if data else []
+    if ensemble and not config.bonus:
+        raise UserError("an ensemble without a bonus changes nothing", ensemble, "Give --set bonus=0.1 too.")
+    if config.bonus and not ensemble:
+        what = "a bonus is paid where an ensemble's members say yes"
+        raise UserError(what, f"bonus={config.bonus:g}", "Give --ensemble too, or leave bonus out.")
+    taught = open_artefact(ensemble, "ensemble").whole() if ensemble else None
+    if taught and taught.config["domain"] != domain:
+        what = f"this ensemble is of {taught.config['domain']!r}, not of {domain!r}"
+        raise UserError(what, taught.path, "Name the domain it is of.")
+    inputs = [path for path in (data, ensemble) if path]
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
-    lived: dict[str, Any] = {}
+    lived: dict[str, Any] = played.world(taught.config["domain_config"]) if taught else {}
     if data:
         dataset = open_dataset(data)
         if dataset.domain != domain:
@@ -60,10 +72,15 @@ def train_baseline(
     cut(engine, config.cap)
     if data and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
-    env = EngineEnv(engine)
+    bonus = None
+    if taught:
+        members = judged(engine, taught.path, taught.config, device)
+        bonus = Bonus(members.of, members.options, engine.count, config.bonus, members)
+    env = EngineEnv(engine, bonus)
     size = env.observation_space.sample().nbytes
     replay = chosen.replay if isinstance(chosen, DQNSettings) else 0
-    preflight("train-baseline", out, baseline_needs(size, replay), resume=resume, quiet=quiet)
+    needs = baseline_needs(size, replay, bonus.members if bonus else 0)
+    preflight("train-baseline", out, needs, resume=resume, quiet=quiet)
     about = as_dict(config) | {"domain": domain, "domain_config": world}
     about |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
     with create_artefact(

@@ -149,7 +149,7 @@ def test_epsilon_waits_for_the_first_goal():
     assert isinstance(tuned, DQNSettings)
     assert [round(epsilon(paper, step, None), 3) for step in (0, 4_000, 8_000, 9_000)] == [1.0, 0.505, 0.01, 0.01]
     assert epsilon(tuned, 200_000, None) == 1.0
-    assert epsilon(tuned, 24_000, first_goal=20_000) == pytest.approx(0.525)
+    assert epsilon(tuned, 36_000, first_goal=20_000) == pytest.approx(0.525)
 
 
 def test_the_paper_setting_is_the_papers():
@@ -169,7 +169,7 @@ def test_the_artefact_says_what_happened(tmp_path):
     train_baseline("doorkey", config, tmp_path / "b", seed=4, quiet=True)
     artefact = open_artefact(tmp_path / "a", "baseline")
     assert artefact.config["hyperparameters"]["epsilon_from"] == "first-goal"
-    assert artefact.config["environments"] == 32
+    assert artefact.config["environments"] == 16
     assert numbers["steps"] == 2_560
     rows = list(csv.DictReader((tmp_path / "a" / "episodes.csv").read_text().splitlines()))
     assert len(rows) == numbers["episodes"] == 64
