@@ -32,7 +32,7 @@ class EnsembleConfig:
     )
     encoder: str = setting(
         "separate",
-        "a network without its last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
+        "network up to the last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
         source="the paper; shared: DivDis (arXiv:2202.03418)",
         choices=("separate", "shared", "frozen"),
     )
