@@ -147,7 +147,7 @@ def require_names(sub_goals: Sequence[str]) -> None:
     for name in sub_goals:
         if not plain_name(name):
             do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, dot or space first or last, any of {FORMULA} first."
-            raise UserError("a sub-goal's name must be able to be a file's name", repr(name), do)
+            raise UserError("a sub-goal's name must be usable as a file name", repr(name), do)
     if not plain_names(sub_goals):
         do = "Give them different names; upper and lower case are one to some file systems."
         raise UserError("two sub-goals have the same name", ", ".join(sub_goals), do)
@@ -170,7 +170,7 @@ def write_dataset(
     require_names(collected.sub_goals)
     for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
         if not path_part(origin):
-            raise UserError("an origin's name must be able to be a file's name", repr(origin), "Leave out separators.")
+            raise UserError("an origin's name must be usable as a file name", repr(origin), "Leave out separators.")
     path = claim(path, kind=DATA, force=force)
     parse_json(json.dumps([domain, dict(config)]), path, "names and settings are", "Give names in UTF-8.")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,7 +199,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
     labels, shape = states.labels, (len(states.observations), len(sub_goals))
     if getattr(labels, "dtype", None) != np.bool_ or labels.shape != shape:  # of the text 'False' NumPy makes True
         found = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
-        raise UserError(f"the domain's {split} labels are no truth values", found, f"Give bool {shape}.")
+        raise UserError(f"the domain's {split} labels are not truth values", found, f"Give bool {shape}.")
     first: Any = None
     for index, sub_goal in enumerate(sub_goals):
         group = file.create_group(f"{split}/{sub_goal}")
@@ -246,7 +246,7 @@ class Dataset:
             if version > DATA_FORMAT:
                 raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
             if version < DATA_FORMAT:
-                raise UserError(f"format {version} is that of an earlier hypogoal", path, AGAIN)
+                raise UserError(f"format {version} comes from an earlier hypogoal", path, AGAIN)
             if hdf5.attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal saved the rest of a cut file
                 raise UserError("a part of the data file was cut off", path, AGAIN)
             self.attributes = {name: hdf5.attribute(file, name) for name in ATTRIBUTES}

@@ -344,7 +344,7 @@ def test_labels_of_a_domain_that_collects_itself(labels: Any, told: Callable[...
             found = super().collect(config, seed, progress)
             return replace(found, labelled=replace(found.labelled, labels=labels))
 
-    assert "the domain's labelled labels are no truth values" in told(Domain(), ["collect", NAME, "-q"])
+    assert "the domain's labelled labels are not truth values" in told(Domain(), ["collect", NAME, "-q"])
 
 
 OBJECTIVES: list[tuple[Callable[[Tensor, Tensor], Any], str]] = [

@@ -23,9 +23,9 @@ Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
 def show(
     path: Made,
     as_json: cli.AsJson = False,
-    pictures: Annotated[Path | None, Option(help="Of a data file: draw labelled states into this folder.")] = None,
+    pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
-    """What is this: its result, configuration and inputs."""
+    """Say what this is: its result, configuration and inputs."""
     from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
 
     about, numbers = describe_path(path), None
@@ -45,7 +45,7 @@ def show(
 
 @cli.command(cli.LOOK, "verify runs/mine")
 def verify(path: Made, as_json: cli.AsJson = False) -> None:
-    """Is it whole? Exit code 2 when something is wrong.
+    """Check that it is whole. Exit code 2 if something is wrong.
 
     Checks schema, hashes, numbers, and the inputs within PATH.
     """
@@ -61,7 +61,7 @@ def verify(path: Made, as_json: cli.AsJson = False) -> None:
 def watch(
     run: Annotated[Path, Argument(help="A run, finished or not.")],
     once: Annotated[bool, Option("--once", help="Print it once instead of following it.")] = False,
-    tensorboard: Annotated[Path | None, Option(help="Logs for TensorBoard (an extra), into this new folder.")] = None,
+    tensorboard: Annotated[Path | None, Option(help="Write logs for TensorBoard (an extra) to this folder.")] = None,
 ) -> None:
     """Follow a run: steps, success or loss so far. Ctrl-C ends it."""
     from hypogoal.live_view import Boards
@@ -74,13 +74,14 @@ def watch(
 def config(
     context: typer.Context,
     stage: Annotated[
-        str | None, Argument(help="train-meta, say; if none, all are told.", autocompletion=cli.offer("stage"))
+        str | None,
+        Argument(help="For example train-meta; without it, the list of stages.", autocompletion=cli.offer("stage")),
     ] = None,
-    domain: Annotated[str, Option(help=f"Whose: {cli.DOMAINS}", autocompletion=cli.offer("domain"))] = DOMAIN,
+    domain: Annotated[str, Option(help=f"Settings for: {cli.DOMAINS}", autocompletion=cli.offer("domain"))] = DOMAIN,
     preset: cli.Preset = None,
     as_json: cli.AsJson = False,
 ) -> None:
-    """Every setting of a stage: default, unit, meaning, source."""
+    """List every setting of a stage: default, unit, meaning, source."""
     if stage is None:
         known: Any = context.parent and context.parent.command
         cli.echo(list(TABLES), as_json, [f"{name:15}{known.commands[name].get_short_help_str(64)}" for name in TABLES])

@@ -24,18 +24,20 @@ if TYPE_CHECKING:
 
 @cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
-    source: Annotated[Path, Argument(help="A .npz file, or a folder: of .npy files, of images, a Minari dataset's.")],
+    source: Annotated[Path, Argument(help="A .npz file, or a folder of .npy files, of images or of a Minari dataset.")],
     out: cli.Out,
-    sub_goal: Annotated[list[str] | None, Option(help="In the order of the labels' columns; repeatable.")] = None,
-    label: Annotated[list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Of Minari: who labels.")] = None,
-    key: Annotated[str, Option(help="Of a Minari dataset of dictionaries: which part is meant.")] = "",
+    sub_goal: Annotated[list[str] | None, Option(help="Its name; in the order of the labels' columns.")] = None,
+    label: Annotated[
+        list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Minari: a function that labels.")
+    ] = None,
+    key: Annotated[str, Option(help="Which part to take, if a Minari dataset has dictionaries.")] = "",
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
-    domain: Annotated[str, Option(help="What the states are of, for train-options.")] = "imported",
+    domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
     seed: cli.Seed = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Make a data file of own arrays, images or Minari data."""
+    """Make a data file of your arrays, images or Minari data."""
     from hypogoal.core import own_code
     from hypogoal.stages.import_data import import_data as stage
 
@@ -57,8 +59,8 @@ def import_(
 def export(
     source: Annotated[Path, Argument(help="A data file, or the folder of a meta artefact.")],
     out: Annotated[Path, Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
-    episodes: Annotated[int, Option(min=1, help="Of the agent, where it is one.")] = 20,
-    seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Of the agent's draws of options.")] = 0,
+    episodes: Annotated[int, Option(min=1, help="How many an agent plays.")] = 20,
+    seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Seed of the agent's draws of options.")] = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
@@ -83,17 +85,17 @@ def export(
 def label(
     source: Annotated[str, Argument(help=f"To look at: a data file, .npz file or folder of images; to play: {PLAYED}")],
     out: Annotated[Path, Option("--out", help="The folder of marked states; its name is the sub-goal's.")],
-    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played first.")] = 0,
-    arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Of the environment: start=2-6.")] = None,
+    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
+    arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
     fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps a second; 0: a step for each key.")] = 0,
-    resume: Annotated[bool, Option("--resume", help="Go on with a folder that there is.")] = False,
-    record: Annotated[Path | None, Option(help="Write what is played into this file, for 'collect --play'.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Go on with an existing folder.")] = False,
+    record: Annotated[Path | None, Option(help="Write what you play into this file, for 'collect --play'.")] = None,
 ) -> None:
     """Mark states by hand, in a window; 'import' takes them.
 
     Keys: p positive, n negative, u unlabelled. Every mark is on the disk at
-    once. --heldout adds states of other layouts to a folder, to judge members.
+    once. --heldout adds states of other layouts to the folder, to judge members by.
     """
     from hypogoal.core import own_code
     from hypogoal.stages.label import label as stage
@@ -131,12 +133,12 @@ def check(
     set_: cli.Set = None,
     play: cli.Play = None,
     seed: cli.Seed = 0,
-    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout that is played.")] = 0,
+    layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play.")] = 0,
 ) -> None:
-    """Does an own domain, objective or network keep its contract?
+    """Check that your domain, objective or network keeps its contract.
 
-    Exit code 2 when not. --set and --play change how states of the domain are
-    collected, as for 'collect'; a few are, twice.
+    Exit code 2 if not. It collects a few states of the domain, twice; --set and
+    --play change how, as for 'collect'.
     """
     from hypogoal.core import own_code
 

@@ -13,7 +13,7 @@ from hypogoal.stages import domain_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
-FILMS = "RUN/report/videos/*.gif; the page shows the first. If not said: one, where it can be."
+FILMS = "RUN/report/videos/*.gif; the page shows the first. By default one, if possible."
 
 
 @cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
@@ -47,7 +47,7 @@ def train_ensemble(
 def train_options(
     given: cli.Given,
     ensemble: Annotated[Path, ENSEMBLE],
-    options: Annotated[Path | None, Option(help="Go on with these options of the ensemble, perhaps elsewhere.")] = None,
+    options: Annotated[Path | None, Option(help="Continue these options, perhaps in another place.")] = None,
 ) -> None:
     """Learn an option (a policy) for every member."""
     from hypogoal.stages.train_meta import FIXED
@@ -76,7 +76,7 @@ def train_meta(
 def train_baseline(
     given: cli.Given,
     domain: cli.DomainName,
-    data: Annotated[Path | None, Option(help="Play in the world in which these states were collected.")] = None,
+    data: Annotated[Path | None, Option(help="Play in the world that these states were collected in.")] = None,
     ensemble: Annotated[
         Path | None, Option(help="Pay --set bonus=X for its members' first yeses in an episode.")
     ] = None,
@@ -89,11 +89,11 @@ def train_baseline(
 def audit(
     given: cli.Given,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
-    domain: Annotated[str, Option(help=f"Where it is played: {cli.DOMAINS}", autocompletion=cli.offer("domain"))],
-    sub_goal: Annotated[str, Option(help="Of the domain: whose truth counts.")],
-    member: Annotated[int, Option(min=0, help="Of the ensemble.")] = 0,
+    domain: Annotated[str, Option(help=f"Where to play: {cli.DOMAINS}", autocompletion=cli.offer("domain"))],
+    sub_goal: Annotated[str, Option(help="The domain's sub-goal whose truth counts.")],
+    member: Annotated[int, Option(min=0, help="Which member of the ensemble.")] = 0,
 ) -> None:
-    """How often do policies fool a success classifier, where?"""
+    """How often, and where, do policies fool a success classifier?"""
     from hypogoal.core import own_code
     from hypogoal.evaluation.audit import lines_of
     from hypogoal.stages.audit import audit as audited
@@ -111,7 +111,7 @@ def evaluate(
     run: Annotated[Path, Argument(help="A run: a folder with artefacts in it.")],
     out: Annotated[Path | None, Option("--out", help="Default: RUN/evaluation.")] = None,
     layouts: Annotated[
-        str | None, Option(help="Agents, and each option alone, also play these as they are: 2000-2099 or 7,9.")
+        str | None, Option(help="Agents, and each option alone, also play these without learning: 2000-2099 or 7,9.")
     ] = None,
     force: cli.Force = False,
     resume: cli.Resume = False,
@@ -132,9 +132,9 @@ def evaluate(
 @cli.command(cli.MAKE, "report runs/mine --videos 3")
 def report(
     run: Annotated[Path, Argument(help="A run that was evaluated.")],
-    figures: Annotated[Path | None, Option(help="The paper's figures, into this folder, instead of the page.")] = None,
-    format_: Annotated[str | None, Option("--format", help="Of --figures: svg (if not said), pdf or png.")] = None,
-    videos: Annotated[int | None, Option(min=0, help=f"Films of the policy over options, {FILMS}")] = None,
+    figures: Annotated[Path | None, Option(help="Draw the paper's figures into this folder, not the page.")] = None,
+    format_: Annotated[str | None, Option("--format", help="For --figures: svg (the default), pdf or png.")] = None,
+    videos: Annotated[int | None, Option(min=0, help=f"Films of the policy over options, in {FILMS}")] = None,
     force: cli.Force = False,
     resume: cli.Resume = False,
     quiet: cli.Quiet = False,
@@ -164,11 +164,11 @@ def report(
 
 @cli.command(cli.LOOK, "compare runs/mine runs/other --out runs/both")
 def compare(
-    runs: Annotated[list[Path], Argument(metavar="RUN RUN ...", help="Evaluated; the first is compared with.")],
+    runs: Annotated[list[Path], Argument(metavar="RUN RUN ...", help="Evaluated; each is compared with the first.")],
     out: cli.Out,
     force: cli.Force = False,
 ) -> None:
-    """Evaluated runs side by side: what differs, who wins."""
+    """Put evaluated runs side by side: what differs, who wins."""
     from hypogoal.inspection import outcome
     from hypogoal.stages.compare import compare as compared
 

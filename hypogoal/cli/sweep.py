@@ -11,7 +11,7 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 
-KNOWN = "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or an own .toml file."
+KNOWN = "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or a .toml file of your own."
 DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost, run none.")]
 _slurm = partial(Option, rich_help_panel="Slurm (with --engine slurm)")
 
@@ -65,24 +65,26 @@ def sweep(
     engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
     yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
-    status: Annotated[bool, Option("--status", help="Only say how far it is.")] = False,
+    status: Annotated[bool, Option("--status", help="Only say how far the sweep is.")] = False,
     cancel: Annotated[bool, Option("--cancel", help="Only end its jobs in Slurm; they save first.")] = False,
     gather: Annotated[bool, Option("--gather", help="Only write results.csv of what is done.")] = False,
     cell: Annotated[str | None, Option(hidden=True, help="Only this cell, within a Slurm job.")] = None,
     quiet: cli.Quiet = False,
     as_json: cli.AsJson = False,
-    partition: Annotated[str, _slurm(help="As sbatch's.")] = "",
+    partition: Annotated[str, _slurm(help="Partition, as sbatch's.")] = "",
     time: Annotated[str, _slurm(help="Limit of a cell, as sbatch's: 4:00:00.")] = "",
-    memory: Annotated[str, _slurm(help="Of a cell, as sbatch's --mem; else estimated.")] = "",
-    cpus: Annotated[int, _slurm(min=0, help="Of a cell; 0: what it can use.")] = 0,
-    gpus: Annotated[int, _slurm(min=0, help="Of a cell.")] = 0,
+    memory: Annotated[str, _slurm(help="Memory of a cell, as sbatch's --mem; else estimated.")] = "",
+    cpus: Annotated[int, _slurm(min=0, help="Processors of a cell; 0: as many as it can use.")] = 0,
+    gpus: Annotated[int, _slurm(min=0, help="GPUs of a cell.")] = 0,
     cap: Annotated[int, _slurm(min=0, help="Cells of an array that run at once.")] = 0,
     warn: Annotated[int, _slurm(min=1, max=65535, help="Seconds before its limit at which a cell saves.")] = 120,
-    sbatch: Annotated[list[str] | None, _slurm(help="Of sbatch: --sbatch=--account=x; repeatable.")] = None,
+    sbatch: Annotated[
+        list[str] | None, _slurm(help="More options of sbatch: --sbatch=--account=x; repeatable.")
+    ] = None,
 ) -> None:
     """Run an experiment's cells: seeds, layouts, methods.
 
-    What is finished is not run again. --set takes KEY=VALUE or STAGE.KEY=VALUE, of an own experiment AXIS=VALUES.
+    Finished cells are not run again. --set takes KEY=VALUE or STAGE.KEY=VALUE; AXIS=VALUES if the experiment is yours.
     """
     from hypogoal.core.drafts import place_of
 

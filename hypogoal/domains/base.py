@@ -402,7 +402,7 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
         if name != IMPORTED:
             raise
         do = f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file."
-        raise UserError("nobody said which domain these imported states are of", name, do) from None
+        raise UserError("the domain of these imported states is not known", name, do) from None
     if not isinstance(domain, Domain):
         raise UserError("the object is not a domain", name, "Derive it from hypogoal.domains.base.Domain.")
     return domain

@@ -42,9 +42,9 @@ class GymnasiumConfig:
         source="as the paper's MiniGrid experiment",
         low=0,
     )
-    steps: int = setting(3_000, "steps that are played on each layout", unit="steps", low=1)
+    steps: int = setting(3_000, "steps played on each layout", unit="steps", low=1)
     states: int = setting(
-        1_000, "distinct states kept of each layout, at the most: as many of each combination of sub-goals", low=2
+        1_000, "distinct states kept of each layout, at most; as many of each combination of sub-goals", low=2
     )
     explore: float = setting(0.25, "share of random actions, where the domain brings a policy", low=0.0, high=1.0)
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)

@@ -41,7 +41,7 @@ def own_classifier(name: str) -> Classifier:
     """Code of the user's own, from observations (n, *obs) to probabilities (n,); else a ``UserError``."""
     function = own_code.load_own(name, "classifier", "hypogoal.classifiers", {})
     if not callable(function):
-        raise UserError("this is no function", name, "Give one from observations (N, *obs) to probabilities (N,).")
+        raise UserError("this is not a function", name, "Give one from observations (N, *obs) to probabilities (N,).")
 
     def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
         told = []

@@ -304,7 +304,7 @@ def _metrics(path: Path) -> dict[str, Any]:
         raise UserError("the evaluation is damaged", path, AGAIN)
     lacking = [part for part in PARTS if part not in metrics]
     if lacking:
-        raise UserError(f"evaluated by an older hypogoal (no {', '.join(lacking)})", path, AGAIN)
+        raise UserError(f"an older hypogoal evaluated this (no {', '.join(lacking)})", path, AGAIN)
     for name in _sub_goals(metrics):
         if not plain_name(name):
             raise UserError(f"a sub-goal in the evaluation has a name that is none, {name!r}", path, AGAIN)

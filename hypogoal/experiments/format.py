@@ -175,7 +175,7 @@ def _setting(name: str, row: Any, path: Path) -> _Setting:
     value = row.get("value")
     numbers = isinstance(value, list) and bool(value) and all(type(item) in NUMBER for item in value)
     if ("low" in row or "high" in row) and not numbers:
-        raise UserError("low and high are of numbers", f"{name} in {path}", MEND)
+        raise UserError("low and high are for numbers", f"{name} in {path}", MEND)
     if isinstance(value, bool) or value == []:
         _values(name, [0], path)  # its name
         return _Setting(value if isinstance(value, bool) else (), row)
@@ -199,10 +199,10 @@ def _group(row: Any, settings: Mapping[str, _Setting], known: Mapping[str, _Grou
     pairs = list(axes.items()) if isinstance(axes, dict) else [(axis, axis) for axis in axes]
     texts = [text for pair in pairs for text in pair]
     if not all(isinstance(text, str) for text in texts) or not all(own in lists for _, own in pairs):
-        raise UserError("cells over an axis that is not there", where, MEND)
+        raise UserError("cells over an axis that does not exist", where, MEND)
     inner = [*row.get("for", []), *row.get("first", [])]
     if len(dict(pairs)) != len(pairs) or any(axis not in [name for name, _ in pairs] for axis in inner):
-        raise UserError("cells over an axis that is not there", where, MEND)
+        raise UserError("cells over an axis that does not exist", where, MEND)
     if "if" in row and not isinstance(getattr(settings.get(row["if"]), "value", None), bool):
         raise UserError("no such switch", f"{row['if']} of {where}", MEND)
     if not all(isinstance(text, str) for text in row.get("columns", {}).values()):
@@ -286,9 +286,9 @@ class _Planner:
 
     def _refuse(self, assignments: Sequence[str], preset: str | None, device: str) -> None:
         if preset is not None:
-            raise UserError("an own experiment takes no preset", preset, "Write --preset into its commands.")
+            raise UserError("an experiment of your own takes no preset", preset, "Write --preset into its commands.")
         if device != "auto":
-            raise UserError("an own experiment takes no device", device, "Write --device into its commands.")
+            raise UserError("an experiment of your own takes no device", device, "Write --device into its commands.")
         known = [*self.experiment.settings, "workers", "evaluate"]
         for key, text in parse_assignments(assignments).items():
             if key not in known:

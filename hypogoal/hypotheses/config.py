@@ -32,7 +32,7 @@ class EnsembleConfig:
     )
     encoder: str = setting(
         "separate",
-        "a network but its last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
+        "network up to the last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
         source="the paper; shared: DivDis (arXiv:2202.03418)",
         choices=("separate", "shared", "frozen"),
     )
@@ -94,7 +94,7 @@ class EnsembleConfig:
     )
     jitter: int = setting(
         0,
-        "the window of each state of a training batch is moved at random by up to so much (view=agent-crop)",
+        "each window of a training batch is moved at random by up to this much (view=agent-crop)",
         unit="pixels",
         source=BEYOND,
         low=0,

@@ -139,10 +139,10 @@ def view_of(
             raise UserError("only windows can be moved", f"jitter={config.jitter}", "Set view=agent-crop or jitter=0.")
         if config.augment == "grey-context":
             do = "Set view=agent-crop or augment=grey."
-            raise UserError("nobody says what is around the agent", f"augment={config.augment}", do)
+            raise UserError("the surroundings of the agent are not known", f"augment={config.augment}", do)
         return FullView(shape)
     if agent_pixels is None:
-        raise UserError("nobody says where in these observations the agent is", "view=agent-crop", "Set view=full.")
+        raise UserError("the agent's place in these observations is not known", "view=agent-crop", "Set view=full.")
     origins = needed(origins, POSITION, "view=agent-crop")
     others = (POSITION if config.localiser == "ram" else ACTIONS) if len(unlabelled) else ()
     unlabelled_origins = needed(unlabelled_origins, others, f"localiser={config.localiser}")

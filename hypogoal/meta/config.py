@@ -70,24 +70,24 @@ class PlayConfig(OptionConfig):
     )
     cap: float = setting(
         0.0,
-        "an episode is cut after so many times the layout's shortest path; 0 for max_episode_steps",
+        "an episode is cut after this many times the layout's shortest path; 0 for max_episode_steps",
         source="ours: a task in which choosing decides",
         low=0.0,
     )
     world: tuple[str, ...] = setting(
         (),
-        "what is otherwise in the world than where the states were collected: settings of the domain as name=value",
+        "how the world differs from where the states were collected: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
     termination: str = setting(
         "learned",
         "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
-        "hardly ever gets there; dwell:N, N yes on end; or oracle, the true sub-goals (upper bound)",
+        "hardly ever gets there; dwell:N, N yeses in a row; or oracle, the true sub-goals (upper bound)",
         source="paper: learned; the others ours",
     )
     save_visited: int = setting(
         0,
-        "distinct states visited that are kept as a data file, to train ensembles with",
+        "visited distinct states to keep as a data file, to train ensembles with",
         source="the paper's suggestion",
         low=0,
     )
@@ -165,5 +165,5 @@ class AuditConfig(TrainOptionsConfig):
         high=1.0,
     )
     mend: float = setting(
-        0.95, "a second policy is learned against yes above this higher probability; 0: none", low=0.0, high=1.0
+        0.95, "a second policy learns against yes above this higher probability; 0: none", low=0.0, high=1.0
     )

@@ -153,7 +153,7 @@ def cut(engine: Engine, cap: float) -> None:
     """End episodes after ``cap`` times the layout's shortest path; 0 leaves them as long as they are."""
     if cap:
         if (shortest := engine.shortest_path()) is None:
-            raise UserError("nobody knows this layout's shortest path", f"cap={cap:g}", "Give cap=0.")
+            raise UserError("this layout's shortest path is not known", f"cap={cap:g}", "Give cap=0.")
         engine.max_steps = math.ceil(cap * shortest)
 
 

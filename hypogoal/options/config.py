@@ -41,7 +41,7 @@ class OptionConfig:
         0.05, "an option is held back where its chance is below this (initiation=learned)", low=0.0, high=1.0
     )
     initiation_ignored: float = setting(
-        0.1, "share of the choices for which none is held back (initiation=learned)", low=0.0, high=1.0
+        0.1, "share of choices at which no option is held back (initiation=learned)", low=0.0, high=1.0
     )
     bootstrap_timeout: bool = setting(
         True, "an option's timeout is not a terminal state", source="paper, appendix; light: ours"

@@ -34,7 +34,7 @@ class PlannedLearner(Learner):
     def build(self, config: OptionConfig, seed: int) -> None:
         plan = self.engine.plan()
         if plan is None:
-            what = "nobody knows what follows on each action in this domain"
+            what = "this domain does not know what follows on each action"
             raise UserError(what, "network=planned", "Give --set network=light.")
         self.actions = plan.actions
         self._place = places_of(plan, self.engine)

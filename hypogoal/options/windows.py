@@ -16,7 +16,7 @@ SIDE = 42  # pixels, half of what is seen of Montezuma's Revenge
 def localiser_of(ensemble: Ensemble) -> Localiser:
     """Who finds the agent; a ``UserError`` where nobody does, or by positions that no policy may see."""
     if not isinstance(ensemble.view, AgentView) or ensemble.needs_positions:
-        what = "nobody says where in an observation the agent is"
+        what = "the agent's place in an observation is not known"
         raise UserError(what, "policy_view=agent-crop", "Train the ensemble with view=agent-crop, localiser=learned.")
     return ensemble.view.localiser
 

@@ -89,7 +89,7 @@ def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
             with zipfile.ZipFile(raw) as archive:
                 entries = archive.infolist()
         except (zipfile.BadZipFile, OSError, NotImplementedError, ValueError):
-            raise UserError("this is no .npz file", path, do) from None
+            raise UserError("this is not a .npz file", path, do) from None
         if any(entry.compress_type not in PACKED or entry.flag_bits & ENCRYPTED for entry in entries):
             raise UserError("the arrays are packed as numpy does not pack them", path, do)
         require_memory(sum(entry.file_size for entry in entries), path)

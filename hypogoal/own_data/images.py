@@ -89,7 +89,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
                 raise UserError("several pictures are in one file", file, "Write each as a file of its own.")
             values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
     except (*DAMAGED, LookupError, struct.error, PIL.Image.DecompressionBombError):
-        raise UserError("this is no image, or a damaged one", file, DO) from None
+        raise UserError("this is not an image, or it is damaged", file, DO) from None
     return values.reshape(*values.shape[:2], -1)
 
 

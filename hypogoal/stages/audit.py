@@ -66,7 +66,7 @@ def audit(
         raise UserError(what, f"mend={config.mend:g}", "Give a higher one, or 0.")
     for name, value in (("termination", "oracle"), ("policy_view", "agent-crop")):
         if getattr(config, name) == value:
-            raise UserError("an audit is of one classifier alone", f"{name}={value}", "Leave it out.")
+            raise UserError("an audit takes one classifier only", f"{name}={value}", "Leave it out.")
     about = {"sub_goals": [sub_goal], "members": len(edges), "domain": domain, "domain_config": lived}
     out = claim(out, kind="audit", inputs=inputs, force=force, resume=resume)
     start_arguments(world, config, 1, seed)  # what cannot be is told before what it would need

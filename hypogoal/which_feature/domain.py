@@ -146,7 +146,7 @@ class RoomsDomain(Domain):
 
 def _column(factors: tuple[str, ...], truth: str) -> int:
     if truth not in factors or len(set(factors)) < len(factors) or MOVED in factors:
-        what = "features are planted once each, the true one among them, and all are seen in one frame"
+        what = "each feature is planted once, the true one among them, and all are seen in one frame"
         raise UserError(what, f"factors={','.join(factors)}, truth={truth}", f"Choose of {', '.join(FACTORS)}.")
     return factors.index(truth)
 

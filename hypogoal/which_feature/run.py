@@ -149,7 +149,7 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
     for entry in entries:
         config_of(entry, config)  # whose weight may be none
     if not config.factors or len(set(config.factors)) < len(config.factors):
-        raise UserError("features are planted once each", f"factors {config.factors}", "Name each once.")
+        raise UserError("each feature is planted once", f"factors {config.factors}", "Name each once.")
     wanted = [(entry, mix, seed) for seed in config.seeds for mix in config.mix for entry in entries]
     if not wanted:
         raise UserError("there is nothing to run", f"seeds {config.seeds}, mixes {config.mix}", "Give one of each.")
@@ -187,7 +187,7 @@ def _begin(out: Path, config: WhichFeatureConfig) -> None:
     path = out / "settings.json"
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise UserError("this is no folder of the benchmark", out, "Choose another --out.")
+            raise UserError("this is not a folder of the benchmark", out, "Choose another --out.")
         out.mkdir(parents=True, exist_ok=True)
         replace_text(path, json.dumps(shared(config), indent=1) + "\n")
     elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):

@@ -72,7 +72,7 @@ def test_baselines_play_an_own_domain(tmp_path: Path, agent: str) -> None:
 @pytest.mark.parametrize(
     ("domain", "message"),
     [
-        ("NAMELESS", "a sub-goal's name must be able to be a file's name: 'rooms/low'"),
+        ("NAMELESS", "a sub-goal's name must be usable as a file name: 'rooms/low'"),
         ("TWICE", "two sub-goals have the same name: End, end"),
         ("STACKED", "observations have their channels, or stacked frames, first: (4, 48, 48)"),
         ("TURNED", "the environment gave another observation than its space says: uint8 (48, 48, 3)"),

@@ -252,9 +252,9 @@ def test_data_that_do_not_say_enough_are_one_clear_line() -> None:
         fit_crop(observations, labels, observations, origins=some, unlabelled_origins=origins)
     with pytest.raises(UserError, match=r"do not say room, x, y of each state: localiser=ram"):
         fit_crop(observations, labels, observations, origins=origins)
-    with pytest.raises(UserError, match="nobody says where in these observations the agent is: view=agent-crop"):
+    with pytest.raises(UserError, match="the agent's place in these observations is not known: view=agent-crop"):
         fit(observations, labels, observations, CROP, 0, origins=origins)
-    with pytest.raises(UserError, match="nobody says what is around the agent: augment=grey-context"):
+    with pytest.raises(UserError, match="the surroundings of the agent are not known: augment=grey-context"):
         fit(observations, labels, observations, dataclasses.replace(CROP, view="full", augment="grey-context"), 0)
     plain = dataclasses.replace(CROP, view="full")
     with pytest.raises(UserError, match=r"do not say ladder of each state: batch_kind=per-ladder"):

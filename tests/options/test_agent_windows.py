@@ -107,7 +107,7 @@ def test_windows_need_someone_who_finds_the_agent(tmp_path: Path) -> None:
     """Spec G2: one line."""
     whole = ensemble_in(tmp_path / "whole", view="full", network="montezuma")
     for ensemble, changes, line in (
-        (whole, {}, "nobody says where in an observation the agent is"),
+        (whole, {}, "the agent's place in an observation is not known"),
         (ensemble_in(tmp_path / "crop"), {"network": "paper", "n_step": 1}, "only the light network sees windows"),
     ):
         with pytest.raises(UserError, match=line):

@@ -194,7 +194,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"labels": np.arange(39) % 2}, "do not fit 40 states"),
     ({"labels": np.zeros(0)}, "do not fit 40 states"),
     ({"sub_goals": np.array([b"won"])}, r"sub_goals are no texts but \|S3"),
-    ({"sub_goals": np.array(["a:b"])}, "a sub-goal's name must be able to be a file's name: 'a:b'"),
+    ({"sub_goals": np.array(["a:b"])}, "a sub-goal's name must be usable as a file name: 'a:b'"),
     ({"labels": np.arange(40) % 3}, r"are not only 0 and 1: \[2\]"),
     ({"labels": np.full(40, np.nan)}, "are not only 0 and 1"),
     ({"labels": np.zeros(40)}, "has no positives among 40 labelled states"),

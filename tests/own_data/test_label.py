@@ -71,7 +71,7 @@ def test_what_is_played_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixtur
     for source, do in (("doorkey", "--resume"), (str(out / "negative"), "--heldout")):
         other = record if do == "--resume" else tmp_path / "other.json"
         assert main(["label", source, "--out", str(out), do, "--record", str(other)]) == 2
-        assert "play is recorded in a new file, of what is played" in capsys.readouterr().err
+        assert "what you play is recorded in a new file" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir() if path.suffix] == ["play.json"]
 
 

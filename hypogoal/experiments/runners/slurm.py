@@ -125,7 +125,9 @@ def check(run: Path, options: Options) -> None:
             raise UserError("not an option of sbatch", repr(text), "See 'man sbatch'.")
     place = str(run.resolve())
     if "\\" in place or not place.isprintable():  # upon a backslash Slurm takes %A and %a literally
-        raise UserError("a path with such signs cannot stand in a batch script", repr(place), "Choose another --out.")
+        raise UserError(
+            "a path with such characters cannot stand in a batch script", repr(place), "Choose another --out."
+        )
 
 
 def _head(run: Path, name: str, options: Options) -> list[str]:

@@ -82,13 +82,13 @@ class BaselineConfig:
     )
     cap: float = setting(
         0.0,
-        "an episode is cut after so many times the layout's shortest path; 0 for max_episode_steps",
+        "an episode is cut after this many times the layout's shortest path; 0 for max_episode_steps",
         source="ours: a task in which choosing decides",
         low=0.0,
     )
     world: tuple[str, ...] = setting(
         (),
-        "what is otherwise in the world than in the data, or by default: settings of the domain as name=value",
+        "how the world differs from the data's, or from the default: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
     bonus: float = setting(
