@@ -20,7 +20,8 @@ from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.training import assemble, check_fit, description, start_arguments, train, write_trained
 from hypogoal.needs import play_needs
 
-FIXED = ("network", "termination", "policy_view", "layout_seed", "start", "option_timeout")  # as of the options
+# As of the options.
+FIXED = ("network", "embedding", "termination", "policy_view", "layout_seed", "start", "option_timeout")
 WORLD = ("domain_config", "cap", "max_episode_steps")  # where it differs, episodes of practice are none of the agent's
 
 
