@@ -12,7 +12,7 @@ from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import PICTURE, Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.networks import AUTO, NETWORKS, as_input, build_network
+from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
 from hypogoal.options.windows import AgentWindows
 

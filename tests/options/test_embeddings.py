@@ -82,7 +82,11 @@ def test_an_own_embedding_learns_and_plays(monkeypatch: pytest.MonkeyPatch) -> N
         assert np.mean([row.reached for row in last]) >= 0.9
         assert np.median([row.duration for row in last]) == shortest
     state = learner.state()
-    moved = {name for name, value in below("online.cells.", state).items() if not torch.equal(value, fresh[f"online.cells.{name}"])}
+    moved = {
+        name
+        for name, value in below("online.cells.", state).items()
+        if not torch.equal(value, fresh[f"online.cells.{name}"])
+    }
     assert moved == {f"encoder.0.layers.{layer}.{kind}" for layer in (0, 1) for kind in ("weight", "bias")}
 
     ids = np.arange(engine.n_states - 40, engine.n_states)
@@ -96,7 +100,7 @@ def test_an_own_embedding_learns_and_plays(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(UserError, match=f"a file names code of its own as its network: {NAME}.*HYPOGOAL_TRUST="):
         make_policies(LIGHT, state, {"observation_shape": engine.observation_shape})
     for name in ("tiles", "no-such", [], None):
-        with pytest.raises(UserError, match="do not fit|unknown network|too small"):
+        with pytest.raises(UserError, match=r"do not fit|unknown network|too small"):
             make_policies({**LIGHT, "embedding": name}, state, {"observation_shape": engine.observation_shape})
 
 
