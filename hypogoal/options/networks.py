@@ -69,8 +69,8 @@ class PictureEmbedding(nn.Module):
     def __init__(self, observation_shape: tuple[int, ...]):
         super().__init__()
         height, width, depth = observation_shape
-        self.first = nn.Conv2d(depth, 16, 6, 6, padding=[(-side % 6 + 1) // 2 for side in (height, width)])
-        self.second = nn.Conv2d(16, 32, 3, 2, padding=[1 - -(-side // 6) % 2 for side in (height, width)])
+        self.first = nn.Conv2d(depth, 16, 6, 6, padding=((-height % 6 + 1) // 2, (-width % 6 + 1) // 2))
+        self.second = nn.Conv2d(16, 32, 3, 2, padding=(1 - -(-height // 6) % 2, 1 - -(-width // 6) % 2))
         with torch.no_grad():
             self.features = self.second(self.first(torch.zeros(1, depth, height, width))).numel()
 
@@ -104,8 +104,10 @@ class OwnEmbedding(FullView):
 
     def __init__(self, name: str, observation_shape: tuple[int, ...], standard: Standard | None = None):
         super().__init__(observation_shape, standard)
-        *layers, last = build_network(name, observation_shape, torch.default_generator)
-        self.encoder, self.features = nn.Sequential(*layers).eval(), last.in_features
+        network = build_network(name, observation_shape, torch.default_generator)
+        last = network[-1]
+        assert isinstance(last, nn.Linear)
+        self.encoder, self.features = network[:-1].eval(), last.in_features
 
     def forward(self, observations: Tensor) -> Any:
         """uint8 (N, H, W, C), or float32 (N, *shape) where there is a standard -> float32 (N, features)."""
