@@ -63,7 +63,7 @@ class PictureEmbedding(nn.Module):
     takes 10 ms and acting for 8 environments 0.8 ms; with the usual 8x8/4 and 4x4/2 it is 19 and 1.2 ms.
 
     Where strides would not reach the last pixels, there is a margin of zeros, of the least width with which they do.
-    That the second layer has its own, and not all of it the first, costs 84 pixels 7 % of an update; it would be 30 %.
+    With 84 pixels, where the second layer has it, an update takes 4 to 11 % more; pixels padded instead, 24 to 58 %.
     """
 
     def __init__(self, observation_shape: tuple[int, ...]):
