@@ -83,7 +83,8 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
     picture = domain.observation_bytes
     paper = config.network == "paper"
     replays = options if paper else 1
-    weights = options * PAPER_POLICY if paper else LIGHT_POLICIES
+    own = MEMBER if config.embedding != "auto" else 0.0
+    weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + own
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept

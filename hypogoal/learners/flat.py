@@ -10,31 +10,29 @@ class FlatParameters:
     An optimiser's step, the norm of the gradients and a target's average then cost one call instead of one for each
     parameter. Matrices lie transposed in the vectors, (in, out) row by row: so a dense layer's product needs nothing
     rearranged, and for the 16 states of an acting step it takes a fifth of the time. Same values, up to rounding.
+    What is shared stays shared, what is frozen frozen: its gradient is 0.
 
     The modules, on one device, float32, get new parameters, which are to be changed in place only. ``vector``, float32
     (P,), where ``learning`` with its ``grad``, is to be given to an optimiser.
     """
 
     def __init__(self, *modules: nn.Module, learning: bool = True):
-        places = [
-            (part, name, parameter)
-            for module in modules
-            for part in module.modules()
-            for name, parameter in part.named_parameters(recurse=False)
-        ]
-        sizes = [parameter.numel() for _, _, parameter in places]
-        values = torch.zeros(sum(sizes), device=places[0][2].device)
+        parameters = dict.fromkeys(parameter for module in modules for parameter in module.parameters())
+        sizes = [parameter.numel() for parameter in parameters]
+        values = torch.zeros(sum(sizes), device=next(iter(parameters)).device)
         self.vector = nn.Parameter(values, requires_grad=learning)
         gradients = torch.zeros_like(values)
         if learning:
             self.vector.grad = gradients
-        for (part, name, parameter), held, slope in zip(
-            places, values.split(sizes), gradients.split(sizes), strict=True
-        ):
-            view = nn.Parameter(_shaped(held, parameter).copy_(parameter.data), requires_grad=learning)
-            setattr(part, name, view)
-            if learning:
-                view.grad = _shaped(slope, parameter)
+        views: dict[nn.Parameter, nn.Parameter] = {}
+        for parameter, held, slope in zip(parameters, values.split(sizes), gradients.split(sizes), strict=True):
+            learns = learning and parameter.requires_grad
+            views[parameter] = nn.Parameter(_shaped(held, parameter).copy_(parameter.data), requires_grad=learns)
+            if learns:
+                views[parameter].grad = _shaped(slope, parameter)
+        for part in (part for module in modules for part in module.modules()):
+            for name, parameter in part.named_parameters(recurse=False, remove_duplicate=False):
+                setattr(part, name, views[parameter])
 
     def backward(self, loss: Tensor, largest: float) -> Tensor:
         """Fill the gradients with those of a loss, cut to the norm ``largest``; returns their norm before, ().

@@ -20,6 +20,7 @@ from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.hypotheses.networks import AUTO
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
@@ -81,6 +82,9 @@ def assemble(
         alone = config.experience == "own" and not config.mask_reached
         terminations = judged(engine, ensemble, about, device, running_only=alone, rule=config.termination)
     _check_rule(terminations, config)
+    if config.network != "light" and config.embedding != AUTO:
+        given = f"embedding={config.embedding}, network={config.network}"
+        raise UserError("only the light network has an embedding", given, "Give --set network=light.")
     windows = None
     if config.policy_view == "agent-crop":
         if config.network != "light":

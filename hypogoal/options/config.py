@@ -18,6 +18,12 @@ class OptionConfig:
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
     )
+    embedding: str = setting(
+        "auto",
+        "what the light network sees by: cells, convolutions or numbers, as suits the observations; or a member "
+        "network's layers, by name or as module:function",
+        source="ours",
+    )
     experience: str = setting(
         "shared",
         "who learns from a step: its own member, or all of them",

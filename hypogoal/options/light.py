@@ -56,7 +56,8 @@ class LightLearner(Learner):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
             shape, standard = self.pictures.observation_shape, self.engine.standard
-            self.online = LightQNetwork(shape, self.options, len(self.actions), standard=standard).to(self.device)
+            made = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
+            self.online = made.to(self.device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
         self.pixels = Pixels(self.pictures, 2 * config.option_batch, self.device) if pictures else None

@@ -14,6 +14,7 @@ from hypogoal.core.tensors import below, load_fitting
 from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
+from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.options.exploration import actions_of
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, standard_in
 from hypogoal.options.windows import SIDE, around_agent, halved, localiser_of
@@ -47,7 +48,8 @@ def make_policies(
     if config["network"] != "light":
         return PaperPolicies(weights, shape, options, actions)
     around = localiser_of(ensemble) if ensemble and config.get("policy_view", "full") == "agent-crop" else None
-    return LightPolicies(weights, shape, options, actions, around, half=config.get("policy_pixels", "all") == "half")
+    half = config.get("policy_pixels", "all") == "half"
+    return LightPolicies(weights, shape, options, actions, around, config.get("embedding", AUTO), half=half)
 
 
 class LightPolicies:
@@ -60,6 +62,7 @@ class LightPolicies:
         options: int,
         actions: NDArray[np.int64],
         localiser: Localiser | None = None,
+        embedding: str = AUTO,
         *,
         half: bool = False,
     ):
@@ -67,8 +70,8 @@ class LightPolicies:
         shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
         shape = (shape[0] // 2, shape[1] // 2, *shape[2:]) if half else shape
         weights = below("online.", weights)
-        make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape))
-        self.network = load_fitting(make, weights, "options.safetensors")
+        make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape), embedding)
+        self.network = load_fitting(make, weights, "options.safetensors", own=embedding not in (AUTO, *NETWORKS))
         self.actions = actions
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

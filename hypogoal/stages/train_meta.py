@@ -21,7 +21,10 @@ from hypogoal.meta.training import assemble, check_fit, description, start_argum
 from hypogoal.needs import play_needs
 
 # As of the options.
-FIXED = ("network", "termination", "policy_view", "policy_pixels", "layout_seed", "start", "option_timeout")
+FIXED = (
+    *("network", "embedding", "termination", "policy_view", "policy_pixels"),
+    *("layout_seed", "start", "option_timeout"),
+)
 WORLD = ("domain_config", "cap", "max_episode_steps")  # where it differs, episodes of practice are none of the agent's
 
 

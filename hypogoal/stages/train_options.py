@@ -37,7 +37,7 @@ def train_options(
     source = open_artefact(ensemble, "ensemble").whole()
     trained = open_artefact(options, "options").whole() if options else None
     if trained:
-        check_fit(trained, source, config, ("network", "termination", "policy_view", "policy_pixels"))
+        check_fit(trained, source, config, ("network", "embedding", "termination", "policy_view", "policy_pixels"))
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])

@@ -16,6 +16,7 @@ from test_docs import blocks, commands
 
 from hypogoal import OptionEnv, load_ensemble, load_options
 from hypogoal.cli import main
+from hypogoal.core.errors import UserError
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation import explorer
 
@@ -78,6 +79,12 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
     stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
     assert ran == [*stages, "check", "train-ensemble"]
     run = tmp_path / "runs" / "unlock"
+    for words in commands(EXAMPLES.parent / "docs" / "extending.md"):
+        assert main([*words[1:], *SHORT[words[1]]]) == 0, words
+    with pytest.raises(UserError, match="a file names code of its own as its network: wide_network:wide"):
+        load_options(run / "wide")
+    monkeypatch.setenv("HYPOGOAL_TRUST", "wide_network:wide")
+    assert load_options(run / "wide").policies.network.cells.features == 64
     for goal, row in open_dataset(run / "data.h5").counts()["labelled"].items():
         assert 10 < row["positives"] < row["states"] - 10, goal
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))

@@ -34,6 +34,27 @@ def test_flat_parameters_learn_what_plain_ones_do() -> None:
         torch.testing.assert_close(target.state_dict()[name], follower.state_dict()[name], rtol=1e-4, atol=1e-5)
 
 
+def test_what_is_shared_or_frozen_stays_so() -> None:
+    """Spec H6: layers of one's own may use a weight twice, or bring some that are not to be learned."""
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(3, 3), nn.ReLU(), nn.Linear(3, 3))
+    network[2].weight = network[0].weight
+    network[0].bias.requires_grad_(False)
+    plain = copy.deepcopy(network)
+    flat = FlatParameters(network)
+    one, other = torch.optim.Adam(plain.parameters(), lr=1e-2), torch.optim.Adam([flat.vector], lr=1e-2)
+    for _ in range(3):
+        inputs = torch.randn(4, 3)
+        one.zero_grad()
+        plain(inputs).square().mean().backward()
+        one.step()
+        flat.backward(network(inputs).square().mean(), 1e6)
+        other.step()
+    assert len(flat.vector) == 9 + 3 + 3 and network[2].weight is network[0].weight
+    for name, value in plain.state_dict().items():
+        torch.testing.assert_close(network.state_dict()[name], value)
+
+
 def test_weights_are_loaded_into_the_vector() -> None:
     """Spec G1: an artefact's weights, read into the modules, are what the optimiser goes on with."""
     torch.manual_seed(0)

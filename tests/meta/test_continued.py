@@ -84,6 +84,21 @@ def test_options_go_on_with_the_time_they_learned_for(
     assert "trained with option_timeout=40, not 10" in capsys.readouterr().err
 
 
+def test_an_embedding_by_name_goes_through_both_stages(
+    ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec D2, D8, H6: where an engine has tiles, too; it is part of the options, and of the light network alone."""
+    few = ["--set", "steps=64", "--set", "random_episodes=2", "--set", "warm_up=20", "-q"]
+    options, out, named = str(tmp_path / "options"), str(tmp_path / "meta"), ["--set", "embedding=tiles"]
+    assert main(["train-options", str(ensemble), "--out", options, *named, *few]) == 0
+    meta = ["train-meta", str(ensemble), "--options", options, "--out", out, *few]
+    assert main(meta) == 2
+    assert "trained with embedding=tiles, not auto" in capsys.readouterr().err
+    assert main([*meta, *named]) == 0
+    assert main([*meta[:2], "--out", str(tmp_path / "other"), *named, "--set", "network=planned", *few]) == 2
+    assert "only the light network has an embedding" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("small_gru")
 @pytest.mark.parametrize("kind", [LightLearner, RecurrentLearner])
 def test_exploration_goes_on_falling_where_options_go_on(kind: type) -> None:
