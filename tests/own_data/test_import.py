@@ -92,7 +92,7 @@ def test_options_of_states_of_no_domain_are_refused(tmp_path: Path, capsys: pyte
     capsys.readouterr()
     assert main(["train-options", ensemble, "--out", str(tmp_path / "options"), "-q"]) == 2
     told = capsys.readouterr().err
-    assert "which domain these imported states are of: imported. Import them again with --domain" in told
+    assert "the domain of these imported states is not known: imported. Import them again with --domain" in told
 
 
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
