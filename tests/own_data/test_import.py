@@ -92,7 +92,7 @@ def test_options_of_states_of_no_domain_are_refused(tmp_path: Path, capsys: pyte
     capsys.readouterr()
     assert main(["train-options", ensemble, "--out", str(tmp_path / "options"), "-q"]) == 2
     told = capsys.readouterr().err
-    assert "which domain these imported states are of: imported. Import them again with --domain" in told
+    assert "the domain of these imported states is not known: imported. Import them again with --domain" in told
 
 
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
@@ -222,7 +222,7 @@ def test_damaged_arrays_are_one_line(tmp_path: Path) -> None:
     """Spec G2."""
     path = tmp_path / "own.npz"
     path.write_bytes(b"PK" + b"x" * 100)
-    with pytest.raises(UserError, match=r"no \.npz file"):
+    with pytest.raises(UserError, match=r"not a \.npz file"):
         read_arrays(path)
     np.savez(path, **arrays())
     whole = bytearray(path.read_bytes())
@@ -285,7 +285,7 @@ def test_zip_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> Non
     for name in ("positive", "negative", "unlabelled"):
         (tmp_path / "images" / name).mkdir(parents=True)
         (tmp_path / "images" / name / "x.npy").write_bytes(huge)
-    with pytest.raises(UserError, match="no image, or a damaged one"):
+    with pytest.raises(UserError, match="not an image, or it is damaged"):
         read_images(tmp_path / "images")
 
 
@@ -350,7 +350,7 @@ def test_what_is_wrong_with_images_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"the image is 48 x 20, others are 48 x 48: .*zz\.png"):
         read_images(folder)
     (folder / "positive" / "zz.png").write_bytes(b"no image")
-    with pytest.raises(UserError, match=r"no image, or a damaged one: .*zz\.png"):
+    with pytest.raises(UserError, match=r"not an image, or it is damaged: .*zz\.png"):
         read_images(folder)
     Image.fromarray(np.full((SIDE, SIDE), 40_000, np.uint16)).save(folder / "positive" / "zz.png")
     with pytest.raises(UserError, match=r"the image has the mode I;16, not 8 bits a channel: .*zz\.png"):
@@ -376,7 +376,7 @@ def test_what_is_no_picture_of_a_state_is_not_even_decoded(
     (tmp_path / "gs").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     file.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n")
-    with pytest.raises(UserError, match=r"no image, or a damaged one: .*x\.png"):
+    with pytest.raises(UserError, match=r"not an image, or it is damaged: .*x\.png"):
         read_image(file)
     assert not (tmp_path / "ran").exists()
     Image.new("1", (13_000, 13_000)).save(file)

@@ -96,7 +96,7 @@ def test_a_factor_of_two_frames_is_scored_too(tmp_path: Path) -> None:
         ("--set stepz=3", "Did you mean 'steps'"),
         ("--seeds ,", "nothing to run"),
         ("--high 2", "out of range"),
-        ("--out {made}", "no folder of the benchmark"),
+        ("--out {made}", "not a folder of the benchmark"),
     ],
 )
 def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, message: str) -> None:

@@ -64,7 +64,7 @@ def test_layouts_differ_and_the_reward_alone_tells_truths_apart() -> None:
 @pytest.mark.parametrize("factors", [("shape", "shape"), ("place",), ("shape", "moved")])
 def test_a_truth_that_is_not_planted_is_refused(factors: tuple[str, ...]) -> None:
     """Where states are collected and where agents play."""
-    with pytest.raises(UserError, match="planted once each"):
+    with pytest.raises(UserError, match="each feature is planted once"):
         DOMAIN.make_engine(0, 1, factors=factors)
 
 
