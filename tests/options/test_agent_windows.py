@@ -142,7 +142,7 @@ def test_options_of_half_pictures(tmp_path: Path) -> None:
         train(ensemble, tmp_path / view, **half)
         train(ensemble, tmp_path / f"{view}-on", tmp_path / view, **half)
         weights = load_tensors(tmp_path / f"{view}-on" / "options.safetensors")
-        assert weights["online.trunk.0.weight"].shape[1] == (32 * 9 if view == "full" else 32)
+        assert weights["online.trunk.0.weight"].shape[1] == (32 * 9 if view == "full" else 32 * 4)
         act = hypogoal.load_options(tmp_path / f"{view}-on").policies(1)
         assert 0 <= act(engine.images(ids)[0]) < 18
         with pytest.raises(UserError, match="trained with policy_pixels=half, not all"):
