@@ -135,7 +135,8 @@ def test_what_cannot_be_compared_is_one_line(runs, tmp_path, capsys):
     assert "different window (slow: 100; otherwise: 50)" in line
     line = refused(slow, changed("bare", lambda metrics: metrics.update(agents=[])))
     assert "no kind of result in common (slow: agents; bare: nothing)" in line
-    assert "older hypogoal evaluated this (no distance)" in refused(slow, changed("old", lambda metrics: metrics.pop("distance")))
+    old = changed("old", lambda metrics: metrics.pop("distance"))
+    assert "older hypogoal evaluated this (no distance)" in refused(slow, old)
     with pytest.raises(UserError, match="would replace an input"):
         compare([slow, fast], fast)
 
