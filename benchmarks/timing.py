@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
@@ -20,14 +21,16 @@ def alone() -> None:
 
 
 def machine(*packages: str) -> dict[str, str]:
-    """Where it was measured, and with which versions."""
+    """Where it was measured, of which commit (with a + where files differ from it), and with which versions."""
     model = platform.processor() or "unknown"
     info = Path("/proc/cpuinfo")
     if info.exists():
         names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
         model = f"{names[0]}, {len(os.sched_getaffinity(0))} cores" if names else model
     versions = {name: metadata.version(name) for name in packages}
-    return {"processor": model, "python": platform.python_version(), **versions}
+    told = subprocess.run(["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=False)
+    commit = {"commit": told.stdout.strip()} if told.returncode == 0 else {}
+    return {"processor": model, **commit, "python": platform.python_version(), **versions}
 
 
 def arguments(doc: str | None, name: str) -> argparse.Namespace:
