@@ -26,6 +26,7 @@ RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
     "figure4-ladders": ladder_options.tables,
+    "figure6-doorkey": figure6.tables,
     "hypotheses-doorkey": hypotheses.tables,
     "hypotheses-ladders": ladders.tables,
     "labels-doorkey": labels.tables,
