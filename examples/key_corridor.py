@@ -1,7 +1,7 @@
 """MiniGrid's KeyCorridor at 8 pixels a tile, where random play never gets to the ball: recorded play shows a way to it.
 
 Shows `collect --play`, members that are right on new layouts, and an agent that learns to fetch the ball every time
-(layout 101, one seed). Three and a half minutes of a core. First `export HYPOGOAL_TRUST=key_corridor:DOMAIN`:
+(layout 101, one seed). Three minutes of a core. First `export HYPOGOAL_TRUST=key_corridor:DOMAIN`:
 
     hypogoal collect key_corridor:DOMAIN --play key_corridor.json --out runs/corridor/data.h5
     hypogoal train-ensemble runs/corridor/data.h5 --out runs/corridor/ensemble
