@@ -63,8 +63,7 @@ SHOWN = {
 def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
     """Play every agent of a run, frozen, as the evaluation does, and chance with its options: a row per number.
 
-    Of evaluated baselines it takes the last training episodes. Rows that are there of methods and policies that the run
-    has not stay.
+    Of evaluated baselines it takes the last training episodes. Rows that are there of agents that the run has not stay.
     """
     rows = [row for artefact in find_artefacts(run, "meta") for row in _played(artefact)]
     if baselines:
@@ -75,9 +74,9 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
         chooser = "uniform" if row["method"] == UNIFORM else "agent"
         value = f"{float(row['value']):.4f}"
         kept.append((method, row.get("policy", ""), row["layout"], row["seed"], chooser, row["quantity"], value))
-    made = {row[:2] for row in kept}
+    made = {row[:3] for row in kept}
     before = [tuple(row[column] for column in COLUMNS) for row in _read(path)] if path.exists() else []
-    kept += [row for row in before if row[:2] not in made]
+    kept += [row for row in before if row[:3] not in made]
     known = (*METHODS, *POLICIES, "agent", "uniform", *OF_PLAY, *OF_CHOICE, PRACTICE, PRACTISED)
     order = {name: place for place, name in enumerate(("", *known))}
     kept.sort(key=lambda row: (order[row[0]], order[row[1]], int(row[2]), order[row[4]], order[row[5]]))
