@@ -1,7 +1,7 @@
 """The Python interface: run stages, load what was trained, predict, play options as actions of an environment.
 
-The stages' functions do what their commands do. ``given`` is what these take: ``preset``, ``seed``, ``device``,
-``force``, ``resume``, ``quiet``, and every setting by its name. What would end a command is a ``UserError``.
+The functions of the stages do what their commands do. ``given`` takes a command's options, ``preset``, ``seed``,
+``device``, ``force``, ``resume`` and ``quiet``, and any setting by name. What would end a command is a ``UserError``.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ HOW = ("preset", "seed", "device", "force", "resume", "quiet")  # of what is giv
 
 
 class Made:
-    """A data file, an artefact or a run at a ``path``: a path wherever one is asked for, and something to look at."""
+    """A data file, an artefact or a run at ``path``. It works wherever a path is expected, and shows what it holds."""
 
     def __init__(self, path: Place):
         self.path = Path(path)
@@ -47,7 +47,7 @@ class Made:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """Its numbers: counts of states, the last of a training's logs, or all of an evaluation or a comparison."""
+        """Its numbers: counts of states, a training's last log entry, or all of an evaluation or a comparison."""
         return numbers_in(describe_path(self.path)["kind"], self.path)
 
     def __repr__(self) -> str:
@@ -58,45 +58,45 @@ class Made:
         return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'
 
     def show(self) -> None:
-        """Print what ``hypogoal show`` tells: what came out, configuration, inputs."""
+        """Print what ``hypogoal show`` prints: result, configuration, inputs."""
         about = describe_path(self.path)
         for line in [*repr(self).splitlines(), *lines({**about, "counts": None})[1:]]:
             say(line)
 
 
 def collect(domain: str | Domain, out: Place, **given: Any) -> Made:
-    """Collect states into the HDF5 file ``out``; a domain itself is known in this process by its ``name``."""
+    """Collect states into the HDF5 file ``out``. A domain object is known by its ``name``, in this process only."""
     if isinstance(domain, Domain):
         if domain.name in BUILT_IN and load_domain(domain.name) is not domain:
-            raise UserError("an own domain is called like one of hypogoal's", domain.name, "Give it another name.")
+            raise UserError("this domain has the name of one of hypogoal's", domain.name, "Give it another name.")
         here[domain.name] = domain
     return _made("collect", domain if isinstance(domain, str) else domain.name, out, given)
 
 
 def train_ensemble(data: Place, out: Place, *, unlabelled: Iterable[Place] = (), **given: Any) -> Made:
-    """Train an ensemble for each sub-goal of a data file, perhaps with ``unlabelled`` states from elsewhere."""
+    """Train an ensemble for each sub-goal of a data file, if wanted with ``unlabelled`` states from elsewhere."""
     return _made("train-ensemble", Path(data), out, given, unlabelled=[*map(Path, unlabelled)])
 
 
 def train_options(ensemble: Place, out: Place, *, options: Place | None = None, **given: Any) -> Made:
-    """Learn an option for every member of an ensemble, or go on with ``options`` of it."""
+    """Learn an option for every member of an ensemble, or continue training its ``options``."""
     return _made("train-options", Path(ensemble), out, given, options=Path(options) if options else None)
 
 
 def train_meta(ensemble: Place, out: Place, *, options: Place | None = None, **given: Any) -> Made:
-    """Learn which options to choose, fresh ones or ``options`` that were trained, by the reward."""
+    """Learn from the reward which options to choose: fresh ones, or trained ``options``."""
     return _made("train-meta", Path(ensemble), out, given, options=Path(options) if options else None)
 
 
 def evaluate(run: Place, out: Place | None = None, **given: Any) -> Made:
-    """Compute every number of a run, into ``run/evaluation`` or ``out``; ``given``: ``layouts``, and no settings."""
+    """Compute every number of a run into ``run/evaluation`` or ``out``. ``given`` takes ``layouts``, no settings."""
     path, place = Path(run), Path(out or Path(run) / "evaluation")
     call = partial(stages.named("evaluate"), path, place, **given)
     return _called("evaluate", place, call, {"run": path, **given})
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
-    """Compare evaluated runs, the others with the first; it shows who wins, by how much, on what."""
+    """Compare each evaluated run with the first. The result shows which wins, by how much, on what."""
     paths = [*map(Path, runs)]
     call = partial(stages.named("compare"), paths, Path(out), force=force)
     return _called("compare", Path(out), call, {"runs": paths})
@@ -130,8 +130,8 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
         sub_goal: for example ``open-red-door``.
 
     Returns:
-        An ensemble; ``ensemble.predict(observations)`` gives float32 (N, K) from (N, *obs_shape), uint8 or
-        float32 as it was trained.
+        An ensemble; ``ensemble.predict(observations)`` takes (N, *obs_shape), uint8 or float32 as in training,
+        and returns float32 (N, K).
 
     Raises:
         UserError: not an ensemble artefact, or no such sub-goal.
@@ -153,7 +153,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
 
     Args:
         path: the artefact's folder.
-        ensemble: the ensemble artefact they were trained with; found from the manifest when None.
+        ensemble: the ensemble artefact they were trained with; None: the one in the manifest.
 
     Raises:
         UserError: not such an artefact, the ensemble is gone, or the options end at the true sub-goals (oracle).

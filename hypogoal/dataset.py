@@ -26,7 +26,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
 
 if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # whose integers come out otherwise, deep in the work
-    raise UserError("hypogoal needs NumPy 2", f"here is {np.__version__}", "pip install 'numpy>=2,<3'")
+    raise UserError("hypogoal needs NumPy 2", f"found {np.__version__}", "pip install 'numpy>=2,<3'")
 
 DATA_FORMAT = 2  # 1: texts of variable length
 SPLITS = ("labelled", "heldout")
@@ -54,7 +54,7 @@ class States:
 
     Attributes:
         observations: uint8 or float32 (N, *observation_shape).
-        labels: bool (N, G), one column per sub-goal; (N,) where they are of one sub-goal.
+        labels: bool (N, G), one column per sub-goal; (N,) for a single sub-goal.
         origins: int (N,) arrays that say where each state comes from (layout_seed, agent_x, ...).
     """
 
@@ -63,14 +63,14 @@ class States:
     origins: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def where(self, kept: NDArray[np.bool_]) -> States:
-        """Those of them that are ``kept``, bool (N,)."""
+        """The states that are ``kept``, bool (N,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         return States(self.observations[kept], self.labels[kept], origins)
 
 
 @dataclass(frozen=True)
 class Collected:
-    """What a domain's ``collect`` returns: three sets of states, the sub-goals' names (G), those of features if any."""
+    """What a domain's ``collect`` returns: three sets of states, names of sub-goals (G), and of features if any."""
 
     observation_shape: tuple[int, ...]
     sub_goals: tuple[str, ...]
@@ -143,13 +143,13 @@ def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: obje
 def require_names(sub_goals: Sequence[str]) -> None:
     """Refuse (``UserError``) no names, ones that are not plain, and two that differ in upper and lower case only."""
     if not sub_goals:
-        raise UserError("there are no sub-goals", None, "Give one at least, with a name.")
+        raise UserError("there are no sub-goals", None, "Give at least one, with a name.")
     for name in sub_goals:
         if not plain_name(name):
             do = f"Leave out separators, {' '.join(NO_FILE_NAME)}, dot or space first or last, any of {FORMULA} first."
             raise UserError("a sub-goal's name must be usable as a file name", repr(name), do)
     if not plain_names(sub_goals):
-        do = "Give them different names; upper and lower case are one to some file systems."
+        do = "Give them different names; some file systems ignore case."
         raise UserError("two sub-goals have the same name", ", ".join(sub_goals), do)
 
 
@@ -165,7 +165,7 @@ def write_dataset(
 ) -> None:
     """Write collected states; the file appears under its name only when it is whole.
 
-    Names that cannot be names of files, labels that are no truth values, or a file that exists are a ``UserError``.
+    Raises ``UserError`` if a name cannot be a file name, labels are not truth values, or the file exists.
     """
     require_names(collected.sub_goals)
     for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
@@ -267,7 +267,7 @@ class Dataset:
         self.observation_bytes = prod(self.observation_shape) * self.observation_dtype.itemsize  # of one
 
     def features(self) -> list[str]:
-        """Names of the numbers of an observation that is no picture, in their order; ``x0``, ... where it has none."""
+        """Names of the numbers in an observation that is not a picture, in order; ``x0``, ... where there are none."""
         count = prod(self.observation_shape)
         with self._file() as file:
             if hdf5.find(file, "features") is None:
@@ -275,7 +275,7 @@ class Dataset:
             text = hdf5.read_array(file, "features", "S").tobytes().rstrip(b"\0").decode(errors="replace")
         names = parse_json(text, self.path, "names of features are", AGAIN)
         if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
-            raise UserError("the data file has other names than features", self.path, AGAIN)
+            raise UserError("the data file's feature names do not fit", self.path, AGAIN)
         return names
 
     def labelled(self, sub_goal: str) -> States:
@@ -359,7 +359,7 @@ class Dataset:
         if isinstance(parsed, str):
             parsed = parse_json(parsed, self.path, f"not a hypogoal data file, its attribute {name!r} is", AGAIN)
         if not isinstance(parsed, kind):
-            do = f"Its attribute {name!r} is no JSON {kind.__name__}."
+            do = f"Its attribute {name!r} is not a JSON {kind.__name__}."
             raise UserError("not a hypogoal data file", self.path, do)
         return parsed
 
@@ -368,7 +368,7 @@ class Dataset:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file written by ``collect`` (or by the user in the same schema), a ``UserError`` where it is none."""
+    """Open a data file written by ``collect`` (or by the user in the same schema); ``UserError`` if it is not one."""
     if path.is_dir():
         do = "Give the .h5 file that 'hypogoal collect' wrote."
         raise UserError("a folder where a data file is needed", path, do)

@@ -141,11 +141,11 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     from hypogoal.evaluation.pictures import contact_sheets
 
     if not path.is_file():
-        raise UserError("contact sheets are of data files", path, "Give the .h5 file that 'hypogoal collect' wrote.")
+        raise UserError("contact sheets need a data file", path, "Give the .h5 file that 'hypogoal collect' wrote.")
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
         given = f"{dataset.observation_dtype} {dataset.observation_shape}"
-        raise UserError("the states are no pictures", given, f"Read them with 'hypogoal export {path} --out X.npz'.")
+        raise UserError("the states are not pictures", given, f"Read them with 'hypogoal export {path} --out X.npz'.")
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []
@@ -269,7 +269,7 @@ def _read_lines(path: Path) -> None:
     """JSON, one object a line; a number that was not there yet may be NaN."""
     for number, line in enumerate(read_text(path, "the log is", AGAIN).splitlines(), 1):
         if not [*json_lines([line])]:
-            raise UserError(f"line {number} is no JSON object", path, AGAIN)
+            raise UserError(f"line {number} is not a JSON object", path, AGAIN)
 
 
 def _read_arrays(path: Path) -> None:

@@ -199,7 +199,7 @@ def places(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pa
         ("collect doorkey --out {ensemble} --force", "not of kind 'data'"),
         ("evaluate {ensemble} --out {ensemble} --force", "not of kind 'evaluation'"),
         ("train-ensemble {data} --out {out} --set sub_goals=fly", "unknown sub-goal: fly"),
-        ("train-ensemble {data} --out {out} --set sub_goals=go-to-goal,go-to-goal", "a sub-goal twice"),
+        ("train-ensemble {data} --out {out} --set sub_goals=go-to-goal,go-to-goal", "a sub-goal is named twice"),
         ("train-ensemble {data} --out {out} --seed 9007199254740992", "--seed"),
         ("collect doorkey --out {out} --seed 36893488147419103232", "--seed"),
         ("train-meta {ensemble} --out {out} --layout-seed 9007199254740993", "out of range: layout_seed"),

@@ -243,9 +243,9 @@ def test_nothing_depends_on_the_clock() -> None:
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (MemoryError(), "the memory does not suffice"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "the memory does not suffice"),
-        (ImportError("x.so: failed to map segment from shared object"), "the memory does not suffice"),
+        (MemoryError(), "there is not enough memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "there is not enough memory"),
+        (ImportError("x.so: failed to map segment from shared object"), "there is not enough memory"),
         (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), "Free some memory"),
         (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), "ulimit -n"),
         (RuntimeError("unable to open file <x> in read-only mode: Too many open files (24)"), "ulimit -n"),

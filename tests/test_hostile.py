@@ -234,7 +234,7 @@ def test_texts_of_variable_length(tmp_path: Path) -> None:
     path = write(tmp_path / "data.h5")
     with h5py.File(path, "a") as file:
         file.attrs["domain"] = "toy"
-    with pytest.raises(UserError, match="'domain' is no text of fixed length"):
+    with pytest.raises(UserError, match="'domain' is neither a text of fixed length"):
         open_dataset(path)
 
 

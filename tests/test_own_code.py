@@ -97,20 +97,20 @@ LIES: list[tuple[GymnasiumDomain, str]] = [
         GymnasiumDomain(lying(reset=lambda self, **_: np.zeros((2, 48, 48), np.uint8)), SUB_GOALS),
         "the environment's reset gave no tuple but a ndarray",
     ),
-    (GymnasiumDomain(lying(reset=lambda self, **_: (1, {})), SUB_GOALS), "the environment gave another observation"),
-    (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is none, but a NoneType"),  # type: ignore[arg-type, return-value]
+    (GymnasiumDomain(lying(reset=lambda self, **_: (1, {})), SUB_GOALS), "gave an observation that does not fit"),
+    (GymnasiumDomain(lambda: None, SUB_GOALS), "the environment is a NoneType, not a gymnasium.Env"),  # type: ignore[arg-type, return-value]
     (GymnasiumDomain(Spaceless, SUB_GOALS), "the environment has no spaces: AttributeError: "),
     *((labelling(value), "a sub-goal's function gave the label ") for value in [*ENDS, object()]),
     *(
         (labelling_all({"left-end": True, "lie": value}), "the function of all labels gave the label of lie ")
         for value in [*ENDS, object()]
     ),
-    (labelling_all({"left-end": True}), "the function of all labels gave no label of lie: test_own_code.py, line "),
+    (labelling_all({"left-end": True}), "the function of all labels gave no label for lie: test_own_code.py, line "),
     (
         labelling_all({"left-end": True, "lie": True, 3: 1}),
-        "gave a label of 3, which is no sub-goal: test_own_code.py",
+        "gave a label for 3, which is not a sub-goal: test_own_code.py",
     ),
-    *((labelling_all(value), "the function of all labels gave no dictionary but a ") for value in (None, [True, True])),
+    *((labelling_all(value), "the function of all labels gave a ") for value in (None, [True, True])),
     *(
         (choosing(value), "the domain's policy gave the action ")
         for value in [77, -1, 1.5, None, "1", True, np.array([0, 1]), NAN]
@@ -322,8 +322,8 @@ def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
         (lambda step: step._replace(terminated=step.rewards), "the engine's step gave terminated"),
         (lambda step: step._replace(truncated=step.truncated[:1]), "the engine's step gave truncated"),
         (lambda step: step._replace(succeeded=step.rewards), "the engine's step gave succeeded"),
-        (lambda step: None, "the engine's step gave no Step but a NoneType"),
-        (lambda step: tuple(step), "the engine's step gave no Step but a tuple"),
+        (lambda step: None, "the engine's step gave a NoneType, not a Step"),
+        (lambda step: tuple(step), "the engine's step gave a tuple, not a Step"),
         (lambda step: sys.exit(0), "own code of test_own_code raised SystemExit(0)"),
         (lambda step: os._exit(0), "own code of test_own_code raised SystemExit(0)"),
         (lambda step: 1 // 0, "own code of test_own_code raised ZeroDivisionError"),
@@ -394,7 +394,7 @@ NETWORKS: list[tuple[Callable[[int], Any], str]] = [
     (lambda channels: os._exit(0), "raised SystemExit(0)"),
     (lambda channels: ([Leaves(lambda: sys.exit(0))], (8,)), "own code of test_own_code raised SystemExit(0)"),
     (lambda channels: ([Leaves(lambda: os._exit(0))], (8,)), "own code of test_own_code raised SystemExit(0)"),
-    (lambda channels: ([Leaves(lambda: 7)], (8,)), "makes no tensor but 7 of images"),
+    (lambda channels: ([Leaves(lambda: 7)], (8,)), "makes 7 of images, not a tensor"),
     (lambda channels: ([convolution(channels).double()], (8,)), "takes no images of 3 channels"),
 ]
 

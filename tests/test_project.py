@@ -153,7 +153,7 @@ def test_an_old_numpy_is_told_in_a_line(tmp_path: Path) -> None:
         "import hypogoal\nhypogoal.Made",
     ):
         done = subprocess.run([sys.executable, "-c", old + code], capture_output=True, text=True, cwd=tmp_path)
-        assert "hypogoal needs NumPy 2: here is 1.26.4. pip install 'numpy>=2,<3'" in done.stderr.splitlines()[-1]
+        assert "hypogoal needs NumPy 2: found 1.26.4. pip install 'numpy>=2,<3'" in done.stderr.splitlines()[-1]
         assert done.returncode in (1, 2) and not list(tmp_path.iterdir())
         assert len(done.stderr.splitlines()) == 1 or "Made" in code
 

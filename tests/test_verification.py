@@ -157,7 +157,7 @@ def test_messages_about_manifests_stay_helpful(copy: Path) -> None:
     manifest = json.loads(path.read_text())
     for change, words in (
         ({"format": 3}, "newer"),
-        ({"seed": -1}, "checksum does not fit"),
+        ({"seed": -1}, "checksum does not match"),
         ({"format": 1}, "checksum"),
     ):
         path.write_text(json.dumps(manifest | change, indent=1) + "\n")

@@ -41,7 +41,7 @@ def _version(value: bool) -> None:
 
 @app.callback()
 def _root(
-    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show it and exit.")] = False,
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
     debug: Annotated[bool, Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
     """What stands before a command."""
@@ -110,7 +110,7 @@ def _internal(error: BaseException) -> tuple[str, int]:
     if os.strerror(errno.EMFILE) in str(error):  # torch's, which is no OSError
         return _refused(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
     if isinstance(error, MemoryError) or any(text in str(error) for text in MEMORY_TEXTS):
-        return with_notes(f"the memory does not suffice. Nothing was half-written. {NO_MEMORY}", error), 2
+        return with_notes(f"there is not enough memory. Nothing was half-written. {NO_MEMORY}", error), 2
     if (told := users_own(error)) is not None:
         return with_notes(str(told), error), 2
     first = next(iter(str(error).splitlines()), "")  # those of numbers that are none have a tensor after it
@@ -149,7 +149,7 @@ def _refused(error: OSError) -> tuple[str, int]:
         errno.ENAMETOOLONG: "Choose a shorter name.",
     }
     if not _homed():
-        return "the current folder is not there any more. Change to another one.", 2
+        return "the current folder no longer exists. Change to another one.", 2
     # HDF5 tells the number in its text only: "... errno = 28, error message = ..."
     told = re.search(r"errno = (\d+)", str(error))
     code = error.errno or (int(told[1]) if told else 0)

@@ -10,7 +10,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give
 
 ENTRIES = (
-    "With commas between: dbat, none, another objective (docs/concepts.md) or module:function, each also with a weight "
+    "Comma-separated: dbat, none, another objective (docs/concepts.md) or module:function, each also with a weight "
     "(dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
 )
 benchmark = typer.Typer(cls=cli.Commands, no_args_is_help=True)
@@ -24,14 +24,16 @@ def _group() -> None:
 
 @cli.command(cli.MANY, "benchmark which-feature --out runs/which", "which-feature", benchmark)
 def which_feature(
-    out: Annotated[Path, Option("--out", help="A folder. Started again on it, the benchmark goes on.")],
+    out: Annotated[Path, Option("--out", help="A folder. Give it again to continue.")],
     diversity: Annotated[str, Option(help=ENTRIES)] = "dbat,none,oracle",
-    mix: Annotated[str, Option(help="Shares of unlabelled states whose features are drawn apart: 0.1,0.5.")] = "0.5",
+    mix: Annotated[str, Option(help="Shares of unlabelled states with independent features: 0.1,0.5.")] = "0.5",
     members: Annotated[int, Option(help="Hypotheses (K) of an entry.")] = 4,
     seeds: Annotated[str, Option(help="0-4, or 0,3,7.")] = "0-4",
-    factors: Annotated[str, Option(help="Features planted; also moved, of two frames.")] = "colour,shape,place,count",
-    high: Annotated[float, Option(help="Ranking of a feature from which on a member owns it.")] = 0.95,
-    low: Annotated[float, Option(help="Its ranking of every other feature is at most this.")] = 0.6,
+    factors: Annotated[
+        str, Option(help="Planted features; another is moved, of two frames.")
+    ] = "colour,shape,place,count",
+    high: Annotated[float, Option(help="A member owns a feature that it ranks at least this well,")] = 0.95,
+    low: Annotated[float, Option(help="if it ranks every other feature at most this well.")] = 0.6,
     set_: cli.Set = None,
     quiet: cli.Quiet = False,
 ) -> None:
@@ -39,7 +41,7 @@ def which_feature(
 
     Small scenes have planted features (--factors): colour, shape and place of
     an object, and how many boxes there are. In the labelled ones all say the
-    same; in a share of the unlabelled ones (--mix) each is drawn for itself.
+    same; in a share of the unlabelled ones (--mix) each is drawn independently.
     Members are trained as by train-ensemble (--set takes its settings) and
     scored on scenes in which all features are crossed:
 
@@ -48,8 +50,8 @@ def which_feature(
     - best: the highest ranking of a feature by a member, mean over features
     - same: the share of pairs of members with the same best feature
     - gap: what the threshold of 0.5 costs in balanced accuracy
-    - labels: how many it takes until the right member is known, for those
-    features that are covered
+    - labels: how many it takes to find the right member, for the features
+    that are covered
 
     Writes results.csv: a line for each entry, mix, seed, member and feature.
     """

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 def import_(
     source: Annotated[Path, Argument(help="A .npz file, or a folder of .npy files, of images or of a Minari dataset.")],
     out: cli.Out,
-    sub_goal: Annotated[list[str] | None, Option(help="Its name; in the order of the labels' columns.")] = None,
+    sub_goal: Annotated[
+        list[str] | None, Option(help="Its name; one for each of the labels' columns, in order.")
+    ] = None,
     label: Annotated[
         list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Minari: a function that labels.")
     ] = None,
@@ -59,14 +61,14 @@ def import_(
 def export(
     source: Annotated[Path, Argument(help="A data file, or the folder of a meta artefact.")],
     out: Annotated[Path, Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
-    episodes: Annotated[int, Option(min=1, help="How many an agent plays.")] = 20,
+    episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
     seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Seed of the agent's draws of options.")] = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
     """Write states or an agent's episodes for other software.
 
-    States as NumPy arrays, episodes as a Minari dataset. 'import' takes both again.
+    States as NumPy arrays, episodes as a Minari dataset. 'import' reads both.
     """
     if source.is_dir():
         from hypogoal.stages.export_episodes import export_episodes
@@ -89,13 +91,13 @@ def label(
     arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
     fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps a second; 0: a step for each key.")] = 0,
-    resume: Annotated[bool, Option("--resume", help="Go on with an existing folder.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Continue with an existing folder.")] = False,
     record: Annotated[Path | None, Option(help="Write what you play into this file, for 'collect --play'.")] = None,
 ) -> None:
-    """Mark states by hand, in a window; 'import' takes them.
+    """Mark states by hand, in a window; 'import' reads them.
 
-    Keys: p positive, n negative, u unlabelled. Every mark is on the disk at
-    once. --heldout adds states of other layouts to the folder, to judge members by.
+    Keys: p positive, n negative, u unlabelled. Every mark is saved at once.
+    --heldout adds states of other layouts to the folder, to judge members by.
     """
     from hypogoal.core import own_code
     from hypogoal.stages.label import label as stage

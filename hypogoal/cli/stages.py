@@ -68,7 +68,7 @@ def train_meta(
     ensemble: Annotated[Path, ENSEMBLE],
     options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
 ) -> None:
-    """Learn which options to choose, by the reward."""
+    """Learn from the reward which options to choose."""
     given.end(given.make(ensemble, options=options), "evaluate", given.out.parent)
 
 
@@ -131,7 +131,7 @@ def evaluate(
 
 @cli.command(cli.MAKE, "report runs/mine --videos 3")
 def report(
-    run: Annotated[Path, Argument(help="A run that was evaluated.")],
+    run: Annotated[Path, Argument(help="An evaluated run.")],
     figures: Annotated[Path | None, Option(help="Draw the paper's figures into this folder, not the page.")] = None,
     format_: Annotated[str | None, Option("--format", help="For --figures: svg (the default), pdf or png.")] = None,
     videos: Annotated[int | None, Option(min=0, help=f"Films of the policy over options, in {FILMS}")] = None,

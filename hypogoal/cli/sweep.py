@@ -12,7 +12,7 @@ from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 
 KNOWN = "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or a .toml file of your own."
-DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost, run none.")]
+DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost; run none.")]
 _slurm = partial(Option, rich_help_panel="Slurm (with --engine slurm)")
 
 
@@ -22,10 +22,10 @@ def run(
     out: Annotated[Path | None, Option(help="What to write. [dim]\\[default: runs/EXPERIMENT][/dim]")] = None,
     preset: cli.Preset = None,
     set_: cli.Set = None,
-    seed: Annotated[int | None, Option(min=0, help="The one run seed, instead of the experiment's.")] = None,
+    seed: Annotated[int | None, Option(min=0, help="A single seed, instead of the experiment's.")] = None,
     device: cli.Device = "auto",
     force: cli.Force = False,
-    resume: Annotated[bool, Option("--resume", help="Keep what is complete, go on with the rest.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Keep what is complete, continue with the rest.")] = False,
     quiet: cli.Quiet = False,
     dry_run: DryRun = False,
 ) -> None:
@@ -56,7 +56,7 @@ def run(
 
 @cli.command(cli.MANY, "sweep figure6 --out runs/figure6 --seeds 0-2 --dry-run")
 def sweep(
-    out: Annotated[Path, Option("--out", help="The sweep's folder. Started again on it, a sweep goes on.")],
+    out: Annotated[Path, Option("--out", help="The sweep's folder. Give it again to continue the sweep.")],
     experiment: Annotated[str | None, Argument(help=KNOWN, autocompletion=cli.offer("experiment"))] = None,
     preset: cli.Preset = None,
     set_: cli.Set = None,
@@ -65,21 +65,21 @@ def sweep(
     engine: Annotated[str, Option(help="local: the cores of this machine; slurm: job arrays.")] = "local",
     dry_run: DryRun = False,
     yes: Annotated[bool, Option("--yes", "-y", help="Do not ask, however long it takes.")] = False,
-    status: Annotated[bool, Option("--status", help="Only say how far the sweep is.")] = False,
-    cancel: Annotated[bool, Option("--cancel", help="Only end its jobs in Slurm; they save first.")] = False,
-    gather: Annotated[bool, Option("--gather", help="Only write results.csv of what is done.")] = False,
+    status: Annotated[bool, Option("--status", help="Only show how far the sweep is.")] = False,
+    cancel: Annotated[bool, Option("--cancel", help="Only cancel its Slurm jobs; they save first.")] = False,
+    gather: Annotated[bool, Option("--gather", help="Only write results.csv of the cells done so far.")] = False,
     cell: Annotated[str | None, Option(hidden=True, help="Only this cell, within a Slurm job.")] = None,
     quiet: cli.Quiet = False,
     as_json: cli.AsJson = False,
-    partition: Annotated[str, _slurm(help="Partition, as sbatch's.")] = "",
-    time: Annotated[str, _slurm(help="Limit of a cell, as sbatch's: 4:00:00.")] = "",
-    memory: Annotated[str, _slurm(help="Memory of a cell, as sbatch's --mem; else estimated.")] = "",
+    partition: Annotated[str, _slurm(help="Partition, as for sbatch.")] = "",
+    time: Annotated[str, _slurm(help="Time limit of a cell, as for sbatch: 4:00:00.")] = "",
+    memory: Annotated[str, _slurm(help="Memory of a cell, as for sbatch --mem; else estimated.")] = "",
     cpus: Annotated[int, _slurm(min=0, help="Processors of a cell; 0: as many as it can use.")] = 0,
     gpus: Annotated[int, _slurm(min=0, help="GPUs of a cell.")] = 0,
     cap: Annotated[int, _slurm(min=0, help="Cells of an array that run at once.")] = 0,
     warn: Annotated[int, _slurm(min=1, max=65535, help="Seconds before its limit at which a cell saves.")] = 120,
     sbatch: Annotated[
-        list[str] | None, _slurm(help="More options of sbatch: --sbatch=--account=x; repeatable.")
+        list[str] | None, _slurm(help="More options for sbatch: --sbatch=--account=x; repeatable.")
     ] = None,
 ) -> None:
     """Run an experiment's cells: seeds, layouts, methods.
@@ -104,7 +104,7 @@ def sweep(
     if cancel:
         from hypogoal.experiments.runners.slurm import cancel as end
 
-        say(f"{end(out)} jobs ended; the same command as before goes on", err=True)
+        say(f"{end(out)} jobs ended; give the same command as before to continue", err=True)
         return
 
     from hypogoal.core import own_code

@@ -80,7 +80,7 @@ class Artefact:
                     what = f"the {kind} that {self.path} was made from is {fault}"
                     raise UserError(what, entry["path"], "Restore it.")
                 return path
-        raise UserError(f"{self.path} was made from no {kind}", self.path / MANIFEST, "Is it the right artefact?")
+        raise UserError(f"{self.path} was not made from any {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
 
 class Settings(dict[str, Any]):

@@ -197,7 +197,7 @@ def parse_integers(text: str) -> list[int]:
     try:
         return [int(number) for item in text.split(",") for number in _range(item)]
     except ValueError:
-        raise UserError("these are no integers", repr(text[:200]), "Write them as 0-3,7.") from None
+        raise UserError("these are not integers", repr(text[:200]), "Write them as 0-3,7.") from None
 
 
 def _range(item: Any) -> Iterable[Any]:

@@ -164,15 +164,17 @@ def _begin(folder: Path, begun: dict[str, Any]) -> None:
 
 def _begun(folder: Path) -> dict[str, Any]:
     try:
-        begun = read_json(folder / BEGUN, "what was begun is", "Give --force to begin anew.")
+        begun = read_json(folder / BEGUN, "the unfinished output is", "Give --force to begin anew.")
         return {"identity": dict(begun["identity"]), "command": [str(word) for word in begun["command"]]}
     except (KeyError, TypeError, ValueError):
-        raise UserError("what was begun is damaged", folder / BEGUN, "Give --force to begin anew.") from None
+        raise UserError("the unfinished output is damaged", folder / BEGUN, "Give --force to begin anew.") from None
 
 
 def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
     if unfinished(out) and not (force or resume):
-        raise UserError("an unfinished one is there", out, "Give --resume to go on with it, or --force to begin anew.")
+        raise UserError(
+            "an unfinished output is there", out, "Give --resume to go on with it, or --force to begin anew."
+        )
 
 
 def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str, do: str) -> None:
@@ -268,7 +270,9 @@ def _check_own(folder: Path) -> None:
         with contextlib.suppress(FileNotFoundError):  # its owner removes it
             mode = path.lstat().st_mode
             if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
-                raise UserError("what was begun holds a link, pipe or device, which no stage makes", path, "Remove it.")
+                raise UserError(
+                    "the unfinished output holds a link, pipe or device, which no stage makes", path, "Remove it."
+                )
 
 
 def try_lock(file: TextIO | BinaryIO, *, shared: bool = False) -> bool | None:

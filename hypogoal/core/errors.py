@@ -4,7 +4,7 @@ from hypogoal.core.terminal import printable
 
 
 class UserError(Exception):
-    """A mistake the user can mend. The command line prints it as one line and exits with code 2.
+    """A mistake that the user can fix. The command line prints it as one line and exits with code 2.
 
     Args:
         what: what is wrong, as a sentence without a full stop.
@@ -24,9 +24,9 @@ class Killed(UserError):
 
 
 class Complete(UserError):
-    """What is to be gone on with is complete, made as asked: the command line says so and exits with code 0.
+    """What is to be resumed is complete, made as asked: the command line says so and exits with code 0.
 
-    ``path`` is what the command would have made, ``note`` what else there is to say of it.
+    ``path`` is what the command would have made, ``note`` what else there is to say about it.
     """
 
     def __init__(self, path: object, note: str = ""):

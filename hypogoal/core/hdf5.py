@@ -99,7 +99,7 @@ def attribute(file: Any, name: str) -> Any:
             return None
         stored = file.attrs.get_id(name)
         if stored.shape not in ((), (1,)) or stored.dtype.kind not in "Siufb":
-            raise Foreign(f"the attribute {name!r} is no text of fixed length or number")
+            raise Foreign(f"the attribute {name!r} is neither a text of fixed length nor a number")
         if stored.get_storage_size() > MAX_ATTRIBUTE_BYTES:
             raise Foreign(f"the attribute {name!r} is too large")
         value = file.attrs[name]

@@ -34,7 +34,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         do = "Upgrade hypogoal."
         raise UserError(f"format {version} is newer than this hypogoal reads ({FORMAT_VERSION})", path, do)
     if (version != UNSEALED or CHECKSUM in manifest) and data != sealed(manifest):
-        raise UserError("the manifest was changed since it was written, its checksum does not fit", path, AGAIN)
+        raise UserError("the manifest was changed since it was written, its checksum does not match", path, AGAIN)
     manifest.pop(CHECKSUM, None)
     return _checked(manifest, path)
 

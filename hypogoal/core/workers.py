@@ -61,8 +61,8 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
-        do = f"Have fewer at once: --set workers=1, or {CORES}=1 in the environment."
-        raise Killed("a process was killed by the system, most likely for want of memory", None, do) from None
+        do = f"Run fewer at once: --set workers=1, or {CORES}=1 in the environment."
+        raise Killed("a process was killed by the system, most likely for lack of memory", None, do) from None
     except BaseException:
         # Again until none is left: one that fails of its own has kept the first for the checkpoint that never comes,
         # and waits for the next task, behind a lock that a killed one may hold.

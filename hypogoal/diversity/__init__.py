@@ -1,14 +1,14 @@
-"""Spec C1: diversity objectives. One objective a file; the file's name is the name on the command line.
+"""Spec C1: diversity objectives. One objective per file; the file's name is the name on the command line.
 
 An objective is one of two functions:
 
-- ``pair_loss(logits_a, logits_b)`` of two members' logits (..., N, 2) on the same N unlabelled states. It returns a
+- ``pair_loss(logits_a, logits_b)`` takes two members' logits (..., N, 2) on the same N unlabelled states. It returns a
   loss (...,), lower where the two members differ more. Eq. (1) sums it over all ordered pairs.
-- ``ensemble_loss(context)`` of all members at once, see :class:`Context`. It returns one number, a tensor ().
+- ``ensemble_loss(context)`` takes all members at once, see :class:`Context`. It returns one number, a tensor ().
 
-Both must stay finite and differentiable at extreme logits and for N = 0 (``hypogoal check --diversity`` looks). An own
-one is named as ``module:function``, a function of two arguments or of one; other packages add theirs under the entry
-point group ``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` with such a function in it.
+Both must stay finite and differentiable at extreme logits and for N = 0 (``hypogoal check --diversity`` tests
+it). Name your own as ``module:function``, a function of two arguments or of one. Other packages add theirs under the
+entry point group ``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` that contains one.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class Context:
         unlabelled: float (K, N, 2), logits of unlabelled states.
         labelled_features: float (K, B, D), the last hidden layer's outputs.
         unlabelled_features: float (K, N, D), the same of unlabelled states.
-        frozen: float (F, N, 2), logits of members that were trained before these (schedule=sequential); no gradient
-            goes there.
+        frozen: float (F, N, 2), logits of members that were trained before these (schedule=sequential); they get no
+            gradient.
         positives: the share of positives among all labelled states, not only this batch's; above 0 and below 1.
-        input_gradients: computes float (K, B, C * H * W), the gradients of each member's logit gap (yes minus no) by
-            the pixels of the labelled states; can be differentiated. Costs another pass through the members.
+        input_gradients: computes float (K, B, C * H * W), the gradients of each member's logit gap (yes minus no) with
+            respect to the pixels of the labelled states; differentiable. Costs another pass through the members.
     """
 
     labels: Tensor
@@ -103,8 +103,8 @@ class Objective:
 def load_objective(name: str) -> Objective:
     """The diversity objective ``name``: of :data:`OBJECTIVES`, an installed entry point, or ``module:function``.
 
-    No such objective, one that cannot be loaded or is none, or code that the user did not allow (see
-    :mod:`hypogoal.core.own_code`) is a ``UserError``.
+    Raises ``UserError`` if there is no such objective, if it cannot be loaded or is not one, or if the user did not
+    allow the code (see :mod:`hypogoal.core.own_code`).
     """
     built_in = {objective: f"{__name__}.{objective.replace('-', '_')}" for objective in OBJECTIVES}
     loaded = load_own(name, "diversity objective", ENTRY_POINTS, built_in)
@@ -116,7 +116,7 @@ def load_objective(name: str) -> Objective:
         function, kind = loaded, "ensemble_loss" if _arguments(loaded) == 1 else "pair_loss"
     if not callable(function):
         do = "Give a pair_loss(logits_a, logits_b) or an ensemble_loss(context)."
-        raise UserError("this is no diversity objective", name, do)
+        raise UserError("this is not a diversity objective", name, do)
     return Objective(name, **{kind: function if name in OBJECTIVES else _watched(name, function)})
 
 

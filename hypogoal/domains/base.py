@@ -41,8 +41,8 @@ class Step(NamedTuple):
         rewards: float32 (E,).
         terminated: bool (E,), the task is over.
         truncated: bool (E,), the episode was cut at its step limit.
-        succeeded: bool (E,), the episode is over and was a success, where a domain says itself what that is. None: one
-            that terminated with a sum of rewards above 0.
+        succeeded: bool (E,), the episode is over and was a success, where the domain defines success. None: it
+            terminated with a sum of rewards above 0.
     """
 
     next_ids: NDArray[np.int64]
@@ -87,23 +87,23 @@ class Layouts(Resumable):
 class Engine(ABC):
     """Many environments, of one layout or several, stepped together; every distinct state has an integer id.
 
-    What each engine must have comes first; below it what an engine may have besides, with what holds where it has not.
+    What every engine must have comes first, then what is optional, with its defaults.
 
     Attributes:
         n_actions: primitive actions are 0 .. n_actions - 1.
         count: environments (E).
         observation_shape, observation_dtype: uint8 (H, W, C), pictures, or float32 of any shape.
-        standard: of the latter, what agents standardise them by; set by who trains some.
+        standard: mean and deviation by which agents standardise float32 observations; set in training.
         max_steps: steps after which an episode is truncated.
         ids: int64 (E,), the current state of each environment.
         elapsed: int64 (E,), steps since its episode began.
-        memory: how many states, at least, it can still draw; the frames of older ones are forgotten. None: all.
-        starts: its start states, whose ids are 0 .. S - 1 and which are never forgotten, each with ``on_the_way``;
-            empty where all episodes begin alike.
-        action_sets: by name, actions that a policy may be restricted to.
-        position_names: of the columns of :meth:`positions`; empty where it does not know where the agent is.
-        layouts: those that episodes begin in; None where all are of one.
-        restarts, resumes: it has :meth:`restart`; it has :meth:`snapshot` and :meth:`restore`.
+        memory: how many of the latest states, at least, it can still draw; it forgets older frames. None: all.
+        starts: its start states, with ids 0 .. S - 1, never forgotten, each with ``on_the_way``; empty where all
+            episodes begin alike.
+        action_sets: sets of actions that a policy may be restricted to, by name.
+        position_names: names of the columns of :meth:`positions`; empty where it does not know where the agent is.
+        layouts: where episodes begin; None: all in one layout.
+        restarts: whether it has :meth:`restart`; resumes: whether it has :meth:`snapshot` and :meth:`restore`.
     """
 
     n_actions: int
@@ -127,14 +127,14 @@ class Engine(ABC):
         """Ids known so far are 0 .. n_states - 1."""
 
     def reset(self) -> NDArray[np.int64]:
-        """Put every environment at the start of an episode; returns the ids, int64 (E,). Here by ``restart``."""
+        """Begin a new episode in every environment; returns the ids, int64 (E,). By default with ``restart``."""
         self.ids = self.elapsed = np.zeros(self.count, np.int64)
         self.restart(np.ones(self.count, np.bool_))
         return self.ids.copy()
 
     @abstractmethod
     def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment, actions (E,); where an episode ends, ``ids`` is a start state again afterwards."""
+        """Step every environment with actions (E,); where an episode ends, ``ids`` is then a start state."""
 
     @abstractmethod
     def images(self, ids: NDArray[np.int64], out: Any = None) -> Observations:
@@ -145,11 +145,11 @@ class Engine(ABC):
         """True sub-goal predicates, bool (n, G): the oracle that only evaluation and the upper bound may see."""
 
     def labels_now(self) -> NDArray[np.bool_]:
-        """The labels of the environments' current states, bool (E, G), asked anew where they are kept by id."""
+        """The labels of the environments' current states, bool (E, G), computed anew where they are kept by id."""
         return self.labels(self.ids)
 
     def room_for(self, count: int, out: Observations | None) -> Observations:
-        """Where to draw ``count`` observations: ``out``, a ``ValueError`` where it does not fit, or a new array."""
+        """Where to draw ``count`` observations: ``out``, or a new array; ``ValueError`` where ``out`` does not fit."""
         shape = (count, *self.observation_shape)
         if out is None:
             return np.empty(shape, self.observation_dtype)
@@ -158,20 +158,20 @@ class Engine(ABC):
         return out
 
     def restart(self, where: NDArray[np.bool_]) -> None:
-        """Begin a new episode now in the environments ``where``, bool (E,); where ``restarts``."""
-        raise UserError("this domain's engine cannot begin an episode when asked", None, "Leave that to its episodes.")
+        """Begin a new episode now in the environments ``where``, bool (E,); needs ``restarts``."""
+        raise UserError("this domain's engine cannot begin an episode on request", None, "Let its episodes end.")
 
     def snapshot(self) -> dict[str, Any]:
-        """All that it is, nested dicts of arrays and JSON values; where ``resumes``."""
+        """Its whole state, nested dicts of arrays and JSON values; needs ``resumes``."""
         raise UserError("this domain's engine cannot be saved", None, "Train on it without --resume.")
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments; where ``resumes``."""
-        raise UserError("this domain's engine cannot be gone on with", None, "Begin anew with --force.")
+        """Continue from a ``snapshot`` of an engine made with the same arguments; needs ``resumes``."""
+        raise UserError("this domain's engine cannot be resumed", None, "Begin anew with --force.")
 
     @property
     def oldest(self) -> int:
-        """Ids below this one, but for start states', are forgotten: they cannot be drawn any more."""
+        """Ids below this one, except start states, are forgotten: they can no longer be drawn."""
         return 0
 
     def remembers(self, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -188,19 +188,19 @@ class Engine(ABC):
         return None
 
     def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """The cell codes of states, uint8 (n, cells); where there are ``tiles``."""
+        """The cell codes of states, uint8 (n, cells); needs ``tiles``."""
         raise UserError("this domain's pictures are not made of cells", None, "Ask for images.")
 
     def reachable(self) -> NDArray[np.int64] | None:
-        """Ids of all states that can be reached, one for each image; None where nobody knows them."""
+        """Ids of all states that can be reached, one for each image; None where they are not known."""
         return None
 
     def plan(self) -> Plan | None:
-        """What follows on each action in each state; None where nobody knows."""
+        """What each action leads to in each state; None where that is not known."""
         return None
 
     def shortest_path(self) -> int | None:
-        """Primitive steps to the end of the task, at least; None where nobody knows them."""
+        """Fewest primitive steps to the end of the task; None where they are not known."""
         return None
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float | None:
@@ -249,26 +249,26 @@ class TurnEngine(Engine):
 
 
 class Domain(ABC):
-    """What hypogoal needs to know of a domain; :class:`hypogoal.GymnasiumDomain` makes one of an environment.
+    """What hypogoal needs to know about a domain; :class:`hypogoal.GymnasiumDomain` makes one from an environment.
 
-    ``hypogoal check`` tests it. What a domain may have besides follows what it must have.
+    ``hypogoal check`` tests it. What a domain must have comes first, then what is optional.
 
     Attributes:
         name: for messages.
         sub_goals: their names (G).
-        config_class: what ``collect`` can be told, a frozen dataclass of ``core.config.setting`` fields.
-        engine_settings: the names of those that are the world's own: who plays in it later is told them too.
-        defaults: settings of stages that suit it, by stage; sources: where these are from, where that can be told.
-        env_id: its Gymnasium environment, where it has a registered one.
-        resumes: ``collect`` also takes ``kept``, a function from a name to the ``Checkpoints`` in which the part of
-            that name is kept until all are there.
+        config_class: the settings of ``collect``, a frozen dataclass of ``core.config.setting`` fields.
+        engine_settings: the names of those that belong to the world: later stages play with them too.
+        defaults: settings of stages that suit it, by stage; sources: where these come from, where known.
+        env_id: the id of its registered Gymnasium environment, if any.
+        resumes: ``collect`` also takes ``kept``, a function from a part's name to the ``Checkpoints`` that keep it
+            until all parts are there.
         kinds: names of the values of the origin ``kind``.
-        starts: names of places where episodes begin, one of which ``make_engine`` takes as ``start``.
-        many_starts: it takes some of them, too, comma-separated.
+        starts: names of places where episodes begin; ``make_engine`` takes one as ``start``.
+        many_starts: it also takes several, comma-separated.
         many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence on how to read its observations, for people.
-        packed: how many times smaller than in memory collected states are on the disk, about; 1 where nobody knows.
+        packed: about how many times smaller collected states are on disk than in memory; 1 where not known.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
@@ -292,16 +292,16 @@ class Domain(ABC):
     @property
     @abstractmethod
     def observation_shape(self) -> tuple[int, ...]:
-        """(H, W, C) of pictures; of other observations any."""
+        """(H, W, C) for pictures, any shape for other observations."""
 
     @property
     def observation_dtype(self) -> np.dtype[Any]:
-        """uint8 of pictures, float32 of other observations."""
+        """uint8 for pictures, float32 for other observations."""
         return PICTURE
 
     @property
     def observation_bytes(self) -> int:
-        """Of one observation."""
+        """Bytes of one observation."""
         return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     @abstractmethod
@@ -314,7 +314,7 @@ class Domain(ABC):
 
     @property
     def has_env(self) -> bool:
-        """Whether there is a Gymnasium environment of it."""
+        """Whether it has a Gymnasium environment."""
         return bool(self.env_id)
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
@@ -326,17 +326,17 @@ class Domain(ABC):
         return gymnasium.make(self.env_id, **arguments)
 
     def world(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Of the settings that states were collected with (``config`` of a data file, ``domain_config`` of an artefact)
-        the engine's.
+        """The engine's settings among those that states were collected with: ``config`` of a data file,
+        ``domain_config`` of an artefact.
 
-        What they do not say is as ``make_engine`` has it; what ``collect`` would not take is a ``UserError``.
+        Missing ones are as ``make_engine`` has them; values that ``collect`` would not take are a ``UserError``.
         """
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked: Any = from_values(self.config_class, values, "collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
     def small(self, config: Any) -> Any:
-        """Settings with which ``check`` collects: those of ``config``, but for fewer states."""
+        """Settings with which ``check`` collects: as in ``config``, but for fewer states."""
         return config
 
     def inputs(self, config: Any) -> Sequence[Path]:
@@ -344,40 +344,40 @@ class Domain(ABC):
         return ()
 
     def collected_bytes(self, config: Any) -> int:
-        """Bytes of observations that ``collect`` will make, at the most; 0 where nobody knows."""
+        """Most bytes of observations that ``collect`` will make; 0 where not known."""
         return 0
 
     def played_bytes(self, steps: int, frames: int) -> int:
-        """Bytes of pictures that an engine keeps while it plays ``steps``, of which replays need ``frames``."""
+        """Bytes of pictures that an engine keeps while it plays ``steps``, if replays need ``frames`` of them."""
         return 0
 
     def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """From positions of an engine to the nearest place where a sub-goal holds, int (n,); where ``measures``."""
+        """Distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
         raise UserError("this domain measures no distances", self.name, "Leave them out.")
 
     def rooms_of(self, start: str) -> tuple[int, ...]:
-        """The rooms to draw of a start."""
+        """The rooms to draw for a start."""
         return ()
 
     def picture(self, room: int) -> NDArray[np.uint8]:
-        """A room, uint8 (height, width, 3); where ``pictures``."""
+        """A picture of a room, uint8 (height, width, 3); needs ``pictures``."""
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
 
     def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Column and row in that picture, (n, 2), of positions; where ``pictures``."""
+        """Column and row of positions in that picture, (n, 2); needs ``pictures``."""
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
 
     def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Row and column of the agent's middle in an observation, (n, 2), of positions; where ``sees_agent``."""
+        """Row and column of the agent's centre in an observation, (n, 2), from positions; needs ``sees_agent``."""
         raise UserError("this domain does not say where in an observation the agent is", self.name, "Set view=full.")
 
 
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
     """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
     step: Any = engine.step(actions)
-    do = f"Give a Step of arrays of {engine.count}; hypogoal check says of which type."
+    do = f"Give a Step of arrays of length {engine.count}; 'hypogoal check' says of which types."
     if not isinstance(step, Step):
-        UsersCode("the engine's step", engine, "step").refuse(f"gave no Step but a {type(step).__name__}", do)
+        UsersCode("the engine's step", engine, "step").refuse(f"gave a {type(step).__name__}, not a Step", do)
     for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):
         values = getattr(step, name)
         if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:

@@ -22,11 +22,11 @@ from hypogoal.domains.doorkey_engine import DoorKeyEngine
 
 @dataclass(frozen=True)
 class DoorKeyConfig:
-    """What ``hypogoal collect doorkey`` can be told."""
+    """Settings of ``hypogoal collect doorkey``."""
 
     regime: str = setting(
         "fixed",
-        "labelled states: 'fixed', the layout as it lies; 'shuffled', keys re-drawn within its walls",
+        "labelled states: 'fixed', the layout as it is; 'shuffled', keys placed anew within its walls",
         source="paper, MiniGrid experiment",
         choices=("fixed", "shuffled"),
     )
@@ -37,7 +37,7 @@ class DoorKeyConfig:
     )
     heldout_first: int = setting(
         1000,
-        "first held-out layout seed; seeds whose grid is a training layout's or came before are passed over",
+        "first held-out layout seed; seeds that repeat a training grid or an earlier one are skipped",
         low=0,
     )
     heldout_layouts: int = setting(20, "held-out layouts", source="paper, MiniGrid experiment", low=1, high=500)

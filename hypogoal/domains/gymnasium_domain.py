@@ -28,7 +28,7 @@ _Layout = tuple[int, list[Recorded]]  # its seed, and what was recorded on it
 
 @dataclass(frozen=True)
 class GymnasiumConfig:
-    """What ``hypogoal collect`` can be told about such a domain."""
+    """Settings of ``hypogoal collect`` for such a domain."""
 
     labelled_seeds: tuple[int, ...] = setting(
         (0,), "layout seeds of the labelled states", source="as the paper's MiniGrid experiment", low=0
@@ -44,39 +44,39 @@ class GymnasiumConfig:
     )
     steps: int = setting(3_000, "steps played on each layout", unit="steps", low=1)
     states: int = setting(
-        1_000, "distinct states kept of each layout, at most; as many of each combination of sub-goals", low=2
+        1_000, "most distinct states kept of each layout, evenly over combinations of sub-goals", low=2
     )
-    explore: float = setting(0.25, "share of random actions, where the domain brings a policy", low=0.0, high=1.0)
+    explore: float = setting(0.25, "share of random actions, where the domain has a policy", low=0.0, high=1.0)
     max_episode_steps: int = setting(500, "an episode is cut after this many steps", unit="steps", low=1)
     play: tuple[str, ...] = setting(
-        (), "files of recorded play, or folders of Minari datasets: half of the steps begin on the way that it went"
+        (), "files of recorded play, or folders of Minari datasets: half of the steps begin somewhere along it"
     )
 
 
 class GymnasiumDomain(Domain):
-    """Spec B6: all that hypogoal needs to know of a problem, from a Gymnasium environment.
+    """Spec B6: all that hypogoal needs to know about a problem, from a Gymnasium environment.
 
     Args:
-        make: makes an environment: observations are pictures, uint8 (H, W, C) or (H, W), or numbers, a ``Box`` of any
-            shape or a ``Dict`` of such; actions ``Discrete``. What ``seed`` of ``reset`` fixes is the layout: the same
+        make: makes an environment. Observations are pictures, uint8 (H, W, C) or (H, W), or numbers, a ``Box`` of any
+            shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of ``reset`` sets the layout: the same
             seed and actions give the same episode. Its arguments are the domain's own settings, see ``config_class``.
-        sub_goals: by name, a function from the environment to whether the sub-goal holds in its current state, however
-            it came there; or names alone, with ``labels``.
-        labels: for names alone, one function from the environment to all of ``{name: bool}``.
-        success: at the end of each episode of training, whether it was a success: a function of the environment, the
-            last step's info, the episode's sum of rewards, and whether it terminated. None: where it terminated with a
-            sum above 0.
-        policy: what is played to collect states, for ``1 - explore`` of the steps; None, random play. Policies by
-            sub-goal, one that gets there for each that is rare, share the steps evenly.
+        sub_goals: by name, a function of the environment that says whether the sub-goal holds in its current state,
+            whatever came before; or names alone, with ``labels``.
+        labels: with names alone, one function from the environment to ``{name: bool}`` for all of them.
+        success: called at the end of each training episode to say whether it was a success: a function of the
+            environment, the last step's info, the episode's sum of rewards, and whether it terminated. None: it
+            terminated with a sum above 0.
+        policy: plays ``1 - explore`` of the steps to collect states; None: random play. Policies by sub-goal, for
+            example one that reaches each rare sub-goal, share the steps evenly.
         defaults: settings of stages that suit this domain, by stage: ``{"train-ensemble": {"network": "montezuma"}}``.
-        memory: distinct states that training keeps observations of, see ``GymnasiumEngine``.
-        features: names of the numbers in observations that are no pictures; else those of a ``Dict``, or x0, x1, ...
-        resize: pixels of a side to which pictures are resized; 0, not at all.
-        name: for messages; artefacts name the domain as the user named it to ``collect``.
+        memory: how many distinct states training keeps observations of, see ``GymnasiumEngine``.
+        features: names of the numbers in observations other than pictures; default: those of a ``Dict``, or x0, x1, ...
+        resize: side in pixels to which pictures are resized; 0: not at all.
+        name: for messages; artefacts have the name that the user gave to ``collect``.
         config_class: a frozen dataclass that adds settings of its own to ``GymnasiumConfig``: ``make`` gets them, in
             collection, training, baselines and evaluation alike.
 
-    Example, a domain that ``hypogoal collect my_module:DOMAIN`` knows::
+    Example, for ``hypogoal collect my_module:DOMAIN``::
 
         DOMAIN = GymnasiumDomain(make, {"key": lambda env: env.unwrapped.carrying is not None})
     """
@@ -109,7 +109,9 @@ class GymnasiumDomain(Domain):
         by_goal = policy if isinstance(policy, Mapping) else {}
         self.policies = tuple(by_goal.values()) or (None if isinstance(policy, Mapping) else policy,)
         if not set(by_goal) <= set(self.sub_goals):
-            raise UserError("policies are by sub-goal", ", ".join(by_goal), f"These are {', '.join(self.sub_goals)}.")
+            raise UserError(
+                "policies are given by sub-goal", ", ".join(by_goal), f"These are {', '.join(self.sub_goals)}."
+            )
         self.defaults = dict(defaults or {})
 
     @cached_property
@@ -120,7 +122,7 @@ class GymnasiumDomain(Domain):
         env.close()
         if self._named and len(self._named) != len(look.features):
             given = f"{len(self._named)} for {len(look.features)}"
-            raise UserError("there are not as many names of features as numbers", given, "Give one for each.")
+            raise UserError("the number of feature names is wrong", given, "Give one for each.")
         return look._replace(features=self._named or look.features)
 
     @property
@@ -136,7 +138,7 @@ class GymnasiumDomain(Domain):
         return True
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """An environment; ``arguments``: settings of its own, the defaults of those that are not there."""
+        """An environment; ``arguments``: its own settings, with defaults for those left out."""
         env = engines.made(self.make, **{**self._own_settings, **arguments})
         return engines.resized(env, self.resize) if self.resize else env
 
@@ -161,11 +163,11 @@ class GymnasiumDomain(Domain):
         return min(2 * self.memory, steps) * self.observation_bytes
 
     def collect(self, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
-        """Labelled, unlabelled and held-out states: what play on each layout meets, each picture once.
+        """Labelled, unlabelled and held-out states met in play on each layout, each picture once.
 
-        Held-out states that look like one of those for learning are left out. Origins: ``layout_seed``, ``episode`` and
-        ``step``, counted from 0. Labelled states of one class only, no unlabelled or no held-out ones, or recorded play
-        that cannot be played are a ``UserError``.
+        Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
+        and ``step``, counted from 0. Raises ``UserError`` if the labelled states have one class only, if there are no
+        unlabelled or no held-out states, or if recorded play cannot be replayed.
         """
         seeds_of_sets = config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds
         env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
@@ -174,7 +176,7 @@ class GymnasiumDomain(Domain):
             most = int(env.action_space.n) - 1  # type: ignore[attr-defined]
             if max(way.actions) > most or not any(way.layout_seed in seeds for seeds in seeds_of_sets):
                 what = f"recorded play has layout seed {way.layout_seed} and actions up to {max(way.actions)}"
-                do = f"The seed must be of labelled_seeds, unlabelled_seeds or heldout_seeds, actions 0 to {most}."
+                do = f"The seed must be in labelled_seeds, unlabelled_seeds or heldout_seeds, actions in 0 to {most}."
                 raise UserError(what, way.where, do)
         progress.expect(sum(map(len, seeds_of_sets)) * config.steps + sum(len(way.actions) for way in recorded))
         learnt: set[bytes] = set()  # what the labelled and the unlabelled states look like
@@ -190,7 +192,7 @@ class GymnasiumDomain(Domain):
         where = f"steps={config.steps}"
         for states, what in ((unlabelled, "unlabelled"), (heldout, "held-out")):
             if not len(states.observations):
-                do = "Give other seeds, or more steps: states that look like those for learning do not count."
+                do = "Give other seeds, or more steps: states that look like training states do not count."
                 raise UserError(f"there are no {what} states", where, do)
         require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
         return Collected(self.look.shape, self.sub_goals, labelled, unlabelled, heldout, self.look.features)

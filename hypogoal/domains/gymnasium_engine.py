@@ -28,7 +28,9 @@ def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
     with UsersCode("the environment", make, failed="cannot be made:") as code:
         env: Any = make(**arguments)
         if not isinstance(env, gymnasium.Env):
-            code.refuse(f"is none, but a {type(env).__name__}", "Give a function that returns a gymnasium.Env.")
+            code.refuse(
+                f"is a {type(env).__name__}, not a gymnasium.Env", "Give a function that returns a gymnasium.Env."
+            )
         return env
 
 
@@ -77,8 +79,8 @@ class Look(NamedTuple):
         if self.dtype == NUMBERS and values.dtype.kind in "iufb":
             values = values.astype(NUMBERS)
         if values.dtype != self.dtype or values.shape not in (self.shape, self.space.shape):
-            do = f"Make the observation space and the observations agree; the former says {self.dtype} {self.shape}."
-            code.refuse(f"gave another observation than its space says: {given}", do)
+            do = f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}."
+            code.refuse(f"gave an observation that does not fit its space: {given}", do)
         if self.dtype == NUMBERS and not np.isfinite(values).all():
             code.refuse("gave an observation with numbers that are not finite", "Give finite ones.")
         return values.reshape(self.shape)
@@ -97,7 +99,7 @@ def look_of(env: gymnasium.Env) -> Look:
     if any(box.dtype == np.uint8 and len(box.shape) in (2, 3) for box in boxes):
         if len(parts) > 1 or not isinstance(space, spaces.Box | spaces.Dict):
             do = "Wrap it in gymnasium.wrappers.FilterObservation, and keep the picture alone, or all but pictures."
-            raise UserError("observations mix pictures with others", ", ".join(name for name, _ in parts), do)
+            raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
         [(key, space)] = parts
         if channels_first(space.shape):
             do = "Wrap it in gymnasium.wrappers.TransformObservation with x.transpose(1, 2, 0)."
@@ -198,13 +200,13 @@ class Labels:
             told: Any = together(env)
             do = f"Give a dictionary of {', '.join(self.names)}, each True or False."
             if not isinstance(told, Mapping):
-                code.refuse(f"gave no dictionary but a {type(told).__name__}", do)
+                code.refuse(f"gave a {type(told).__name__}, not a dictionary", do)
             for name in self.names:
                 if name not in told:
-                    code.refuse(f"gave no label of {name}", do)
+                    code.refuse(f"gave no label for {name}", do)
             for name in told:
                 if name not in self.names:
-                    code.refuse(f"gave a label of {name!r}, which is no sub-goal", do)
+                    code.refuse(f"gave a label for {name!r}, which is not a sub-goal", do)
             return np.array([code.truth(told[name], f"the label of {name}") for name in self.names], np.bool_)
 
 
@@ -348,7 +350,7 @@ class GymnasiumEngine(TurnEngine):
                 self._earned[number] += reward
             here, was = self.look.read(env, observation), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
-                what = "the environment does not do the same again for the same seed, so this cannot be gone on with"
+                what = "the environment does not repeat itself for the same seed, so this cannot be resumed"
                 raise UserError(what, f"layout_seed={seed}", "Begin anew with --force.")
         self._played = [list(actions) for actions in snapshot["played"]]
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()

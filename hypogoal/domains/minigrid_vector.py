@@ -39,19 +39,19 @@ def make_vec(
     """``SyncVectorEnv`` of ``RGBImgObsWrapper(gymnasium.make(env_id), tile_size)``, to the pixel, but faster.
 
     Args:
-        env_id: a MiniGrid environment, of the package or of others.
-        num_envs: N, how many.
+        env_id: a MiniGrid environment, from the package or elsewhere.
+        num_envs: number of environments (N).
         tile_size: pixels along a cell.
-        copy: each step's images are an array of their own; else always the same one, which the next step draws over.
+        copy: give each step's images an array of their own; otherwise the next step draws over the same array.
         autoreset_mode: Gymnasium's ``NextStep``, ``SameStep`` or ``Disabled``.
-        arguments: those of ``gymnasium.make``.
+        arguments: passed to ``gymnasium.make``.
 
     Returns:
         A ``gymnasium.vector.VectorEnv``. Observations are ``image`` uint8 (N, height, width, 3), ``direction``
         int64 (N,) and ``mission``, a tuple of N strings.
 
     Raises:
-        UserError: it is no MiniGrid environment, or it draws in a way of its own.
+        UserError: it is not a MiniGrid environment, or draws in its own way.
     """
 
     def make() -> gymnasium.Env:
@@ -87,7 +87,7 @@ def rows_seen(size: int) -> NDArray[np.int64]:
 class MiniGridVector(SyncVectorEnv):
     """N MiniGrid environments of one kind, each behind ``RGBImgObsWrapper``; made by :func:`make_vec`.
 
-    While they are here their own ``gen_obs`` gives an empty dictionary.
+    Inside it, their own ``gen_obs`` returns an empty dictionary.
     """
 
     def __init__(self, env_fns: Sequence[Any], **arguments: Any):
@@ -195,12 +195,12 @@ class MiniGridVector(SyncVectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """As ``SyncVectorEnv``: environment i begins with ``seed + i`` or ``seed[i]``; ``reset_mask`` bool (N,)."""
+        """Like ``SyncVectorEnv``: environment i begins with ``seed + i`` or ``seed[i]``; ``reset_mask`` bool (N,)."""
         each, infos, options = range(self.num_envs), dict[str, Any](), dict(options or {})
         seeds = seed if isinstance(seed, Sequence) else [None if seed is None else seed + env for env in each]
         begins = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, np.bool_)))
         if not len(seeds) == len(begins) == self.num_envs:
-            raise ValueError(f"seed or reset_mask has not the length of {self.num_envs} environments")
+            raise ValueError(f"seed and reset_mask need one entry for each of {self.num_envs} environments")
         for env in begins.nonzero()[0].tolist():
             _, info = self._plays[env].reset(seed=seeds[env], options=options or None)
             infos = self._add_info(infos, info, env)
@@ -211,7 +211,7 @@ class MiniGridVector(SyncVectorEnv):
     def step(
         self, actions: Any
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """As ``SyncVectorEnv``: observations, rewards (N,), terminated (N,), truncated (N,), infos."""
+        """Like ``SyncVectorEnv``: observations, rewards (N,), terminated (N,), truncated (N,), infos."""
         rewards, (terminated, truncated) = np.zeros(self.num_envs), np.zeros((2, self.num_envs), np.bool_)
         waiting, given, infos = self._autoreset_envs.tolist(), [], dict[str, Any]()
         if self.autoreset_mode == AutoresetMode.DISABLED and any(waiting):

@@ -67,14 +67,12 @@ ALONE: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class MontezumaConfig:
-    """What ``hypogoal collect montezuma`` can be told."""
+    """Settings of ``hypogoal collect montezuma``."""
 
-    groups: int = setting(
-        1, "ladder groups with labels (N), of which there are seven", source="Figure 3", low=1, high=len(GROUPS)
-    )
+    groups: int = setting(1, "ladder groups with labels (N), out of seven", source="Figure 3", low=1, high=len(GROUPS))
     unlabelled_rooms: tuple[int, ...] = setting(
         (),
-        "rooms of the unlabelled states; none given, one with a ladder that has no labels, and room 18, without one",
+        "rooms of the unlabelled states; empty: one with a ladder that has no labels, and room 18, without a ladder",
         source="paper: for N = 1 one room of each kind",
         low=0,
         high=ROOMS - 1,
@@ -88,14 +86,14 @@ class MontezumaConfig:
     heldout_per_room: int = setting(
         300, "held-out states of each of the 24 rooms", unit="states", source="own choice", low=1, high=100_000
     )
-    heldout_seed: int = setting(0, "another number draws other held-out states, the rest stays", low=0)
+    heldout_seed: int = setting(0, "another number draws other held-out states, and nothing else changes", low=0)
     unlabelled_from: str = setting(
         "expert",
         "who plays in the unlabelled rooms: the labelled states' expert, or uniformly random actions from their sides",
         source="the paper's suggestion",
         choices=PLAYS,
     )
-    workers: int = setting(0, "rooms played in at once, each by a process; 0 for one per core", low=0, high=1024)
+    workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
 
 
 class _Task(NamedTuple):

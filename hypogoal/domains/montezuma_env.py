@@ -47,13 +47,13 @@ def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int, 
     """
     if not 0.0 <= along <= 1.0 or count < (2 if 0.0 < along < 1.0 else 1):
         do = "Give along a share, 0 to 1, and one state or more of each kind."
-        raise UserError("start states cannot be shared out like this", f"start_states={count}, along={along}", do)
+        raise UserError("start states cannot be split like this", f"start_states={count}, along={along}", do)
     rng = rng_for(seed, "start-states", ladder.name)
     ways = round(along * count) if along in (0.0, 1.0) else min(max(round(along * count), 1), count - 1)
     tops = _looking_different(_tops(emulator, ladder, TRIES * count, rng), count)
     starts = [*tops[: count - ways], *_looking_different(_ways_down(emulator, ladder, tops, rng), ways)]
     if len(starts) < count:
-        what = f"only {len(starts)} of {count} start states live through the descent"
+        what = f"only {len(starts)} of {count} start states survive the descent"
         raise UserError(what, ladder.name, "Ask for fewer.")
     return starts
 

@@ -177,7 +177,7 @@ def gather(
         if ladder in positives and shown.ram[RAM["dying"]] == 0:
             positives[ladder] += 1
     if len(pool) < wanted:
-        what = f"room {room} shows no {wanted} different states"
+        what = f"room {room} does not show {wanted} different states"
         raise UserError(what, f"{len(pool)} in {step} steps", "Ask for fewer.")
     ram = np.stack([shown.ram for shown in pool])
     chosen = [pool[index] for index in choose(kinds_of(ram), positions_of(ram), wanted, rng)]

@@ -8,7 +8,7 @@ from hypogoal.core.files import read_json
 from hypogoal.core.hdf5 import attribute, find, members, open_hdf5, read_array
 
 MINARI = Path("data") / "main_data.hdf5"  # in a dataset's folder
-DO = 'Give {"layout_seed": 0, "actions": [2, 5]}, a list of such, or a Minari dataset made with reset(seed=...).'
+DO = 'Give {"layout_seed": 0, "actions": [2, 5]}, a list of these, or a Minari dataset made with reset(seed=...).'
 
 
 class Recorded(NamedTuple):

@@ -1,6 +1,6 @@
 """An evaluation's numbers: one table of rows, every mean, interval and comparison, and what each means (Spec F5).
 
-Nothing is averaged over runs that were not made alike: what differs has another name.
+Runs that were not made alike are never averaged: they have different names.
 """
 
 from __future__ import annotations
@@ -120,9 +120,9 @@ def by_unit(values: ArrayLike, units: Sequence[Hashable]) -> NDArray[np.float64]
 
 
 def by_layout(values: ArrayLike, layouts: Sequence[Hashable]) -> tuple[NDArray[np.float64], str]:
-    """Spec F5: what is independent: each layout's mean over its runs; where there is one layout, the runs themselves.
+    """Spec F5: the independent values: each layout's mean over its runs or, with one layout, the runs themselves.
 
-    From n runs' values (n, ...) and layouts, none where they have no such thing: (U, ...), and "layouts" or "runs".
+    Takes n runs' values (n, ...) and layouts, empty where they have none. Returns (U, ...), and "layouts" or "runs".
     """
     several = len(set(layouts)) > 1
     return by_unit(values, layouts if several else range(len(np.asarray(values)))), "layouts" if several else "runs"
@@ -136,10 +136,10 @@ def student_interval(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, str]:
-    """Spec F5: a 95 % interval: of few values Student's, of the mean; of 8 or more a bootstrap, of the middle half's.
+    """Spec F5: a 95 % interval: below 8 values Student's, of the mean; from 8 on a bootstrap, of the middle half's.
 
-    A percentile bootstrap of few values is too narrow: of two it would hold in every second case. Gives the bounds of
-    (n,) independent values, NaN for fewer than two, and the interval's kind; ``rng`` draws the resamples.
+    A percentile bootstrap of few values is too narrow: of two it would hold in half of the cases. Returns the bounds
+    for (n,) independent values, NaN for fewer than two, and the interval's kind; ``rng`` draws the resamples.
     """
     if len(values) < BOOTSTRAP_FROM:
         return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
@@ -151,12 +151,12 @@ def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[flo
 def over(
     values: Sequence[float], unit: str, *cell: str, layouts: Sequence[Hashable] = (), deviation: bool = False
 ) -> dict[str, Any]:
-    """Spec F5: everything said of a number over runs, of which those of one layout count once, by their mean.
+    """Spec F5: the statistics of a number over runs; runs of one layout count once, by their mean.
 
-    Runs whose value is NaN are left out and ``n`` says so. The number's names among all, ``cell``, seed the resamples;
-    ``layouts`` are of :func:`by_layout`. There are mean, standard_error, iqm, interval (95 %, see :func:`interval`),
-    interval_over (of what, and its kind), n (runs), unit, and with ``deviation`` standard_deviation (n - 1): the bands
-    of Figures 3 and 4.
+    Runs with a NaN are left out, and ``n`` shows it. ``cell``, the names that identify the number, seeds the resamples;
+    ``layouts`` as for :func:`by_layout`. Returns mean, standard_error, iqm, interval (95 %, see :func:`interval`),
+    interval_over (its units and kind), n (runs), unit, and with ``deviation`` standard_deviation (n - 1): the bands of
+    Figures 3 and 4.
     """
     defined = [index for index, value in enumerate(values) if not np.isnan(value)]
     numbers, of = by_layout([values[index] for index in defined], [layouts[index] for index in defined if layouts])
@@ -184,15 +184,15 @@ def pairs(
     higher: bool = True,
     layouts: bool = False,
 ) -> Rows:
-    """Spec F5: the first method against each other over what both have alike, seed by seed.
+    """Spec F5: the first method against each of the others, over what both share, seed by seed.
 
     A seed's layout, data and first weights are hard or easy for every method, so pairs that share them tell more than
-    two means; and the probability of improvement says how often, where a difference of means may be one run's.
+    two means. The probability of improvement says how often; a difference of means may come from one run.
 
-    ``measured`` are (method, what is alike, value): layout, sub-goal or ladder, the seed last. What is alike in all of
-    it, options of one seed of several ensembles say, is paired in the order in which it comes. There is a row, see
-    :func:`compare_pairs`, for each method after the first that shares a pair with it; it says that a ``quantity`` is
-    compared, and ``where``. ``layouts``: the first mark is the layout; where there are several, they are the units, not
+    ``measured`` are (method, key, value). A key is what pairs must share: layout, sub-goal or ladder, and last the
+    seed. Values with the same key, such as options of one seed of several ensembles, are paired in order. Each method
+    after the first that shares a pair with it gets a row, see :func:`compare_pairs`, that names the ``quantity``
+    compared, and ``where``. ``layouts``: keys begin with the layout; where there are several, they are the units, not
     the seeds.
     """
     values: dict[str, dict[tuple[Hashable, ...], float]] = {}
@@ -243,13 +243,13 @@ def compare_pairs(
 
     The probability of improvement is the share of pairs in which the first is better, a tie counting half. Pairs of one
     unit (one seed's ensemble on several ladders, one layout with several seeds) are not independent: everything but
-    the counts is over units, each of which counts once, by its mean. Where one wins every pair the interval has no
-    width, so the sign test stands beside it, which few units cannot make small. Pairs with a NaN are left out.
+    the counts is over units, and each unit counts once, by its mean. Where one method wins every pair the interval has
+    no width, so the sign test stands beside it: it stays large with few units. Pairs with a NaN are left out.
 
     Returns:
         n, units (how many), wins, ties, probability and its interval (Student's 95 %, cut at 0 and 1), interval_over,
         difference (mean of first - second) and difference_interval, sign_test (two-sided p, ties left out). NaN without
-        pairs, intervals also of one unit.
+        pairs; intervals are NaN for one unit too.
     """
     there = ~(np.isnan(first) | np.isnan(second))
     marks = [mark for mark, both in zip(units, there, strict=True) if both]

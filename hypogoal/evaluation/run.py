@@ -238,7 +238,7 @@ def read_table(
     table = {name: values[:, index] for index, name in enumerate(columns)}
     options = table.get("option", np.zeros(0))
     if not ((options >= 0) & (options < MOST_OPTIONS)).all():
-        raise UserError("an option in the table has no possible number", path, AGAIN)
+        raise UserError("an option in the table has an impossible number", path, AGAIN)
     return table
 
 
@@ -307,7 +307,7 @@ def _metrics(path: Path) -> dict[str, Any]:
         raise UserError(f"an older hypogoal evaluated this (no {', '.join(lacking)})", path, AGAIN)
     for name in _sub_goals(metrics):
         if not plain_name(name):
-            raise UserError(f"a sub-goal in the evaluation has a name that is none, {name!r}", path, AGAIN)
+            raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, AGAIN)
     return metrics
 
 

@@ -134,7 +134,7 @@ def read_experiment(path: Path) -> Experiment:
     for switch, names in table.get("pairs", {}).items():
         lists = isinstance(names, list) and all(isinstance(settings.get(str(name), (0,))[0], tuple) for name in names)
         if not lists or getattr(settings.get(switch), "value", None) not in (True, False):
-            raise UserError("pairs are named after a switch, and of axes", f"{switch} in {path}", MEND)
+            raise UserError("pairs must be named after a switch and list axes", f"{switch} in {path}", MEND)
     groups: dict[str, _Group] = {}
     for row in table.get("cells", []):
         group = _group(row, settings, groups, path)
@@ -144,7 +144,7 @@ def read_experiment(path: Path) -> Experiment:
 
 def _check_keys(table: Any, kinds: Mapping[str, Any], path: Path) -> None:
     if not isinstance(table, dict):
-        raise UserError("cells and settings are tables", path, MEND)
+        raise UserError("cells and settings must be tables", path, MEND)
     for key, value in table.items():
         if key not in kinds:
             raise UserError("no such key in an experiment", key, f"{path} may have {', '.join(kinds)}.")
@@ -156,7 +156,7 @@ def _check_keys(table: Any, kinds: Mapping[str, Any], path: Path) -> None:
 def _values(name: str, values: Any, path: Path) -> tuple[Value, ...]:
     """An axis: its values make names of folders, so they must be fit for that."""
     if not name.isidentifier() or name in TAKEN:
-        raise UserError("an axis cannot be called this", repr(name), MEND)
+        raise UserError("an axis cannot have this name", repr(name), MEND)
     if isinstance(values, str):
         values = list(parse_integers(values))
     fits = isinstance(values, list) and values and len({str(value) for value in values}) == len(values)
@@ -169,7 +169,7 @@ def _setting(name: str, row: Any, path: Path) -> _Setting:
     _check_keys(row, SETTING_KEYS, path)
     words, choices = row.get("words", {}), row.get("choices", [])
     if not all(isinstance(text, str) for text in words.values()) or not all(map(path_part, map(str, choices))):
-        raise UserError("words are texts, choices parts of names", f"{name} in {path}", MEND)
+        raise UserError("words must be texts, choices parts of names", f"{name} in {path}", MEND)
     for text in words.values():
         _words(text, f"{name} in {path}")
     value = row.get("value")
@@ -206,7 +206,7 @@ def _group(row: Any, settings: Mapping[str, _Setting], known: Mapping[str, _Grou
     if "if" in row and not isinstance(getattr(settings.get(row["if"]), "value", None), bool):
         raise UserError("no such switch", f"{row['if']} of {where}", MEND)
     if not all(isinstance(text, str) for text in row.get("columns", {}).values()):
-        raise UserError("columns are texts", where, MEND)
+        raise UserError("columns must be texts", where, MEND)
     for column in (*dict(pairs), *row.get("columns", {})):
         _values(column, [0], path)  # its name
     words = tuple(_words(command, where))
@@ -214,7 +214,7 @@ def _group(row: Any, settings: Mapping[str, _Setting], known: Mapping[str, _Grou
         raise UserError("the command must be a stage", where, f"Choose one of {', '.join(STAGES)}.")
     minutes, memory = float(row.get("minutes", 0)), float(row.get("memory_gb", MEMORY / 1e9))
     if not (0 <= minutes < MOST and 0 <= memory < MOST):
-        raise UserError("minutes and memory_gb cannot be this", where, MEND)
+        raise UserError("minutes and memory_gb cannot have these values", where, MEND)
     cost = Cost(60 * minutes, 1e9 * memory, cores=_cores(words, known))
     return _Group(name, row, words, dict(pairs), cost)
 
@@ -304,7 +304,7 @@ class _Planner:
             for key in parse_assignments(pairs):
                 if (stage, key) in decided:
                     do = f"Give --set {decided[stage, key]}=..."
-                    raise UserError("the experiment gives each cell its own", f"{stage}.{key}", do)
+                    raise UserError("the experiment sets this for each cell", f"{stage}.{key}", do)
 
     def _decided(self) -> dict[tuple[str, str], str]:
         """By stage and option of a command, the setting that it comes from: ``--set`` would go before it."""
@@ -397,7 +397,9 @@ class _Planner:
             other = self.groups.get(key)
             missing = set() if other is None else other.lists.keys() - point.keys()
             if other is None or other is group or any(not self._is_changes(other, axis) for axis in missing):
-                what = f"{{{key}}} is no axis of these cells, nor the name of cells above over some of their axes"
+                what = (
+                    f"{{{key}}} is neither an axis of these cells nor the name of cells above over some of their axes"
+                )
                 raise UserError(what, f"cells {group.name!r}", MEND)
             needs.append(self._place(other, {**dict.fromkeys(missing, ""), **point}))
             return str(needs[-1])
@@ -457,7 +459,7 @@ class _Planner:
         def filled(match: re.Match[str]) -> str:
             axis = match[1]
             if axis not in group.lists:
-                raise UserError(f"{{{axis}}} in out is no axis of these cells", f"cells {group.name!r}", MEND)
+                raise UserError(f"{{{axis}}} in out is not an axis of these cells", f"cells {group.name!r}", MEND)
             changes = "".join(f",{change}" for change in str(point[axis]).split())
             return changes if self._is_changes(group, axis) else str(point[axis])
 

@@ -193,7 +193,7 @@ def check_same(run: Path, cells: Sequence[Cell]) -> None:
     for cell in there.cells:
         before, after = moved(cell, str(run), RUN), now.get(cell.out.relative_to(run))
         if after is None:
-            raise UserError(f"the sweep here has a cell that this one has not: {cell.name}", run, do)
+            raise UserError(f"the sweep here has a cell that this one lacks: {cell.name}", run, do)
         old, new = _meaning(before), _meaning(after)
         if old != new:
             one, other = (next((part for part in a if part not in b), "") for a, b in ((old, new), (new, old)))

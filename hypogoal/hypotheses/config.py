@@ -20,7 +20,7 @@ class EnsembleConfig:
     diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     schedule: str = setting(
         "simultaneous",
-        "members at once (the double sum of Eq. (1)), or one after the other against those before it",
+        "all members at once (the double sum of Eq. (1)), or one after the other, each against those before it",
         source="Eq. (1); sequential: D-BAT (arXiv:2202.04414)",
         choices=("simultaneous", "sequential"),
     )
@@ -36,12 +36,10 @@ class EnsembleConfig:
         source="the paper; shared: DivDis (arXiv:2202.03418)",
         choices=("separate", "shared", "frozen"),
     )
-    hidden_width: int = setting(
-        0, "units of a layer of each member's own behind the encoder; 0: none", low=0, high=65535
-    )
+    hidden_width: int = setting(0, "units of each member's own layer after the encoder; 0: none", low=0, high=65535)
     steps: int = setting(
         150,
-        "gradient steps (of each member, where sequential)",
+        "gradient steps (for each member if sequential)",
         unit="batches",
         source="own choice, the paper says none: docs/results/hypotheses-doorkey.md",
         low=1,
@@ -57,18 +55,18 @@ class EnsembleConfig:
         low=2,
         high=65536,
     )
-    class_weight_negative: float = setting(0.5, "cross entropy's weight of negatives", source="Table 3", low=1e-6)
-    class_weight_positive: float = setting(0.5, "cross entropy's weight of positives", source="Table 3", low=1e-6)
+    class_weight_negative: float = setting(0.5, "weight of negatives in the cross entropy", source="Table 3", low=1e-6)
+    class_weight_positive: float = setting(0.5, "weight of positives in the cross entropy", source="Table 3", low=1e-6)
     class_balance: str = setting(
         "batch",
-        "batch: half of each labelled batch is positive, so that the class weights hold of what a member "
+        "batch: half of each labelled batch is positive, so that the class weights apply to what a member "
         "sees; none: labelled states are drawn as they come",
         source="own choice: with 8 positives of 1640, weights of 0.5 and 0.5 alone balance nothing",
         choices=("batch", "none"),
     )
     unlabelled_bn: bool = setting(
         True,
-        "unlabelled batches count in BatchNorm's running statistics too, so that these are of more than one layout",
+        "unlabelled batches count in BatchNorm's running statistics too, so that these cover more than one layout",
         source="the authors' code",
     )
     view: str = setting(
@@ -87,8 +85,8 @@ class EnsembleConfig:
     )
     augment: str = setting(
         "none",
-        "what is done to each state of a training batch: none; grey, its shades are mapped by a random rising "
-        "function; grey-context, before that what is around the agent is often replaced (view=agent-crop)",
+        "what is done to each state of a training batch: none; grey, a random increasing function maps its shades; "
+        "grey-context, before that the agent's surroundings are often replaced (view=agent-crop)",
         source=BEYOND,
         choices=("none", "grey", "grey-context"),
     )
@@ -102,13 +100,13 @@ class EnsembleConfig:
     )
     batch_kind: str = setting(
         "plain",
-        "labelled batches: plain, as class_balance says; per-ladder, 3/8 positives, as many of each ladder",
+        "labelled batches: plain, as class_balance says; per-ladder, 3/8 positives, equally many from each ladder",
         source=BEYOND,
         choices=("plain", "per-ladder"),
     )
     threshold: str = setting(
         "0.5",
-        "a member says yes above 0.5; to 5 % of the unlabelled states; above the cut that best parts the unlabelled "
+        "a member says yes above 0.5; to 5 % of the unlabelled states; above the cut that best splits the unlabelled "
         "states in two; or to half of its labelled positives",
         source=f"{BEYOND}; unlabelled-split: Otsu 1979",
         choices=("0.5", "unlabelled-q95", "unlabelled-split", "positives-median"),

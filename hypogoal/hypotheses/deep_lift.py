@@ -1,11 +1,11 @@
-"""What in a state a member goes by: DeepLift attributions and the check that they are complete (Spec F2, Figures 2, 9).
+"""What a member looks at in a state: DeepLift attributions, and a check that they are complete (Spec F2, Figures 2, 9).
 
-Members with layers that DeepLift has no right rules for are explained by integrated gradients (Sundararajan et al.
-2017): means over ``STEPS`` states on the way from the baseline, and complete but for what so few miss.
+Members with layers for which DeepLift has no valid rules are explained by integrated gradients (Sundararajan et al.
+2017): means over ``STEPS`` states on the way from the baseline, complete up to what so few steps miss.
 
-Attributed is the log-odds of "reached", the difference of a member's two logits: its sign is the verdict at a threshold
-of 0.5, so positive attributions speak for "reached" whatever the member says. The attributions of a state, summed over
-pixels and frames, must be the difference between its log-odds and the baseline's; how far they are off is reported.
+We attribute the log-odds of "reached", the difference of a member's two logits. Its sign is the verdict at a threshold
+of 0.5, so positive attributions speak for "reached" whatever the member says. A state's attributions, summed over
+pixels and frames, must equal its log-odds minus the baseline's; the error is reported.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Attributions:
-    """Of every member on n states."""
+    """Attributions of every member on n states."""
 
     values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), in log-odds; for "reached" where positive
     log_odds: NDArray[np.float64]  # (n, K), each member's of each state
@@ -46,7 +46,7 @@ class Attributions:
         return np.abs(self.sums() - (self.log_odds - self.baseline_log_odds))
 
     def sums(self) -> NDArray[np.float64]:
-        """Of each state and member, (n, K)."""
+        """The sum for each state and member, (n, K)."""
         return np.asarray(self.values.reshape(*self.log_odds.shape, -1).sum(-1))
 
 

@@ -27,7 +27,7 @@ CHUNK = 64  # images at once in a plain forward pass: what fits a CPU's cache; o
 PATCH_CHUNK = 4096  # images at once where few patches are distinct
 FOLD_FROM = 32  # images from which making BatchNorm part of the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
-NO_OBSERVATIONS = "these are not observations that the ensemble knows"
+NO_OBSERVATIONS = "these observations do not fit the ensemble"
 
 
 class Ensemble(nn.Module):
@@ -35,21 +35,21 @@ class Ensemble(nn.Module):
 
     Args:
         network: a name in ``networks.NETWORKS``.
-        observation_shape: of the observations, (H, W, C) of pictures.
+        observation_shape: of one observation, (H, W, C) for pictures.
         members: K, at least 1.
         generator: draws the initial weights.
-        view: what members see of an observation; all of a picture where None.
-        encoder: as of ``TrainEnsembleConfig``.
-        hidden_width: the same.
+        view: what members see of an observation; None: all of a picture.
+        encoder: as in ``TrainEnsembleConfig``.
+        hidden_width: likewise.
 
     Attributes:
-        members: K ``nn.Sequential``, float (N, C, h, w) in 0..1, or what else ``networks.as_input`` makes of what
-            ``view`` shows -> logits (N, 2).
-        trunk: the encoder, from the same to (N, F), that members share; None where each has its own.
-        frozen: whether it is, and so always in evaluation mode.
-        parts: the trunk, to be run once, and the K networks behind it: ``networks`` where there is no trunk.
+        members: K ``nn.Sequential``, from what ``networks.as_input`` makes of the view (for pictures float
+            (N, C, h, w) in 0..1) to logits (N, 2).
+        trunk: the encoder that members share, from the same input to (N, F); None where each has its own.
+        frozen: whether the trunk is frozen, and so always in evaluation mode.
+        parts: the trunk, run once, and the K networks behind it; ``networks`` where there is no trunk.
         networks: the members in the order of layers that is fastest; weights and BatchNorm statistics are shared.
-        thresholds: float32 (K,), the probabilities above which the members' verdicts are yes.
+        thresholds: float32 (K,), the probabilities above which members say yes.
 
     Raises:
         UserError: unknown network, or images too small for it.
@@ -123,9 +123,9 @@ class Ensemble(nn.Module):
         self.thresholds.copy_(torch.from_numpy(thresholds))
 
     def see(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> Any:
-        """What the members see, uint8 (N, h, w, C), of observations uint8 (N, H, W, C); see :meth:`predict`.
+        """What the members see of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
 
-        Of observations that are no pictures float32 (N, *shape), standardised.
+        For observations other than pictures: float32 (N, *shape), standardised.
         """
         try:
             observations = np.asarray(observations)
@@ -155,14 +155,14 @@ class Ensemble(nn.Module):
         """Every member's probability that the sub-goal is reached.
 
         Args:
-            observations: uint8 (N, H, W, C), or float32 of any shape as it was trained; or a list of N.
+            observations: uint8 (N, H, W, C), or float32 of any shape, as in training; or a list of N.
             positions: int64 (N, 3) of room, x, y; only where ``needs_positions``.
 
         Returns:
             float32 (N, K). Up to rounding a state's row does not depend on the others.
 
         Raises:
-            UserError: observations of another shape or type, or positions that are needed and not given.
+            UserError: observations of another shape or type, or missing positions.
         """
         both = torch.from_numpy(self.logits(observations, positions))
         probabilities: NDArray[np.float32] = both.softmax(dim=-1)[..., 1].numpy()
@@ -191,11 +191,11 @@ class Ensemble(nn.Module):
         return logits
 
     def attributions(self, observations: Observations, against: Observations) -> NDArray[np.float32]:
-        """Spec F2, Figure 2: what each member goes by in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
+        """Spec F2, Figure 2: what each member looks at in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
 
-        ``against`` are others, unlabelled ones, say, whose mean is the baseline. Returns float32 (N, K, *what members
-        see, of pictures (H, W, C)), in log-odds, for "reached" where positive: a state's sum is its log-odds less the
-        baseline's. A ``UserError`` as of :meth:`predict`, or with no states.
+        The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
+        (N, K, *what members see; (H, W, C) for pictures) in log-odds, positive for "reached": a state's sum is its
+        log-odds minus the baseline's. ``UserError`` as for :meth:`predict`, or where there are no states.
         """
         from hypogoal.hypotheses.deep_lift import AT_ONCE, attributed, mean_state
 

@@ -106,7 +106,7 @@ def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
     built_in = {network: f"{__name__}:{function.__name__}" for network, function in NETWORKS.items()}
     made_for = load_own(name, "network", ENTRY_POINTS, built_in)
     if not callable(made_for):
-        raise UserError("this is no member network", name, "Give a function of channels or of observation_shape.")
+        raise UserError("this is not a member network", name, "Give a function of channels or of observation_shape.")
     return _checked(name, made_for)
 
 
@@ -163,7 +163,7 @@ def build_network(
                 raise UserError(what, where, "Its layers must take (N, channels, height, width).")
             raise UserError(f"images too small for the network {name!r}", where, _way_out(side, observation_shape))
         if not isinstance(features, Tensor):
-            what = f"the network {name!r} makes no tensor but {features!r} of images"  # type: ignore[unreachable]
+            what = f"the network {name!r} makes {features!r} of images, not a tensor"  # type: ignore[unreachable]
             raise UserError(what, where, "Make a tensor.")
         layers.append(nn.Flatten())
         *widths, last = filter(None, (features.numel(), *hidden, hidden_width))

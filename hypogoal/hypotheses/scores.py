@@ -11,10 +11,10 @@ Scores = dict[str, NDArray[np.float64]]
 
 
 def member_scores(verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]) -> Scores:
-    """Spec F1: by name every member's score, float64 (K,), a fraction, from verdicts (N, K) and labels (N,): "reached".
+    """Spec F1: by name every member's score, float64 (K,), a fraction, from "reached" verdicts (N, K) and labels (N,).
 
-    NaN where a score is not defined: balanced accuracy and recall without positives (or, the former, negatives),
-    precision of a member that never says yes, anything without states. A ``ValueError`` where their numbers differ.
+    NaN where a score is not defined: recall without positives, balanced accuracy without positives or negatives,
+    precision of a member that never says yes, any score without states. ``ValueError`` where the two Ns differ.
     """
     if verdicts.shape[0] != labels.shape[0]:
         raise ValueError(f"{verdicts.shape[0]} verdicts for {labels.shape[0]} labels")
@@ -36,8 +36,8 @@ def member_scores(verdicts: NDArray[np.bool_], labels: NDArray[np.bool_]) -> Sco
 def ranking(probabilities: NDArray[np.float32], labels: NDArray[np.bool_]) -> NDArray[np.float64]:
     """How well members tell positives from negatives whatever their thresholds: the area under the ROC curve.
 
-    From probabilities (N, K) and labels (N,) float64 (K,): the share of pairs of a positive and a negative in which the
-    positive has the higher probability, ties counted half; NaN where there are no such pairs.
+    Takes probabilities (N, K) and labels (N,). Returns float64 (K,): the share of pairs of a positive and a negative in
+    which the positive has the higher probability, ties counted half; NaN where there are no such pairs.
     """
     positives = int(labels.sum())
     pairs = positives * (len(labels) - positives)
@@ -51,10 +51,10 @@ def ranking(probabilities: NDArray[np.float32], labels: NDArray[np.bool_]) -> ND
 def best_threshold(
     probabilities: NDArray[np.float32], labels: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """The threshold of each member that is best for the true sub-goal: what a member knows but for where to say yes.
+    """Each member's best threshold for the true sub-goal: what it knows apart from where to say yes.
 
-    It is set on the labels (N,) that it is judged by, so it is a bound and no method. A member with probabilities (N,)
-    says yes above it; beside it (K,) is the balanced accuracy there (K,), NaN where a class is missing.
+    It is set on the labels (N,) that it is judged by, so it is a bound, not a method. Members with probabilities (N, K)
+    say yes above it. Returns thresholds (K,) and the balanced accuracy there (K,), NaN where a class is missing.
     """
     positives, members = int(labels.sum()), np.arange(probabilities.shape[1])
     negatives = len(labels) - positives
@@ -81,9 +81,10 @@ def halves(contexts: NDArray[np.int64]) -> NDArray[np.bool_] | None:
 
 
 def cross_fitted(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """The best member's score, picked on other states than it is scored on: no luck of the pick is in it.
+    """The best member's score, picked on other states than it is scored on, to exclude luck of the pick.
 
-    From members' scores (K,) on two halves of the contexts, the mean of both directions; NaN where one has no score.
+    Takes members' scores (K,) on two halves of the contexts, returns the mean of both directions; NaN where one has
+    no score.
     """
     scores = []
     for picking, scoring in ((first, second), (second, first)):
@@ -106,7 +107,7 @@ def by_member(scores: Scores) -> list[dict[str, float]]:
 
 
 def best_mean_worst(scores: NDArray[np.float64]) -> dict[str, float]:
-    """Spec F1: best, mean and worst of the members' scores (K,), those not defined left out; NaN when none is."""
+    """Spec F1: best, mean and worst of the members' scores (K,), undefined ones left out; NaN when none is defined."""
     defined = scores[~np.isnan(scores)]
     if len(defined) == 0:
         return dict.fromkeys(("best", "mean", "worst"), math.nan)
@@ -122,7 +123,7 @@ def most_and_least(values: NDArray[np.float64]) -> tuple[int | None, int | None]
 
 
 def mean_disagreement(verdicts: NDArray[np.bool_]) -> float:
-    """Spec F2: of verdicts (N, K) the share of states on which two members differ, mean over all pairs of members.
+    """Spec F2: from verdicts (N, K), the share of states on which two members differ, mean over all pairs of members.
 
     NaN for a single member or without states.
     """

@@ -71,9 +71,13 @@ def fit(
     """
     if len(unlabelled) == 0:
         if _diverse(config):
-            raise UserError("unlabelled states are needed to make members differ", None, "Or set diversity=none.")
+            raise UserError(
+                "unlabelled states are needed to make members differ", None, "Give some, or set diversity=none."
+            )
         if config.threshold in NEED_UNLABELLED:
-            raise UserError("unlabelled states are needed to set thresholds on", None, "Or set threshold=0.5.")
+            raise UserError(
+                "unlabelled states are needed to set thresholds on", None, "Give some, or set threshold=0.5."
+            )
     if config.schedule == "sequential" and config.encoder == "shared":
         what = "members one after the other cannot share an encoder that learns"
         raise UserError(what, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")

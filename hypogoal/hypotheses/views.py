@@ -111,7 +111,7 @@ def needed(origins: Origins | None, names: tuple[str, ...], why: str) -> Origins
     """The origins of states, which must say these; a ``UserError`` where one is missing."""
     origins = origins or {}
     if missing := ", ".join(name for name in names if name not in origins):
-        do = "Collect data that do, or set it otherwise."
+        do = "Collect data that do, or change the setting."
         raise UserError(f"the data do not say {missing} of each state", why, do)
     return origins
 
@@ -132,7 +132,7 @@ def view_of(
     if observations.dtype == NUMBERS:
         for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
             if (given := getattr(config, name)) != value:
-                raise UserError("these observations are no pictures", f"{name}={given}", f"Set {name}={value}.")
+                raise UserError("these observations are not pictures", f"{name}={given}", f"Set {name}={value}.")
         return FullView(shape, standard_of(shape, *([observations, unlabelled] if fitted else [])))
     if config.view == "full":
         if config.jitter:

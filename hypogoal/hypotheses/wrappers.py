@@ -23,7 +23,7 @@ def require_observations(env: Env, ensemble: Ensemble) -> Look:
     if (look.shape, look.dtype) != (shape, dtype):
         given = f"{look.dtype} {look.shape}, not {dtype} {shape}"
         do = "Use the environment they were trained on, with its wrappers."
-        raise UserError("the environment's observations are not those that these members know", given, do)
+        raise UserError("these members were trained on other observations", given, do)
     return look
 
 
@@ -40,7 +40,7 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise UserError("the ensemble needs the agent's positions (localiser=ram)", None, do)
         if asked not in RULES and asked not in range(len(ensemble)):
             do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
-            raise UserError("who is to say that the sub-goal holds?", f"by={by!r}", do)
+            raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
         self.ensemble, self.by = ensemble, asked
 
     def holds(self, observation: Any) -> bool:
@@ -57,15 +57,15 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 class SubgoalReward(_Subgoal):
     """Reward where a sub-goal's classifier fires (Spec D1): ``scale`` there, 0 elsewhere.
 
-    An agent can stay where it is rewarded: wrap the result in :class:`SubgoalTermination` too where it is not to.
+    An agent can stay where it is rewarded. To prevent that, wrap the result in :class:`SubgoalTermination` too.
 
     Args:
         env: an environment with the observations that the ensemble was trained on.
         ensemble: from :func:`hypogoal.load_ensemble`.
-        by: who says so: ``any`` member, more than half of them (``vote``), ``all``, their ``mean`` probability above
+        by: who decides: ``any`` member, more than half of them (``vote``), ``all``, their ``mean`` probability above
             0.5, or one member by its number.
         scale: the reward.
-        add: to the environment's own reward, instead of in its place.
+        add: add to the environment's own reward instead of replacing it.
 
     ``info["subgoal"]`` says whether the sub-goal holds.
     """
@@ -75,7 +75,7 @@ class SubgoalReward(_Subgoal):
         self.scale, self.add = scale, add
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """As the environment's, with the reward changed."""
+        """Like the environment's, with the reward changed."""
         observation, reward, terminated, truncated, info = stepped(self.env, action)
         holds = self.holds(observation)
         bonus = self.scale if holds else 0.0
@@ -83,7 +83,7 @@ class SubgoalReward(_Subgoal):
 
 
 class SubgoalTermination(_Subgoal):
-    """The episode terminates where a sub-goal's classifier fires (Spec D1); arguments as of :class:`SubgoalReward`.
+    """The episode terminates where a sub-goal's classifier fires (Spec D1); arguments as for :class:`SubgoalReward`.
 
     ``info["subgoal"]`` says whether the sub-goal holds.
     """
@@ -92,7 +92,7 @@ class SubgoalTermination(_Subgoal):
         super().__init__(env, ensemble, by)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """As the environment's, ``terminated`` where the sub-goal holds."""
+        """Like the environment's, ``terminated`` where the sub-goal holds."""
         observation, reward, terminated, truncated, info = stepped(self.env, action)
         holds = self.holds(observation)
         return observation, reward, terminated or holds, truncated, info | {"subgoal": holds}

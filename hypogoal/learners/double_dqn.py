@@ -28,8 +28,8 @@ def double_q_targets(
         next_online: float (..., A), the online network at s'.
         next_target: float (..., A), the target network at s'.
         gamma: discount of s', float or (...,): per step, or to the power n where s' is n steps on.
-        bounded: clip the targets to 0..1, between which the return of an option lies: 1, discounted, where it ends at
-            its sub-goal, else 0. Bootstrapped values that feed on themselves cannot grow beyond that.
+        bounded: clip the targets to 0..1, the range of an option's return: 1, discounted, where it ends at its
+            sub-goal, else 0. Bootstrapped values that feed on themselves cannot grow beyond that.
 
     Returns:
         float (...,).

@@ -16,7 +16,7 @@ class MetaConfig:
 
     meta_network: str = setting(
         "light",
-        "the paper's three convolutions, or a small one on cells",
+        "light, a small network on cells; or the paper's three convolutions",
         source="paper: three convolutions",
         choices=("light", "paper"),
     )
@@ -26,7 +26,9 @@ class MetaConfig:
     gamma: float = setting(
         0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="paper: not given"
     )
-    gae_lambda: float = setting(0.95, "advantage trace per decision", source="paper: 0.97", low=0.0, high=1.0)
+    gae_lambda: float = setting(
+        0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0
+    )
     decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2)
     epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
     meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
@@ -36,7 +38,7 @@ class MetaConfig:
     value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0)
     advantage_floor: float = setting(
         0.1,
-        "advantages are divided by their standard deviation, but by no less than this",
+        "advantages are divided by their standard deviation, or by this if it is larger",
         source="ours: docs/decisions.md; paper: 0",
         low=0.0,
     )
@@ -48,8 +50,7 @@ class PlayConfig(OptionConfig):
 
     start: str = setting(
         "",
-        "where episodes begin, in a domain that names several such places; of some, comma-separated, each is drawn as "
-        "often",
+        "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
         source="paper, policy learning; several: ours",
     )
     along: float = setting(
@@ -62,7 +63,7 @@ class PlayConfig(OptionConfig):
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     layouts: str = setting(
         "",
-        "layouts of which each episode draws one: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: it",
+        "layouts to draw episodes from: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: that one",
         source="ours: the paper lives on one",
     )
     max_episode_steps: int = setting(
@@ -76,22 +77,22 @@ class PlayConfig(OptionConfig):
     )
     world: tuple[str, ...] = setting(
         (),
-        "how the world differs from where the states were collected: settings of the domain as name=value",
+        "changes to the world that the states were collected in: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
     termination: str = setting(
         "learned",
-        "members' verdicts: learned, the first yes; patience:N, with a threshold that falls where an option of N steps "
-        "hardly ever gets there; dwell:N, N yeses in a row; or oracle, the true sub-goals (upper bound)",
+        "where options end: learned, at the first yes; patience:N, with a threshold that falls after N steps of an "
+        "option that hardly ever gets there; dwell:N, at N yeses in a row; or oracle, at true sub-goals (upper bound)",
         source="paper: learned; the others ours",
     )
     save_visited: int = setting(
         0,
-        "visited distinct states to keep as a data file, to train ensembles with",
+        "distinct visited states to save as a data file, for training ensembles",
         source="the paper's suggestion",
         low=0,
     )
-    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
+    random_episodes: int = setting(200, "episodes of random play: how hard the layout is", source="ours", low=0)
 
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
@@ -115,20 +116,20 @@ class TrainOptionsConfig(PlayConfig):
     )
     steps_for: str = setting(
         "all",
-        "'steps' are those of all options together, or of each of them",
+        "whether 'steps' counts all options together, or each of them",
         source="paper, policy learning",
         choices=("all", "each"),
     )
     until: float = setting(
         0.0,
-        "training ends once this share of the last 100 episodes has succeeded, and at 'steps' at the latest; 0: there",
+        "training ends once this share of the last 100 episodes has succeeded, at 'steps' at the latest; 0: only then",
         source="ours: practice for a task in which choosing decides",
         low=0.0,
         high=1.0,
     )
     chooser: str = setting(
         "random",
-        "uniform choice among the options offered, or the one with the fewest steps so far",
+        "random: uniform among the options offered; even: the one with the fewest steps so far",
         source="paper, policy learning",
         choices=("random", "even"),
     )
@@ -143,7 +144,7 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
     )
     chooser: str = setting(
         "ppo",
-        "the meta-policy, uniform choice among those offered, or a bandit that sees no state",
+        "the meta-policy, uniform choice among the options offered, or a bandit that sees no state",
         source="ours: controls; Thompson 1933",
         choices=("ppo", "random", "thompson"),
     )
@@ -151,19 +152,19 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
 
 @dataclass(frozen=True)
 class AuditConfig(TrainOptionsConfig):
-    """How the policies are learned that are to fool a classifier, and what is tried against them."""
+    """How policies learn to fool a classifier, and what is tried against them."""
 
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
     mask_reached: bool = setting(False, "do not begin executions where the classifier says yes already")
-    steps: int = setting(80_000, "environment steps, those of all policies together", unit="steps", low=1)
-    chooser: str = setting("even", "the policy with the fewest steps so far plays, or any", choices=("random", "even"))
+    steps: int = setting(80_000, "environment steps, all policies together", unit="steps", low=1)
+    chooser: str = setting(
+        "even", "who plays: the policy with the fewest steps so far, or any", choices=("random", "even")
+    )
     threshold: float = setting(
         0.0,
-        "a probability above this is a yes; 0: a member's own threshold, 0.5 of other classifiers",
+        "a probability above this is a yes; 0: a member's own threshold, or 0.5 for other classifiers",
         low=0.0,
         high=1.0,
     )
-    mend: float = setting(
-        0.95, "a second policy learns against yes above this higher probability; 0: none", low=0.0, high=1.0
-    )
+    mend: float = setting(0.95, "a second policy learns against this higher threshold; 0: none", low=0.0, high=1.0)

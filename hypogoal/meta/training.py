@@ -95,7 +95,9 @@ def assemble(
     if config.policy_pixels == "half":
         if config.network != "light" or engine.observation_dtype != PICTURE:
             given = f"policy_pixels=half, network={config.network}"
-            raise UserError("only the light network sees half the pixels, of pictures", given, "Leave it out.")
+            raise UserError(
+                "only the light network can see half the pixels, and only of pictures", given, "Leave it out."
+            )
         seen = HalfPictures(engine, windows)
     gamma, rng = 1.0, rng_for(seed, "random-choice")
     chooser: Chooser = EvenChooser(options, rng) if config.chooser == "even" else RandomChooser(rng)
@@ -167,7 +169,7 @@ def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence
     for name in changed:
         if name not in domain.engine_settings:
             known = ", ".join(domain.engine_settings) or "none"
-            raise UserError(f"{domain.name} has no such setting of its world", f"world={name}", f"It has {known}.")
+            raise UserError(f"the world of {domain.name} has no such setting", f"world={name}", f"It has {known}.")
     return {**collected, **domain.world(changed)}
 
 
@@ -175,7 +177,7 @@ def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
     """Whether the options can be learned that end so."""
     given = f"termination={config.termination}"
     if not terminations.SHARED and config.experience != "own":
-        what = "whether an execution has reached its sub-goal cannot be said of states that others visit"
+        what = "states that other options visit do not say whether an execution has reached its sub-goal"
         raise UserError(what, f"{given}, experience={config.experience}", "Give --set experience=own.")
     if config.network == "planned" and type(terminations) is not Terminations:
         raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
@@ -185,7 +187,7 @@ def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termin
     """Where among the domain's own these sub-goals are; a ``UserError`` that says ``do`` where one is not."""
     for sub_goal in sub_goals:
         if sub_goal not in domain.sub_goals:
-            what, known = f"{domain.name} does not know where this is true", ", ".join(domain.sub_goals)
+            what, known = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
             raise UserError(what, sub_goal, f"It knows of {known}. {do}")
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 

@@ -13,20 +13,20 @@ class OptionConfig:
 
     network: str = setting(
         "light",
-        "Q-network: the paper's conv-GRU, or a small one on cells; or planned: the shortest way, where an engine knows "
-        "what follows on each action",
+        "Q-network: light, a small one on cells; paper, a conv-GRU; or planned: the shortest path, where an engine "
+        "knows what each action leads to",
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
     )
     embedding: str = setting(
         "auto",
-        "what the light network sees by: cells, convolutions or numbers, as suits the observations; or a member "
+        "how the light network reads observations: cells, convolutions or numbers, whichever suits them; or a member "
         "network's layers, by name or as module:function",
         source="ours",
     )
     experience: str = setting(
         "shared",
-        "who learns from a step: its own member, or all of them",
+        "which members learn from a step: its own, or all of them (shared)",
         source="own: paper",
         choices=("own", "shared"),
     )
@@ -36,24 +36,24 @@ class OptionConfig:
     restart_options: bool = setting(
         False, "every option begins a new episode, at a start state", source="paper, policy learning"
     )
-    mask_reached: bool = setting(True, "do not offer options whose sub-goal holds already", source="ours")
+    mask_reached: bool = setting(True, "do not offer options where their sub-goal already holds", source="ours")
     initiation: str = setting(
         "anywhere",
-        "where options may start: anywhere, or where executions showed that they reach their sub-goal in time",
+        "where options may start: anywhere, or where experience says that they reach their sub-goal in time",
         source="ours; anywhere: paper",
         choices=("anywhere", "learned"),
     )
     initiation_threshold: float = setting(
-        0.05, "an option is held back where its chance is below this (initiation=learned)", low=0.0, high=1.0
+        0.05, "an option is held back where its chance of success is below this (initiation=learned)", low=0.0, high=1.0
     )
     initiation_ignored: float = setting(
-        0.1, "share of choices at which no option is held back (initiation=learned)", low=0.0, high=1.0
+        0.1, "share of choices in which no option is held back (initiation=learned)", low=0.0, high=1.0
     )
     bootstrap_timeout: bool = setting(
-        True, "an option's timeout is not a terminal state", source="paper, appendix; light: ours"
+        True, "do not treat an option's timeout as a terminal state", source="paper, appendix; light: ours"
     )
     bounded_values: bool = setting(
-        True, "values are learned from targets clipped to 0..1, what an option can return", source="ours; paper: false"
+        True, "clip the targets of values to 0..1, the range of an option's return", source="ours; paper: false"
     )
     option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
     environments: int = setting(16, "environments stepped together", low=1, high=4096)
@@ -64,10 +64,10 @@ class OptionConfig:
     positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
     option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
     target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
-    target_tau: float = setting(0.01, "share of the online network a target update takes", low=0.0, high=1.0)
+    target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
     n_step: int = setting(
         1,
-        "steps of an execution between a value and the one it is learned from (light, experience=own)",
+        "steps of an n-step return, within one execution (light, experience=own)",
         unit="steps",
         source="paper: 1; Hessel et al. 2018",
         low=1,
@@ -75,27 +75,26 @@ class OptionConfig:
     )
     policy_view: str = setting(
         "full",
-        "what the policies see: full, the whole observation; agent-crop, the window around the agent, whom the "
-        "ensemble's localiser finds (light)",
+        "what the policies see: full, the whole observation; agent-crop, the window around the agent as found by the "
+        "ensemble's localiser (light)",
         source="ours",
         choices=("full", "agent-crop"),
     )
     policy_pixels: str = setting(
         "all",
-        "the policies' pictures: all pixels, or half the side, means of 2 x 2 (light): faster where convolutions read "
-        "them",
+        "the policies' pictures: all pixels, or half the side, means of 2 x 2, faster with convolutions (light)",
         source="ours: docs/performance.md",
         choices=("all", "half"),
     )
     exploration: str = setting(
         "independent",
-        "a random action for one step, or kept for some",
+        "how long a random action lasts: one step, or several",
         source="persistent: Dabney et al. 2020",
         choices=("independent", "persistent"),
     )
     persistence: float = setting(
         2.0,
-        "exponent of how long a random action is kept, P(n) ~ n^-x (exploration=persistent)",
+        "exponent x of how long a random action lasts, P(n) ~ n^-x (exploration=persistent)",
         source="Dabney et al. 2020",
         low=1.1,
         high=10.0,
@@ -106,7 +105,7 @@ class OptionConfig:
         source="paper, Montezuma's Revenge",
     )
     epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
-    epsilon_final: float = setting(0.05, "exploration in the end", source="paper: 0.01", low=0.0, high=1.0)
+    epsilon_final: float = setting(0.05, "final epsilon", source="paper: 0.01", low=0.0, high=1.0)
     epsilon_from: str = setting(
         "first-positive",
         "when a member's epsilon begins to fall",

@@ -31,9 +31,9 @@ class Options:
         ensembles: the termination classifiers, one ensemble per sub-goal.
         policies: starts an option's greedy policy.
         timeout: steps after which an option ends.
-        initiation: holds options back where they rarely reach their sub-goals (D7); None, it holds none back.
-        dwell: in so many states on end a sub-goal must hold for its option to end.
-        mask_reached: options are not offered where their sub-goals hold already, as they were trained (D6).
+        initiation: holds options back where they rarely reach their sub-goals (D7); None: holds none back.
+        dwell: states in a row in which a sub-goal must hold for its option to end.
+        mask_reached: whether options are withheld where their sub-goals already hold, as in training (D6).
         domain, domain_config: where they were trained, see :meth:`make_env`.
 
     It can be sent to another process.
@@ -60,10 +60,10 @@ class Options:
         return len(self.sub_goals) * self.members
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """The Gymnasium environment that they were trained in, with the settings that its states were collected with.
+        """The Gymnasium environment they were trained in, with the settings its states were collected with.
 
-        ``arguments`` are the environment's, such as ``layout_seed``. A domain that is not installed here, is code that
-        the user did not allow, or has no environment is a ``UserError``.
+        ``arguments`` go to the environment, for example ``layout_seed``. Raises ``UserError`` if the domain is not
+        installed, is code that the user did not allow, or has no environment.
         """
         domain = load_domain(self.domain)
         return domain.make_env(**{**domain.world(self.domain_config), **arguments})
@@ -96,7 +96,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so that an agent can bootstrap with
     gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached, ``info["option"]`` its name.
 
-    ``action_masks()`` is what sb3-contrib's MaskablePPO asks for; of ``gymnasium.vector.SyncVectorEnv`` it is
+    sb3-contrib's MaskablePPO calls ``action_masks()``; for a ``gymnasium.vector.SyncVectorEnv``, use
     ``envs.call("action_masks")``.
 
     Args:
@@ -105,7 +105,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gamma: discount per environment step inside an option; 1 for the plain sum.
 
     Raises:
-        UserError: its observations are others.
+        UserError: the environment has other observations.
 
     >>> import gymnasium, hypogoal
     >>> options = hypogoal.load_options("runs/demo/meta")
@@ -129,7 +129,7 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._image: Observations | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """As the environment's own."""
+        """Like the environment's own."""
         observation, info = begun(self.env, seed=seed, options=options)
         self._image = self._look.read(self.env, observation)
         return observation, info

@@ -48,7 +48,7 @@ class LightLearner(Learner):
         self.running_only = config.experience == "own"
         if config.n_step > 1 and not self.running_only:
             raise UserError(
-                "others' sub-goals may lie within an execution, so a step of several is for its own member only",
+                "several steps at once are for an option's own member: others' sub-goals may lie among them",
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )

@@ -64,7 +64,7 @@ class OptionLoop(Resumable):
         self.recorder, self.config, self.gamma = recorder, config, gamma
         if config.restart_options and not engine.restarts:
             raise UserError(
-                "this domain's engine cannot begin an episode when asked",
+                "this domain's engine cannot begin an episode on request",
                 "restart_options=true",
                 "Give --set restart_options=false.",
             )

@@ -34,7 +34,7 @@ class PlannedLearner(Learner):
     def build(self, config: OptionConfig, seed: int) -> None:
         plan = self.engine.plan()
         if plan is None:
-            what = "this domain does not know what follows on each action"
+            what = "this domain does not know what each action leads to"
             raise UserError(what, "network=planned", "Give --set network=light.")
         self.actions = plan.actions
         self._place = places_of(plan, self.engine)

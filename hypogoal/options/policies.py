@@ -36,7 +36,7 @@ def make_policies(
             "Load options that were trained with learned members.",
         )
     if config["network"] == "planned":
-        what = "planned options go by what follows in their domain's engine, which is not in the artefact"
+        what = "planned options need their domain's engine, which is not in the artefact"
         raise UserError(what, "network=planned", "Load options that were learned.")
     shape = tuple(about["observation_shape"])
     options = len(config["sub_goals"]) * config["members"]

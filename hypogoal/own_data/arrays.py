@@ -43,7 +43,7 @@ def read_arrays(path: Path) -> Parts:
         raise UserError("held-out states need observations and labels", path, f"Give {' and '.join(OPTIONAL)}.")
     for name in NAMES:
         if name in arrays and arrays[name].dtype.kind != "U":
-            raise UserError(f"{name} are no texts but {arrays[name].dtype}", path, "Give numpy.array of str.")
+            raise UserError(f"{name} are {arrays[name].dtype}, not texts", path, "Give numpy.array of str.")
     named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
     given: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
     return Parts(**given, **named)
@@ -91,7 +91,7 @@ def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
         except (zipfile.BadZipFile, OSError, NotImplementedError, ValueError):
             raise UserError("this is not a .npz file", path, do) from None
         if any(entry.compress_type not in PACKED or entry.flag_bits & ENCRYPTED for entry in entries):
-            raise UserError("the arrays are packed as numpy does not pack them", path, do)
+            raise UserError("the arrays are not packed as numpy packs them", path, do)
         require_memory(sum(entry.file_size for entry in entries), path)
         raw.seek(0)
         try:

@@ -42,7 +42,7 @@ def read_images(folder: Path) -> Parts:
     sizes = {_size(some[0]): name for name, some in images.items()}
     if len(sizes) > 1:
         text = ", ".join(f"{name} {size}" for size, name in sizes.items())
-        raise UserError("the images are of different sizes", text, "Make them all one size.")
+        raise UserError("the images differ in size", text, "Make them all one size.")
     channels = max(image.shape[2] for some in images.values() for image in some)
     read = [np.stack([image.repeat(channels // image.shape[2], axis=2) for image in some]) for some in images.values()]
     return Parts(*_labelled(*read[:2]), read[2], *(_labelled(*read[3:]) if read[3:] else ()))
@@ -86,7 +86,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
             if (pixels := image.width * image.height) > MOST_PIXELS:
                 raise UserError(f"the image has {pixels:,} pixels, at most {MOST_PIXELS:,} are read", file, DO)
             if getattr(image, "is_animated", False):
-                raise UserError("several pictures are in one file", file, "Write each as a file of its own.")
+                raise UserError("one file holds several pictures", file, "Write each as a file of its own.")
             values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
     except (*DAMAGED, LookupError, struct.error, PIL.Image.DecompressionBombError):
         raise UserError("this is not an image, or it is damaged", file, DO) from None

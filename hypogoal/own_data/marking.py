@@ -186,7 +186,7 @@ class _Window:
         try:
             import pygame
         except ImportError:
-            raise UserError("no pygame, which makes the window", None, "pip install pygame-ce") from None
+            raise UserError("the window needs pygame", None, "pip install pygame-ce") from None
         self._pygame, self._title = pygame, title
         self._surface: Any = None
         self._tick = 0.0  # when the last one was, in real time
@@ -415,4 +415,4 @@ def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]]:
 
 def _require_images(dtype: np.dtype[Any], where: object) -> None:
     if dtype != np.uint8:
-        raise UserError("observations must be images to be looked at", where, "Label states by functions: collect.")
+        raise UserError("only observations that are images can be shown", where, "Label states by functions: collect.")

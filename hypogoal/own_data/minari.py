@@ -58,7 +58,7 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArr
             raise UserError("its observations are dictionaries", path, f"Give --key, one of {keys}.")
         stored = getattr(find(file, f"{names[0]}/{place}"), "shape", None) if names and shape else None
         if stored is not None and stored[1:] != shape:
-            what = "its images are not stored as they were seen, but as JPEG"
+            what = "its images are stored as JPEG, not as they were seen"
             raise UserError(what, path, "Make it with jpeg_encoding=False.")
         places = [f"{name}/{place}" for name in sorted(names, key=_number)]
         require_memory(sum(size_of(file, name, "uif") for name in places), path)

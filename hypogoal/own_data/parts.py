@@ -54,7 +54,7 @@ def collected_of(
         warned.append(f"float32 {images.shape[1:]} are taken for numbers, not for a picture: {do}")
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
         given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
-        raise UserError("there are not as many names of features as numbers", given, "Give one for each.")
+        raise UserError("the number of feature names is wrong", given, "Give one for each.")
     shape = images.shape[1:]
     labels = as_labels(parts.labels, len(images), "the labels")
     goals = named(sub_goals or parts.sub_goals, labels.shape[1])
@@ -115,11 +115,11 @@ def as_observations(values: NDArray[Any], what: str, like: NDArray[Any] | None =
     found = f"{values.dtype} {values.shape}"
     if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
         do = "Give images (N, height, width, channels), or numbers (N, ...)."
-        raise UserError(f"{what} are no observations", found, do)
+        raise UserError(f"{what} are not observations", found, do)
     if values.dtype.kind in "iu" and values.ndim in (3, 4):
         low, high = (int(values.min()), int(values.max())) if len(values) else (0, 0)
         if low < 0 or high > 255:
-            do = "Scale them to 0..255, uint8; where they are no images, give float32."
+            do = "Scale them to 0..255, uint8; if they are not images, give float32."
             raise UserError(f"{what} do not fit bytes ({low} to {high})", found, do)
         values = values.astype(np.uint8, copy=False)
         values = values[..., None] if values.ndim == 3 else values
@@ -133,7 +133,7 @@ def as_observations(values: NDArray[Any], what: str, like: NDArray[Any] | None =
         raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")
     if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
         given = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
-        raise UserError(f"{what} are of another shape or type than the labelled ones", given)
+        raise UserError(f"{what} differ in shape or type from the labelled ones", given)
     return np.ascontiguousarray(values)
 
 
@@ -178,6 +178,6 @@ def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.b
         chosen[rng.permutation(rows)[:taken]] = True
         due -= taken
     if not chosen.any():
-        what = f"of {len(labels)} labelled states none can be held out"
+        what = f"none of {len(labels)} labelled states can be held out"
         raise UserError(what, f"heldout={share:g}", "Give held-out states, a larger --heldout, or more labelled ones.")
     return chosen

@@ -62,7 +62,7 @@ def audit(
         lived = source.config["domain_config"] if source.config["domain"] == domain else lived
     edges = np.array([threshold, config.mend] if config.mend else [threshold])
     if (np.diff(edges) <= 0).any():
-        what = f"this mends no threshold of {threshold:g}"
+        what = f"this does not mend a threshold of {threshold:g}"
         raise UserError(what, f"mend={config.mend:g}", "Give a higher one, or 0.")
     for name, value in (("termination", "oracle"), ("policy_view", "agent-crop")):
         if getattr(config, name) == value:

@@ -61,6 +61,6 @@ def collect(
             soonest = (collected.labelled.origins["step"][held].min() for held in collected.labelled.labels.T)
             apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
             if 2 * apart > OptionConfig.option_timeout and not quiet:
-                what = f"from one sub-goal to the next play took up to {apart} steps, each at its soonest"
+                what = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
                 say(f"hypogoal: {what}: --set option_timeout={2 * apart} gives options time for that", err=True)
     return open_dataset(out).counts()

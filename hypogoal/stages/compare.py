@@ -27,7 +27,7 @@ def compare(runs: Sequence[Path], out: Path, *, force: bool = False) -> Path:
     claim(out, kind="comparison", inputs=runs, force=force)
     if len({run.resolve() for run in runs}) < max(2, len(runs)):
         where = " ".join(map(str, runs))
-        raise UserError("a comparison takes two different runs or more", where, "Name each run once.")
+        raise UserError("a comparison takes two or more different runs", where, "Name each run once.")
     labels = beside.labels_of([run.resolve().as_posix() for run in runs])
     found = {label: read_evaluation(run, "curves/") for label, run in zip(labels, runs, strict=True)}
     metrics = {label: one.metrics for label, one in found.items()}

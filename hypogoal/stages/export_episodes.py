@@ -28,7 +28,7 @@ def export_episodes(
     """
     prepare()
     if not NAME.fullmatch(out.name):
-        raise UserError("a Minari dataset has a version in its name", out.name, "Give --out DIR/NAME-v0.")
+        raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
     source = open_artefact(meta, "meta").whole()
     out = claim(out, kind="episodes", inputs=[meta], force=force)
     made = out.with_name(f".{out.name}.new")

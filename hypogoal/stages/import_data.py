@@ -47,7 +47,7 @@ def import_data(
         functions = [load_own(name, "label function", LABELS, {}) for name in (labels or {}).values()]
         parts, sub_goals = read_minari(source, functions, key=key, seed=seed), tuple(labels or ())
     elif labels or key:
-        raise UserError("no Minari dataset", source, "--label and --key are for the folder of one.")
+        raise UserError("not a Minari dataset", source, "--label and --key are for the folder of one.")
     elif (source / "positive").is_dir() or (source / "negative").is_dir():
         parts = read_images(source)
         sub_goals = sub_goals or (source.resolve().name,)

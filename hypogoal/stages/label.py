@@ -43,7 +43,7 @@ def label(
     if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
         raise UserError("it exists already", out, "Give --resume to go on with it, or another --out.")
     if record and (record.exists() or Path(source).exists()):
-        raise UserError("what you play is recorded in a new file", record, "Give another --record, or none.")
+        raise UserError("--record needs a new file", record, "Give another --record, or none.")
     states: Source
     if Path(source).exists():
         states = Recorded(recorded_states(Path(source)))

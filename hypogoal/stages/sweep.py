@@ -50,7 +50,7 @@ def config_class_of(stage: str, domain: str = "doorkey") -> type:
         for name, experiment in EXPERIMENTS.items():
             if domain == experiment.domain and name not in CELLS.values():
                 return experiment.config_class
-        raise UserError("no experiment is on this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
+        raise UserError("no experiment uses this domain", domain, f"Experiments: {', '.join(EXPERIMENTS)}.")
     if stage not in CONFIGS:
         raise UserError("no such stage", stage, f"Choose one of {', '.join(TABLES)}.")
     return CONFIGS[stage]
@@ -148,7 +148,7 @@ def sweep(
         name, why = next(iter(outcome.failed.items()))
         rest = f", {len(outcome.waiting)} wait for them" if outcome.waiting else ""
         what = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {why}"
-        raise UserError(what, None, "Mend it, then start again: what is done is kept.")
+        raise UserError(what, None, "Fix it, then start again: what is done is kept.")
     say(f"all {len(planned.cells)} cells done")
     return out / records.RESULTS
 

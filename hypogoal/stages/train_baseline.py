@@ -52,8 +52,8 @@ def train_baseline(
         raise UserError(what, f"bonus={config.bonus:g}", "Give --ensemble too, or leave bonus out.")
     taught = open_artefact(ensemble, "ensemble").whole() if ensemble else None
     if taught and taught.config["domain"] != domain:
-        what = f"this ensemble is of {taught.config['domain']!r}, not of {domain!r}"
-        raise UserError(what, taught.path, "Name the domain it is of.")
+        what = f"this ensemble is for {taught.config['domain']!r}, not for {domain!r}"
+        raise UserError(what, taught.path, "Name its domain.")
     inputs = [path for path in (data, ensemble) if path]
     out = claim(out, kind="baseline", inputs=inputs, force=force, resume=resume)
     played = load_domain(domain, given=True)
@@ -62,7 +62,7 @@ def train_baseline(
         dataset = open_dataset(data)
         if dataset.domain != domain:
             what = f"these are states of {dataset.domain!r}, not of {domain!r}"
-            raise UserError(what, data, "Name the domain they are of.")
+            raise UserError(what, data, "Name their domain.")
         lived = played.world(dataset.config)
     world = played_world(played, lived, config.world)
     chosen = HYPERPARAMETERS[config.agent, config.setting]

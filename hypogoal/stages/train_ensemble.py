@@ -62,7 +62,7 @@ def train_ensemble(
     load_network(config.network)
     sub_goals = config.sub_goals or dataset.sub_goals
     if len({*sub_goals}) < len(sub_goals):
-        raise UserError("a sub-goal twice", ", ".join(sub_goals), "Name each once.")
+        raise UserError("a sub-goal is named twice", ", ".join(sub_goals), "Name each once.")
     for sub_goal in sub_goals:
         if sub_goal not in dataset.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")

@@ -1,6 +1,6 @@
-"""What domains, diversity objectives and networks must keep to, as tests that users run on theirs (Spec B6, C1).
+"""The contracts of domains, diversity objectives and networks, as tests that users run on their own (Spec B6, C1).
 
-``hypogoal check`` prints them, a line each. In a test-suite of one's own: ``require(check_domain(DOMAIN))``.
+``hypogoal check`` prints a line for each. In your own test suite: ``require(check_domain(DOMAIN))``.
 """
 
 from hypogoal.testing.domains import check_domain

@@ -24,8 +24,8 @@ GYMNASIUM_SAYS_NOT = ("is different from the unwrapped version",)  # of its chec
 def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, seed: int = 0) -> Iterator[Verdict]:
     """Whether a domain keeps to what the stages rely on.
 
-    A few states are collected twice, with ``config``, an instance of its ``config_class``, or the defaults where None;
-    a layout is played at random. ``seed`` is of both.
+    Collects a few states twice, with ``config``, an instance of its ``config_class`` (None: the defaults), and plays a
+    layout at random. ``seed`` is for both.
     """
     return run(_Contract(domain, config, layout_seed, seed).tests())
 
@@ -60,7 +60,7 @@ class _Contract:
         known = {"collect": self.domain.config_class, **CONFIGS}
         for stage, values in self.domain.defaults.items():
             do = meant(str(stage), known) or f"The stages are {', '.join(known)}."
-            promise(stage in known, f"defaults are of {stage!r}, which is no stage", do)
+            promise(stage in known, f"defaults are for {stage!r}, which is not a stage", do)
             kept = isinstance(values, Mapping)
             promise(kept, f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
             from_values(known[stage], values, stage)
@@ -89,10 +89,10 @@ class _Contract:
         promise(engine.count == COUNT, f"count is {engine.count} of {COUNT} environments", "Make as many as asked for.")
         promise(engine.n_actions >= 1, f"n_actions is {engine.n_actions}", "Say how many actions there are.")
         shape = tuple(engine.observation_shape)
-        text = f"observation_shape is {shape} of the engine, {tuple(self.domain.observation_shape)} of the domain"
+        text = f"observation_shape is {shape} in the engine, {tuple(self.domain.observation_shape)} in the domain"
         promise(shape == tuple(self.domain.observation_shape), text, "Make them agree.")
         dtype = engine.observation_dtype
-        text = f"observations are {dtype} of the engine, {self.domain.observation_dtype} of the domain"
+        text = f"observations are {dtype} in the engine, {self.domain.observation_dtype} in the domain"
         promise(dtype == self.domain.observation_dtype and dtype in (PICTURE, NUMBERS), text, "Give uint8 or float32.")
         given = f"observation_shape is {shape}"
         promise(len(shape) == 3 or dtype == NUMBERS, given, "Pictures are (height, width, channels).")
@@ -190,7 +190,7 @@ class _Contract:
     def collection(self) -> str:
         self.collected = self.collect()
         goals = len(self.domain.sub_goals)
-        text = f"sub_goals are {self.collected.sub_goals} of the states"
+        text = f"the states' sub_goals are {self.collected.sub_goals}"
         same = tuple(self.collected.sub_goals) == tuple(self.domain.sub_goals)
         promise(same, text, "Give those of the domain, in their order.")
         for name, states in _sets(self.collected):
@@ -228,7 +228,7 @@ class _Contract:
         states, known = self.collected.heldout, (self.collected.labelled, self.collected.unlabelled)
         double = len(states.labels) - len(leave_out(states, *(of.observations for of in known)).labels)
         if not double:
-            return "held-out states are others than those for learning"
+            return "held-out states differ from those for learning"
         text = f"{double} of {len(states.observations)} held-out states look like one of those for learning: "
         warnings.warn(f"{text}scores on them say less about other contexts", stacklevel=2)
         return "some are known"
@@ -249,7 +249,7 @@ class _Contract:
             yield rng.integers(engine.n_actions, size=COUNT)
 
 
-DETERMINISM = "What is random must come from the seed alone: for a Gymnasium environment from self.np_random."
+DETERMINISM = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."
 
 
 def _sets(collected: Collected) -> list[tuple[str, States]]:

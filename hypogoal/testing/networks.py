@@ -23,7 +23,7 @@ CLOSE = 1e-4
 def check_network(
     name: str, observation_shape: tuple[int, ...] = (64, 64, 3), observation_dtype: np.dtype[Any] = PICTURE
 ) -> Iterator[Verdict]:
-    """Whether a member network, a name as of ``--set network``, can be trained, stored, predicted with, explained."""
+    """Whether a member network, named as for ``--set network``, can be trained, stored, used to predict, explained."""
     view = FullView(observation_shape, standard_of(observation_shape) if observation_dtype == NUMBERS else None)
     return run(_Network(name, view).tests())
 
@@ -73,7 +73,7 @@ class _Network:
         stacked = 1 / (1 + np.exp(-StackedMembers([ensemble]).log_odds(images[:40])))
         for other, way in ((few, "one by one"), (stacked, "all members at once")):
             worst = float(np.abs(many[:40] - other).max())
-            text = f"probabilities asked {way} differ by {worst:.2g}"
+            text = f"probabilities computed {way} differ by {worst:.2g}"
             promise(worst < CLOSE, text, "Use layers that act on each image.")
         return "one by one, in batches, all members at once"
 
@@ -89,5 +89,5 @@ class _Network:
         ensemble = self.ensemble().eval()
         again = Ensemble.from_state(self.name, self.shape, 2, ensemble.state(), self.view)
         same = np.array_equal(ensemble.predict(self.images(5)), again.predict(self.images(5)))
-        promise(same, "a stored network says something else", "Keep all state in parameters and buffers.")
+        promise(same, "a stored network gives other answers", "Keep all state in parameters and buffers.")
         return "the same after safetensors"

@@ -22,9 +22,9 @@ class Verdict:
     """One check.
 
     Attributes:
-        name: what was looked at.
+        name: what was checked.
         ok: whether the promise is kept.
-        text: what was found; of one that is not kept also what to do.
+        text: what was found; where the promise is not kept, also what to do.
         warnings: what is allowed and may still surprise.
     """
 
@@ -59,7 +59,7 @@ def run(tests: Iterable[Test]) -> Iterator[Verdict]:
 
 
 def require(verdicts: Iterable[Verdict]) -> None:
-    """For a test-suite: pass where all promises are kept, else an ``AssertionError`` that says which is not."""
+    """For a test suite: passes if all promises are kept, else raises an ``AssertionError`` that says which is not."""
     for verdict in verdicts:
         if not verdict.ok:
             raise AssertionError("\n".join(verdict.lines))

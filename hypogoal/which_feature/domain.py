@@ -39,12 +39,12 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class RoomsConfig:
-    """What ``hypogoal collect which-feature`` can be told."""
+    """Settings of ``hypogoal collect which-feature``."""
 
     factors: tuple[str, ...] = setting(("shape", "place"), "planted features: equal in labelled states", choices=KNOWN)
     truth: str = setting("shape", "the feature that rooms are rewarded for", choices=KNOWN)
-    rooms: int = setting(5, "rooms to choose among, one of which is right", low=2, high=32)
-    mix: float = setting(1.0, "share of unlabelled states whose features are crossed", low=0.0, high=1.0)
+    rooms: int = setting(5, "rooms to choose among; one is right", low=2, high=32)
+    mix: float = setting(1.0, "share of unlabelled states with crossed features", low=0.0, high=1.0)
     labelled: int = setting(256, "labelled states", low=4, high=100_000)
     unlabelled: int = setting(2048, "unlabelled states", low=1, high=100_000)
 

@@ -39,11 +39,11 @@ AGAIN = "Remove it and give the same command again, or choose another --out."
 class WhichFeatureConfig(EnsembleConfig):
     """What is run; settings of ensembles are those of training, but for ``diversity``, which names all entries."""
 
-    mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states whose factors are crossed", low=0.0, high=1.0)
+    mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states with crossed factors", low=0.0, high=1.0)
     seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
     factors: tuple[str, ...] = setting(FACTORS, f"planted features, of {', '.join(KNOWN)}", choices=KNOWN)
-    high: float = setting(0.95, "ranking of a factor from which on a member owns it", low=0.5, high=1.0)
-    low: float = setting(0.6, "its ranking of every other factor is at most this", low=0.0, high=1.0)
+    high: float = setting(0.95, "a member owns a factor that it ranks at least this well", low=0.5, high=1.0)
+    low: float = setting(0.6, "if it ranks every other factor at most this well", low=0.0, high=1.0)
 
 
 def resolved(options: Mapping[str, Any], assignments: Iterable[str] = ()) -> WhichFeatureConfig:

@@ -290,7 +290,7 @@ def test_a_current_folder_that_was_deleted(tmp_path: Path, line: str) -> None:
     words = f"cd {tmp_path}/gone && rmdir {tmp_path}/gone && {' '.join(COMMAND)} {line}"
     done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "hypogoal: the current folder is not there any more. Change to another one.\n"
+    assert done.stderr == "hypogoal: the current folder no longer exists. Change to another one.\n"
 
 
 def test_a_table_as_text_is_shown_nowhere_else(

@@ -36,7 +36,7 @@ def stage(out: Path) -> None:
 
 def test_a_process_that_the_system_kills_is_one_line(tmp_path: Path) -> None:
     """Spec G1, G2: what happened and what to do, and that the checkpoint is kept."""
-    with pytest.raises(Killed, match=r"want of memory.*workers=1") as caught:
+    with pytest.raises(Killed, match=r"lack of memory.*workers=1") as caught:
         stage(tmp_path / "ensemble")
     assert "the last checkpoint is kept" in with_notes(str(caught.value), caught.value)
 

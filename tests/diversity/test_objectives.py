@@ -346,7 +346,7 @@ def test_a_function_of_one_argument_is_of_the_whole_ensemble(monkeypatch: pytest
     loss = load_objective("of_ensembles:spread").losses(context)
     assert loss.tolist() == [pytest.approx(-context.unlabelled.std(0).mean().item())]
     assert len(load_objective("of_ensembles:pull").losses(context)) == 3  # pairs
-    with pytest.raises(UserError, match=r"no diversity objective: of_ensembles:nothing\. Give a pair_loss\(logits_a"):
+    with pytest.raises(UserError, match=r"a diversity objective: of_ensembles:nothing\. Give a pair_loss\(logits_a"):
         load_objective("of_ensembles:nothing")
     with pytest.raises(UserError, match=r"of_ensembles:lies gave int for logits \(3, 7, 2\)"):
         load_objective("of_ensembles:lies").losses(context)

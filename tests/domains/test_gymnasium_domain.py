@@ -151,9 +151,9 @@ def test_a_policy_collects() -> None:
     ("name", "message"),
     [
         ("WORDY", "observations must be images, uint8 .* or numbers"),
-        ("MIXED", "observations mix pictures with others: image, cell. Wrap it in .*FilterObservation"),
+        ("MIXED", "observations mix pictures with other values: image, cell. Wrap it in .*FilterObservation"),
         ("STEERED", "actions must be Discrete"),
-        ("LYING", "another observation than its space says"),
+        ("LYING", "an observation that does not fit its space"),
         ("NEVER", "on-the-moon has no positives"),
         ("ALWAYS", "somewhere has no negatives"),
     ],
@@ -230,7 +230,7 @@ def test_an_environment_that_does_not_repeat_itself_is_not_gone_on_with() -> Non
     engine, other = (corridor_env.RESTLESS.make_engine(0, 4, 30) for _ in range(2))
     for _ in range(7):
         engine.step(np.zeros(4, np.int64))
-    with pytest.raises(UserError, match="does not do the same again"):
+    with pytest.raises(UserError, match="does not repeat itself"):
         other.restore(engine.snapshot())
 
 

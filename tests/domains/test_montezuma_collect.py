@@ -287,7 +287,7 @@ def test_what_cannot_be_collected(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError, match="out of range"):
         from_values(MontezumaConfig, {"unlabelled_rooms": "9,24"}, "collect")
     monkeypatch.setattr(montezuma_states, "MOST_STEPS", 1)
-    with pytest.raises(UserError, match="room 16 shows no 50 different states"):
+    with pytest.raises(UserError, match="room 16 does not show 50 different states"):
         gather(16, 50, SEED, ("test",), play="expert", held_out=False, runs_on=False)
 
 

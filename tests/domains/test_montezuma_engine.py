@@ -129,7 +129,7 @@ def test_start_states_that_cannot_be(emulator: Emulator, monkeypatch: pytest.Mon
         with pytest.raises(UserError, match=f"start_states={count}, along={along}"):
             make_starts(emulator, BY_NAME["1L"], count, seed=0, along=along)
     monkeypatch.setattr(montezuma_env, "PHASES", range(2, 5))
-    with pytest.raises(UserError, match=r"only 3 of 4 start states live through the descent: 1L\. Ask for fewer"):
+    with pytest.raises(UserError, match=r"only 3 of 4 start states survive the descent: 1L\. Ask for fewer"):
         make_starts(emulator, BY_NAME["1L"], 4, seed=0)
     assert emulator.screens
 

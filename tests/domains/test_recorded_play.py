@@ -136,7 +136,7 @@ def test_policies_share_the_steps(tmp_path: Path) -> None:
     counts["climb"] = 0
     collected(written(tmp_path, way()), domain=alone, explore=0.0)
     assert 2 * 30 + 15 < counts["climb"] < 2 * 30 + 2 * 15, "from the recorded way it has half, less what is recorded"
-    with pytest.raises(UserError, match=r"policies are by sub-goal: half-way, moon\. These are half-way, top\."):
+    with pytest.raises(UserError, match=r"policies are given by sub-goal: half-way, moon\. These are half-way, top\."):
         GymnasiumDomain(Stairs, SUB_GOALS, policy={"half-way": climb, "moon": stay})
 
 
@@ -158,8 +158,8 @@ BAD = [
     (way([0, -1]), "recorded play needs a layout seed and actions"),
     (way([0, True]), "recorded play needs a layout seed and actions"),
     (way([0, 1.5]), "recorded play needs a layout seed and actions"),
-    ([way(), way(UP, 7)], r"episode 1\. The seed must be of labelled_seeds, unlabelled_seeds or heldout_seeds"),
-    (way([0, 3]), r"actions up to 3: .*play\.json, episode 0\. .* actions 0 to 2\."),
+    ([way(), way(UP, 7)], r"episode 1\. The seed must be in labelled_seeds, unlabelled_seeds or heldout_seeds"),
+    (way([0, 3]), r"actions up to 3: .*play\.json, episode 0\. .* actions in 0 to 2\."),
     ([way(), way([*UP, 2])], r"the episode ends after 12 of 13 actions: .*episode 1\. Leave out the others"),
 ]
 
@@ -229,7 +229,9 @@ def test_the_command_plays_files_and_the_data_name_them(
     assert main(command) == 0
     said = capsys.readouterr().err
     assert "top has 1 positives among" in said and "(--play FILE)" in said
-    assert "play took up to 6 steps, each at its soonest: --set option_timeout=12" in said
+    assert (
+        "play took up to 6 steps from one sub-goal to the next, each at its earliest: --set option_timeout=12" in said
+    )
     data = open_dataset(out)
     assert data.config["play"] == [one, str(two)]
     digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in (one, two)]

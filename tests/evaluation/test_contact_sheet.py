@@ -92,7 +92,7 @@ def test_sheets_of_a_file(tmp_path: Path) -> None:
 
 def test_what_has_no_sheets(tmp_path: Path) -> None:
     """Spec G2: one line for what is not a data file, and for a folder that cannot be written to."""
-    with pytest.raises(UserError, match="contact sheets are of data files"):
+    with pytest.raises(UserError, match="contact sheets need a data file"):
         write_contact_sheets(tmp_path, tmp_path / "sheets")
     path = written(tmp_path / "data.h5", ("one",))
     with pytest.raises(UserError, match="the picture cannot be written"):

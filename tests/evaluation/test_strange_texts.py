@@ -348,7 +348,7 @@ def test_names_that_are_none_are_refused(changed, run, name, command, tmp_path, 
     more = {"report": [], "report --figures": ["--figures", out], "compare": [str(run), "--out", out]}[command]
     assert main([command.split()[0], str(changed), *more]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "has a name that is none" in line
+    assert "has an invalid name" in line
 
 
 @pytest.mark.parametrize("part", ["ensembles", "explorer"])

@@ -159,7 +159,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path, capsys: pytest.Cap
         assert main(words) == 2 and "pictures" in capsys.readouterr().err
     for words in (["vector_goals:DOMAIN"], [data]):
         assert main(["label", *words, "--out", str(tmp_path / "marked")]) == 2
-        assert "observations must be images to be looked at" in capsys.readouterr().err
+        assert "only observations that are images can be shown" in capsys.readouterr().err
     for setting in ("network=paper", "meta_network=paper"):
         assert main(["train-meta", ensemble, "--out", str(tmp_path / "m"), "-q", *settings(setting)]) == 2
         assert f"see pictures only: {setting}" in capsys.readouterr().err

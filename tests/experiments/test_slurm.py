@@ -114,7 +114,7 @@ def test_scripts_are_plain_and_say_what_was_asked(tmp_path: Path, monkeypatch: p
     percent = submit(plan, tmp_path / "50%A", plan.cells[:1], Options())
     text = (tmp_path / "50%A" / "slurm" / f"{percent[0]['name']}.sh").read_text()
     assert "/50%%A/slurm/%x-%A-%a.out\n" in text or "/50%%A/slurm'/%x-%A-%a.out\n" in text
-    with pytest.raises(UserError, match="cannot stand in a batch script"):
+    with pytest.raises(UserError, match="a batch script cannot hold a path"):
         sweeping.submit(plan, tmp_path / "a\\b", Options(), quiet=True)
     assert not list(tmp_path.glob("*\\*"))
     lines = (tmp_path / "asked").read_text().splitlines()

@@ -118,7 +118,7 @@ def test_another_sweep_is_refused(swept: Path, tmp_path: Path, capsys: pytest.Ca
     other.write_text((swept / "toy.toml").read_text().replace("steps=6", "steps=7"))
     for arguments, words in (
         (["sweep", str(other), "--out", out], "ensemble-seed-0 of the sweep here was begun with 'steps=6'"),
-        (["sweep", str(swept / "toy.toml"), "--out", out, "--seeds", "1-2"], "this one has not: ensemble-seed-0"),
+        (["sweep", str(swept / "toy.toml"), "--out", out, "--seeds", "1-2"], "this one lacks: ensemble-seed-0"),
         (["sweep", "figure6", "--out", out], "data of the sweep here was begun with"),
         (["sweep", "figure7", "--out", out], "unknown experiment"),
         (["sweep", "--out", out], "which experiment?"),

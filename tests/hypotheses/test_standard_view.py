@@ -81,7 +81,7 @@ def test_attributions_to_numbers_are_complete(shape: tuple[int, ...]) -> None:
 def test_what_needs_pictures_is_refused(settings: dict[str, Any]) -> None:
     """Spec G2."""
     [name] = settings
-    with pytest.raises(UserError, match=f"these observations are no pictures: {name}=.* Set {name}="):
+    with pytest.raises(UserError, match=f"these observations are not pictures: {name}=.* Set {name}="):
         trained(**settings)
 
 

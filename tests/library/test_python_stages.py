@@ -101,11 +101,11 @@ def test_what_would_end_a_command_is_an_error(run: Path, tmp_path: Path) -> None
         hypogoal.train_ensemble(data, out=run / "ensemble", **FEW)
     with pytest.raises(UserError, match="unknown domain"):
         hypogoal.train_options(run / "ensemble", out=out, **PLAY)  # whose domain was another program's
-    with pytest.raises(UserError, match="two different runs"):
+    with pytest.raises(UserError, match="two or more different runs"):
         hypogoal.compare(run, run, out=out)
     called = own_domain.CorridorDomain()
     called.name = "doorkey"
-    with pytest.raises(UserError, match=r"called like one of hypogoal's: doorkey\. Give it another name"):
+    with pytest.raises(UserError, match=r"has the name of one of hypogoal's: doorkey\. Give it another name"):
         hypogoal.collect(called, out=out)
 
 
@@ -159,7 +159,7 @@ def test_attributions_of_members() -> None:
     for none in ((some[:0], others), (some, others[:0])):
         with pytest.raises(UserError, match="attributions need states"):
             ensemble.attributions(*none)
-    with pytest.raises(UserError, match="not observations that the ensemble knows"):
+    with pytest.raises(UserError, match="observations do not fit the ensemble"):
         ensemble.attributions(some[..., :2], others)
 
 

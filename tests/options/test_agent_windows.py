@@ -147,5 +147,5 @@ def test_options_of_half_pictures(tmp_path: Path) -> None:
         assert 0 <= act(engine.images(ids)[0]) < 18
         with pytest.raises(UserError, match="trained with policy_pixels=half, not all"):
             train(ensemble, tmp_path / "other", tmp_path / view, policy_view=view)
-    with pytest.raises(UserError, match="only the light network sees half the pixels"):
+    with pytest.raises(UserError, match="only the light network can see half the pixels"):
         train(ensemble, tmp_path / "other", policy_pixels="half", network="paper", n_step=1)

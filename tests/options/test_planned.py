@@ -58,5 +58,5 @@ def test_it_goes_where_its_member_says_yes() -> None:
 def test_nobody_plans_where_nobody_knows() -> None:
     """One line of what, where and what to do."""
     engine = Corridor(2)
-    with pytest.raises(UserError, match="this domain does not know what follows on each action"):
+    with pytest.raises(UserError, match="this domain does not know what each action leads to"):
         planned(engine, oracle_terminations(engine, (0,)))  # type: ignore[arg-type]

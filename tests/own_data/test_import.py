@@ -138,7 +138,7 @@ def test_a_share_is_held_out_of_many_small_groups_too() -> None:
     assert len(left) == 64
     rare = np.arange(30) == 7
     assert not held_out(rare[:, None], 0.9, seed=0)[7]
-    with pytest.raises(UserError, match=r"of 64 labelled states none can be held out: heldout=0\.2"):
+    with pytest.raises(UserError, match=r"none of 64 labelled states can be held out: heldout=0\.2"):
         held_out(labels[:64], 0.2, seed=0)
 
 
@@ -182,18 +182,18 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"held_out_labels": np.zeros(3)}, "unknown array 'held_out_labels': .* Did you mean 'heldout_labels'"),
     ({"rewards": np.zeros(3)}, "unknown array 'rewards': .* Known are observations, labels, unlabelled"),
     ({"heldout_labels": None}, "held-out states need observations and labels"),
-    ({"observations": pictures(40)[0] / 255}, "of another shape or type than the labelled ones: uint8"),
+    ({"observations": pictures(40)[0] / 255}, "differ in shape or type from the labelled ones: uint8"),
     ({"observations": np.full((40, 9), np.nan)}, "have numbers that are not finite"),
-    ({"features": np.array(["a"])}, "not as many names of features as numbers: 1 for uint8"),
+    ({"features": np.array(["a"])}, "number of feature names is wrong: 1 for uint8"),
     ({"observations": pictures(40)[0].astype(int) * 9}, "do not fit bytes"),
     ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"channels first.*transpose\(0, 2, 3, 1\)"),
     ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"channels first: uint8 \(60, 12, 48, 48\)"),
-    ({"observations": np.zeros((40, 0), np.uint8)}, "are no observations"),
-    ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "another shape or type than the labelled ones"),
+    ({"observations": np.zeros((40, 0), np.uint8)}, "are not observations"),
+    ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "differ in shape or type from the labelled ones"),
     ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
     ({"labels": np.arange(39) % 2}, "do not fit 40 states"),
     ({"labels": np.zeros(0)}, "do not fit 40 states"),
-    ({"sub_goals": np.array([b"won"])}, r"sub_goals are no texts but \|S3"),
+    ({"sub_goals": np.array([b"won"])}, r"sub_goals are \|S3, not texts"),
     ({"sub_goals": np.array(["a:b"])}, "a sub-goal's name must be usable as a file name: 'a:b'"),
     ({"labels": np.arange(40) % 3}, r"are not only 0 and 1: \[2\]"),
     ({"labels": np.full(40, np.nan)}, "are not only 0 and 1"),
@@ -257,14 +257,14 @@ def test_zip_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> Non
     path = tmp_path / "own.npz"
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
         packed(path, method)
-        with pytest.raises(UserError, match=r"packed as numpy does not pack them: .*own\.npz"):
+        with pytest.raises(UserError, match=r"not packed as numpy packs them: .*own\.npz"):
             read_arrays(path)
     for offset, value in ((8, 1), (10, 99)):  # flags, method
         data = packed(path)
         everywhere(data, b"PK\x01\x02", offset, value)
         everywhere(data, b"PK\x03\x04", offset - 2, value)
         path.write_bytes(data)
-        with pytest.raises(UserError, match="packed as numpy does not"):
+        with pytest.raises(UserError, match="not packed as numpy packs"):
             read_arrays(path)
     data = packed(path, zipfile.ZIP_STORED)
     np.save(tmp_path / "one.npy", arrays()["labels"])
@@ -385,7 +385,7 @@ def test_what_is_no_picture_of_a_state_is_not_even_decoded(
     frames = [Image.new("L", (SIDE, SIDE), value) for value in (0, 90, 180)]
     for suffix in (".gif", ".png", ".webp"):
         frames[0].save(tmp_path / f"several{suffix}", save_all=True, append_images=frames[1:])
-        with pytest.raises(UserError, match=rf"several pictures are in one file: .*several\{suffix}"):
+        with pytest.raises(UserError, match=rf"one file holds several pictures: .*several\{suffix}"):
             read_image(tmp_path / f"several{suffix}")
     assert not list(recwarn)
     file.unlink()
@@ -454,7 +454,7 @@ def test_what_is_wrong_with_minari_is_one_line(tmp_path: Path, capsys: pytest.Ca
         (save_minari(tmp_path / "d", stored="arrow"), label, "'arrow' is not read"),
         (save_minari(tmp_path / "e", 2), label, "2 episodes cannot be"),
         (save_minari(tmp_path / "f"), [*label, "--key", "x"], "no readable 'episode_0/observations/x'"),
-        (save_images(tmp_path / "g"), label, "no Minari dataset"),
+        (save_images(tmp_path / "g"), label, "not a Minari dataset"),
         (
             save_minari(tmp_path / "h"),
             ["--label", "right=test_import:fails"],

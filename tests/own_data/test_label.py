@@ -71,7 +71,7 @@ def test_what_is_played_is_recorded(tmp_path: Path, capsys: pytest.CaptureFixtur
     for source, do in (("doorkey", "--resume"), (str(out / "negative"), "--heldout")):
         other = record if do == "--resume" else tmp_path / "other.json"
         assert main(["label", source, "--out", str(out), do, "--record", str(other)]) == 2
-        assert "what you play is recorded in a new file" in capsys.readouterr().err
+        assert "--record needs a new file" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir() if path.suffix] == ["play.json"]
 
 
@@ -186,7 +186,7 @@ def test_every_key_that_is_offered_plays_its_action() -> None:
     ("arguments", "message"),
     [
         (["nowhere.h5"], "neither a file nor an environment: nowhere.h5"),
-        (["CartPole-v1"], "observations must be images"),
+        (["CartPole-v1"], "only observations that are images"),
         (["no_such:thing"], "the environment cannot be loaded"),
         (["doorkey", "--arg", "layout"], "--arg needs KEY=VALUE: layout"),
         (["doorkey", "--arg", "colour=3"], "the environment cannot be made"),

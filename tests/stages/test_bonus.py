@@ -119,7 +119,7 @@ def test_a_bonus_and_an_ensemble_belong_together(corridor: Path, capsys: pytest.
     cases = (
         ([NAME, "--set", "bonus=.1"], "a bonus is paid where an ensemble's members say yes: bonus=0.1."),
         ([NAME, *ensemble], "an ensemble without a bonus changes nothing"),
-        (["doorkey", *ensemble, "--set", "bonus=.1"], "this ensemble is of 'own_domain:DOMAIN', not of 'doorkey'"),
+        (["doorkey", *ensemble, "--set", "bonus=.1"], "this ensemble is for 'own_domain:DOMAIN', not for 'doorkey'"),
     )
     for words, told in cases:
         assert main(["train-baseline", *words, "--out", out]) == 2

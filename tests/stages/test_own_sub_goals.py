@@ -66,7 +66,7 @@ def test_true_sub_goals_that_the_domain_does_not_have_are_refused(
     for stage in ("train-options", "train-meta"):
         assert main([stage, str(run / "ensemble"), *out]) == 2
         err = capsys.readouterr().err
-        assert "doorkey does not know where this is true: at-the-door" in err and err.count("\n") == 1
+        assert "doorkey does not know where this sub-goal holds: at-the-door" in err and err.count("\n") == 1
         assert not (run / "oracle").exists()
 
 

@@ -161,7 +161,7 @@ def test_each_broken_promise_is_named(domain: CorridorDomain, name: str, message
 
 DEFAULTS: list[tuple[dict[str, Any], str]] = [
     ({"train-ensemble": {"memberz": 4}}, "train-ensemble has no setting: memberz. Did you mean 'members'?"),
-    ({"train_ensemble": {"members": 4}}, "defaults are of 'train_ensemble', which is no stage. Did you mean"),
+    ({"train_ensemble": {"members": 4}}, "defaults are for 'train_ensemble', which is not a stage. Did you mean"),
     ({"train-meta": {"steps": 0}}, "value out of range: steps=0 in train-meta"),
     ({"collect": {"copiez": 2}}, "collect has no setting: copiez"),
     ({"train-options": 7}, "defaults of train-options are 7"),

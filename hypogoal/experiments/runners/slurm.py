@@ -125,9 +125,7 @@ def check(run: Path, options: Options) -> None:
             raise UserError("not an option of sbatch", repr(text), "See 'man sbatch'.")
     place = str(run.resolve())
     if "\\" in place or not place.isprintable():  # upon a backslash Slurm takes %A and %a literally
-        raise UserError(
-            "a path with such characters cannot stand in a batch script", repr(place), "Choose another --out."
-        )
+        raise UserError("a batch script cannot hold a path with such characters", repr(place), "Choose another --out.")
 
 
 def _head(run: Path, name: str, options: Options) -> list[str]:
@@ -191,7 +189,7 @@ def jobs_of(run: Path) -> list[str]:
     path = run / FOLDER / JOBS
     if not path.is_file():
         return []
-    do = "Look with squeue that no job of the sweep waits or runs, then remove this file."
+    do = "Check with squeue that no job of the sweep waits or runs, then remove this file."
     jobs = read_json(path, "the list of jobs is", do)
     try:
         numbers = [str(job["id"]) for job in jobs]

@@ -35,10 +35,10 @@ class DQNSettings:
     batch: int = setting(32, "transitions per update", source="Table 4", low=1)
     learning_rate: float = setting(2.5e-4, "Adam's step size", source="Table 4")
     target_interval: int = setting(10, "updates between two target updates", source="Table 4", low=1)
-    target_tau: float = setting(1.0, "share of the online network a target update takes", source="stable-baselines3")
+    target_tau: float = setting(1.0, "soft-update rate of the target network", source="stable-baselines3")
     epsilon_from: str = setting("start", "when epsilon begins to fall", choices=("start", "first-goal"))
     epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
-    epsilon_final: float = setting(0.01, "exploration in the end", source="Table 4")
+    epsilon_final: float = setting(0.01, "final epsilon", source="Table 4")
     warm_up: int = setting(1_000, "steps before the first update", unit="steps", source="ours")
     gamma: float = setting(0.95, "discount per step", source="ours: at 0.99 it does not learn a corridor")
 
@@ -69,7 +69,7 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 
 @dataclass(frozen=True)
 class BaselineConfig:
-    """Which agent, on which layout, for how long; the hyperparameters are those above."""
+    """Which agent, on which layout, for how long; 'setting' chooses the hyperparameters."""
 
     agent: str = setting("ppo", "the algorithm", source="paper, Figure 6", choices=("ppo", "dqn"))
     steps: int = setting(
@@ -88,7 +88,7 @@ class BaselineConfig:
     )
     world: tuple[str, ...] = setting(
         (),
-        "how the world differs from the data's, or from the default: settings of the domain as name=value",
+        "changes to the world of the data, or to the default world: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
     bonus: float = setting(
@@ -97,7 +97,7 @@ class BaselineConfig:
         source="ours: a flat agent with the same knowledge",
         low=0.0,
     )
-    random_episodes: int = setting(200, "episodes of random play that say how hard the layout is", source="ours", low=0)
+    random_episodes: int = setting(200, "episodes of random play: how hard the layout is", source="ours", low=0)
     # Last, because from here on the name means this field.
     setting: str = setting(
         "tuned",
