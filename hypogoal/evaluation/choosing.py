@@ -273,11 +273,11 @@ def sections(material: Material) -> list[Block]:
     if not agents:
         return []
     text = (
-        "The trained agent plays on, frozen, and so does chance with the agent's own final options. An option's "
-        "quality is the share of its executions that bring about the true sub-goal, begun where agents decide. Choice "
-        "is judged among the members of the sub-goal that was chosen: the rank correlation of preference with quality, "
-        "how often the better of two that differ by .2 is taken (chance .5), and how much of the way from the mean to "
-        "the best quality it goes (chance 0)."
+        "The trained agent plays on, frozen. Beside it uniform choice plays with the agent's own final options. An "
+        "option's quality is the share of its executions that reach the true sub-goal, begun where agents decide. "
+        "Choice is judged among the members of the sub-goal that was chosen: the rank correlation of preference with "
+        "quality, how often the better of two that differ by .2 is taken (chance .5), and how much of the way from the "
+        "mean to the best quality it goes (chance 0)."
     )
     table = page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED)
     return [page.section("choosing", TITLE, [text], [table])]

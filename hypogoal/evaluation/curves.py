@@ -358,9 +358,9 @@ def summary_section(material: Material) -> Block:
     """What was asked, what came out."""
     metrics = material.metrics
     asked = (
-        "Asked was: each sub-goal is known from one context. Each member of an ensemble of classifiers is a hypothesis "
-        "about it, and becomes an option. Does a policy that chooses among all options solve layouts that no data came "
-        "from, and does it choose the hypotheses that are true there?"
+        "The question: each sub-goal is known from one context. Each member of an ensemble is a hypothesis about it "
+        "and becomes an option. Does a policy over all these options solve layouts that no data came from, and does it "
+        "choose the hypotheses that are true there?"
     )
     headline = page.table(
         (AGENT, *HEADLINE),
@@ -390,7 +390,7 @@ def _answers(material: Material) -> list[str]:
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
             text += " Played on, frozen, it solves {}; uniform choice among its own options {}.".format(*solved)
         if len(agent["runs"]) < SEVERAL and len(shown) == 1:
-            text += " So few runs decide nothing: more seeds and layouts do."
+            text += " So few runs decide nothing: run more seeds and layouts."
         paragraphs.append(text)
     return paragraphs
 

@@ -102,7 +102,7 @@ def explorer_section(material: Material) -> Block:
     )
     sample = (
         f"{shown:,} of {states:,} states of a sub-goal, drawn so that every kind of outcome and every place comes up; "
-        "how often one does says nothing. The page's address holds the filters."
+        "how often one does means nothing. The page's address keeps the filters."
     )
     goals = [_goal(material, source, goal["sub_goal"]) for goal in found["sub_goals"]]
     places = list(dict.fromkeys(state["place"] for goal in goals for state in goal["states"] if state["place"]))

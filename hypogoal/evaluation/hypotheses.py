@@ -159,8 +159,7 @@ def hypotheses_section(material: Material) -> Block:
         )
     text = (
         f"{judged} The best member shows whether a hypothesis that holds there is in the ensemble at all; mean and "
-        "worst show what the agent has to choose among. Balanced accuracy is 0.5 for a member that always says the "
-        "same."
+        "worst show what the agent has to choose among. A member that always gives the same answer has 0.5."
     )
     whole = page.table(
         HYPOTHESES,

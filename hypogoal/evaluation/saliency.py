@@ -119,10 +119,10 @@ def saliency_section(material: Material) -> Block:
     method = states[0].get("method", "DeepLift") if states else "DeepLift"  # evaluations of earlier versions do not say
     text = (
         f"Attributions by {method} (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
-        f"{found['seed']}) on a few held-out states, against {found['baseline']}: what a state has in common with the "
-        "usual one gets none. Orange speaks for 'reached', blue against it, each picture on its own scale; the state "
+        f"{found['seed']}) on a few held-out states, against {found['baseline']}: what a state shares with that mean "
+        "gets no attribution. Orange speaks for 'reached', blue against it, each picture on its own scale; the state "
         "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
-        "that goes by what will not be there elsewhere cannot transfer."
+        "that goes by what other contexts lack cannot transfer."
     )
     if bars := [page.shown(material, drawn) for drawn in feature_figures(material)]:
         text = (

@@ -205,15 +205,14 @@ def choices_section(material: Material, agent: Entry) -> Block:
     run = agent["runs"][0]
     text = (
         "Preference is how often an option was chosen over how often a uniform choice among the options offered "
-        "would have chosen it: 1 for a chooser that does not care. Match is the balanced accuracy of the member's "
-        "classifier against the true sub-goal on the layout, not how good its option is. numbers.csv has the same of "
-        "every run, the random chooser's too, if one was run. What that choosing is worth is asked in "
-        f"'{choosing.TITLE}', of agents whose options can be asked anywhere."
+        "would have chosen it; uniform choice has 1. Match is the balanced accuracy of the member's classifier against "
+        "the true sub-goal on the layout, not how good its option is. numbers.csv has these numbers for every run, and "
+        f"for the random chooser if there is one. '{choosing.TITLE}' says what the choices gain."
     )
     stops = (
-        "All states of the layout in which a member says yes, where its option ends, are laid over each other: what "
-        "all of them share is sharp, what few of them show is dim. For each sub-goal the member that the agent prefers "
-        "most and the one that it prefers least."
+        "A picture lays over each other all states of the layout in which a member says yes, where its option ends: "
+        "what all of them share is sharp, what few of them show is dim. For each sub-goal it shows the member that the "
+        "agent prefers most and the one that it prefers least."
     )
     lines = []
     for goal in run["sub_goals"]:
@@ -244,8 +243,8 @@ def figures(material: Material) -> Iterator[Drawn]:
         title = name.replace("figure", "Figure ") if name in NUMBERED.values() else "As Figures 7 and 8"
         caption = (
             f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
-            f"prefers most and of the one it prefers least ({run['path']}, {where}); all states of the layout, as far "
-            "as they can be reached or met, in which the member says yes. Preference: chosen / expected under uniform "
+            f"prefers most and of the one it prefers least ({run['path']}, {where}): all states of the layout that are "
+            "known and in which the member says yes. Preference: chosen / expected under uniform "
             f"choice; match: balanced accuracy on that layout. {which(agent, selection) if agent else ''}"
         ).rstrip()
         drawn = termination_states([(f"{title}\n{note}", image) for title, note, image in sides])
