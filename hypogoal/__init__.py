@@ -9,7 +9,7 @@ import sys
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.13.0"
+__version__ = "0.14.0"
 
 if TYPE_CHECKING:
     from hypogoal.api import Made, OptionEnv, collect, compare, evaluate, load_ensemble, load_options

@@ -3,15 +3,12 @@
 Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`` is quick.
 """
 
-import _thread
-import contextlib
 import errno
 import functools
 import os
 import re
 import signal
 import sys
-import time
 from dataclasses import fields
 from typing import Annotated, Any
 
@@ -20,6 +17,7 @@ from typer import Option
 
 from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
+from hypogoal.core import stopping
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
 from hypogoal.settings import CONFIGS, TABLES
@@ -50,15 +48,15 @@ def _root(
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
     if arguments is None:
-        signal.signal(signal.SIGTERM, _stop)  # so that a cancelled job, too, leaves nothing half-written
-        sys.unraisablehook = _unraised
+        signal.signal(signal.SIGTERM, stopping.stop)  # so that a cancelled job, too, leaves nothing half-written
+        sys.unraisablehook = stopping.unraised
         open_streams()
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     try:
-        if arguments is None and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see __main__
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
+            signal.signal(signal.SIGINT, stopping.stop)
         os.getcwd()  # which may have been deleted
         return _called(given)
     except Unprinted as error:
@@ -66,7 +64,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _fail(f"the output is complete, but could not be printed ({error.strerror})", 1)
     except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
         if arguments is None:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # all is put in order: who is in a hurry need not wait
+            for number in stopping.SIGNALS:  # all is put in order: who is in a hurry need not wait
+                signal.signal(number, signal.SIG_DFL)
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
         return _fail("; ".join(["stopped", *(notes_of(cause) or ["nothing was half-written"])]), 128 + number)
@@ -181,28 +180,6 @@ def with_notes(message: str, error: BaseException) -> str:
 def notes_of(error: BaseException) -> list[str]:
     """What those whom an error passed had to add, each once."""
     return list(dict.fromkeys(getattr(error, "__notes__", [])))
-
-
-def _stop(signum: int, _frame: object) -> None:
-    raise KeyboardInterrupt(signum)
-
-
-def _unraised(what: Any) -> None:
-    """A signal that came while an object was torn down, where Python drops it with a traceback, comes again."""
-    if not isinstance(what.exc_value, KeyboardInterrupt):
-        sys.__unraisablehook__(what)
-        return
-    signum = what.exc_value.args[0] if what.exc_value.args else signal.SIGINT
-    told = False
-    while not told:  # another signal may come meanwhile: neither may be lost
-        with contextlib.suppress(KeyboardInterrupt):
-            _thread.start_new_thread(_again, (signum,))
-            told = True
-
-
-def _again(signum: int) -> None:
-    time.sleep(0.01)
-    os.kill(os.getpid(), signum)
 
 
 def _fail(message: str, code: int) -> int:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_file
+from hypogoal.core.stopping import SIGNALS, stop
 
 if TYPE_CHECKING:
     import torch
@@ -37,7 +38,6 @@ PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between 
 FOLDER = "checkpoint"  # beside the folder that a stage fills
 JSON_PART, SUM_PART = "json-4", "crc32"  # the number rises with what stages keep
 ARRAY, TENSOR = "$array", "$tensor"
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def checkpoints_of(folder: Path, name: str = "stage") -> Checkpoints:
@@ -81,7 +81,7 @@ class Checkpoints:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and self._interrupted:
-            raise KeyboardInterrupt(number)
+            stop(number, frame)
         self._interrupted |= number == signal.SIGINT  # the first; a run sends SIGTERM on
         self._signal = self._signal or number
 

@@ -1,0 +1,42 @@
+"""What a signal that ends the process does: it raises ``KeyboardInterrupt`` wherever Python happens to be (Spec G1)."""
+
+import _thread
+import math
+import os
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
+TOGETHER = 0.5  # seconds within which signals are one: a second would disturb what the first lets be put in order
+
+_raised_at = -math.inf
+
+
+def stop(signum: int, _frame: FrameType | None) -> None:
+    """A signal's handler; what it raises has the signal's number as its argument."""
+    global _raised_at
+    now = time.monotonic()
+    if now - _raised_at > TOGETHER:
+        _raised_at = now
+        raise KeyboardInterrupt(signum)
+
+
+def unraised(what: Any) -> None:
+    """As ``sys.unraisablehook``: a signal that came while an object was torn down comes again.
+
+    Python would drop it with a traceback.
+    """
+    if isinstance(what.exc_value, KeyboardInterrupt):
+        _thread.start_new_thread(_again, what.exc_value.args or (signal.SIGINT,))
+    else:
+        sys.__unraisablehook__(what)
+
+
+def _again(signum: int) -> None:
+    global _raised_at
+    time.sleep(0.01)
+    _raised_at = -math.inf
+    os.kill(os.getpid(), signum)
