@@ -9,7 +9,8 @@ that anything was learned on. Kept and gone on with as in ``benchmarks.hypothese
 
 What limits success is told by controls: ``planned`` options go the shortest way to where members say yes, so what they
 lack is the members' fault; ``oracle`` options learn with the true sub-goals, so what they lack is learning's;
-``trained`` against ``new`` layouts is what the policies do not generalise; ``one-layout`` what variety is worth.
+``trained`` against ``new`` layouts is what the policies do not generalise; ``one-layout`` what variety is worth. More
+exploration, and convolutions over the cells, are what we tried where learning failed.
 """
 
 from __future__ import annotations
@@ -48,15 +49,22 @@ PLANNED = (1,)  # step: where there is nothing to learn
 LOOKS = (100_000, 300_000, 1_000_000, 3_000_000)  # environment steps, of all options together
 GOAL = 0.7  # zero-shot success within twice the shortest path
 ENSEMBLE_STEPS = 150
+EXPLORING = {"epsilon_steps": 1_000_000, "epsilon_final": 0.2}  # steps of an option's own: it hardly falls
+GRID = {**EXPLORING, "embedding": "grid"}
 # A title, settings of the ensemble and of its options.
 METHODS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "dbat": ("D-BAT's members", {}, {}),
     "none": ("members without diversity", {"diversity": "none"}, {}),
     "one-layout": ("D-BAT's, one layout", {}, {"layouts": "1000-1000"}),
     "oracle": ("true sub-goals", {}, {"termination": "oracle"}),
+    "exploring": ("true sub-goals, exploring", {}, {"termination": "oracle", **EXPLORING}),
+    "oracle-grid": ("true sub-goals, grid", {}, {"termination": "oracle", **GRID}),
+    "dbat-grid": ("D-BAT's, grid", {}, GRID),
+    "none-grid": ("no diversity, grid", {"diversity": "none"}, GRID),
     "planned": ("D-BAT's, planned", {}, {"network": "planned", "layouts": "1000-1000"}),
 }
-ENSEMBLES = {"one-layout": "dbat", "oracle": "dbat", "planned": "dbat"}  # of another method
+WITH_DBATS = ("one-layout", "oracle", "exploring", "oracle-grid", "dbat-grid", "planned")
+ENSEMBLES = {**dict.fromkeys(WITH_DBATS, "dbat"), "none-grid": "none"}  # of another method
 KEYS = ("method", "seed", "step", "layouts", "sub_goal", "member")
 COLUMNS = (*KEYS, *OF_OPTIONS, "steps_per_second", "states")
 WHERE = ("trained", "new")

@@ -20,8 +20,8 @@ class OptionConfig:
     )
     embedding: str = setting(
         "auto",
-        "how the light network reads observations: cells, convolutions or numbers, whichever suits them; or a member "
-        "network's layers, by name or as module:function",
+        "how the light network reads observations: cells, convolutions or numbers, whichever suits them; grid, cells "
+        "with convolutions over them, for many layouts; or a member network's layers, by name or as module:function",
         source="ours",
     )
     experience: str = setting(

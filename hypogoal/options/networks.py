@@ -17,6 +17,7 @@ from hypogoal.hypotheses.views import FullView
 from hypogoal.options.windows import AgentWindows, HalfPictures
 
 CELL = 8  # pixels
+GRID = "grid"  # the embedding of this name
 WIDTH = 128  # of dense layers
 SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 
@@ -54,6 +55,36 @@ class CellEmbedding(nn.Module):
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
         # index_select, not embedding: the same, and its gradient takes a sixth of the time.
         return table.index_select(0, codes.flatten().long()).view(len(codes), -1)
+
+
+class GridEmbedding(CellEmbedding):
+    """Cells, and ``LAYERS`` residual convolutions of 3 x 3 cells over what each is: the same rule in every place.
+
+    For options that meet many layouts. The dense layers alone have to learn anew in each place what a key beside the
+    agent is worth: docs/results/many-layouts.md.
+    """
+
+    CHANNELS, LAYERS = 16, 2
+
+    def __init__(self, observation_shape: tuple[int, ...]):
+        super().__init__(observation_shape, self.CHANNELS)
+        self._cells = (-(-observation_shape[0] // CELL), -(-observation_shape[1] // CELL), self.CHANNELS)
+        self.layers = nn.ModuleList(nn.Conv2d(self.CHANNELS, self.CHANNELS, 3, padding=1) for _ in range(self.LAYERS))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """As of :class:`CellEmbedding`."""
+        return self._around(super().forward(images))
+
+    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
+        """As of :class:`CellEmbedding`."""
+        return self._around(super().from_codes(codes, tiles))
+
+    def _around(self, features: Tensor) -> Tensor:
+        # Channels stay last in memory, where the look-up puts them: the layers' forward pass takes half the time.
+        grid = features.view(-1, *self._cells).permute(0, 3, 1, 2)
+        for layer in self.layers:
+            grid = grid + torch.relu(layer(grid))
+        return grid.permute(0, 2, 3, 1).flatten(1)
 
 
 class PictureEmbedding(nn.Module):
@@ -129,10 +160,15 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
 
     Where that is too small it is a ``UserError``.
     """
-    if name != AUTO:
+    if name not in (AUTO, GRID):
         return OwnEmbedding(name, observation_shape, standard)
-    if standard is not None:
+    if standard is not None and name == AUTO:
         return NumberEmbedding(observation_shape, standard)
+    if name == GRID:
+        if standard is not None or any(side % CELL for side in observation_shape[:2]):
+            what = f"only pictures that whole cells of {CELL} x {CELL} pixels fill have a grid"
+            raise UserError(what, f"embedding=grid, observations {observation_shape}", "Give --set embedding=auto.")
+        return GridEmbedding(observation_shape)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:

@@ -16,7 +16,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.options.exploration import actions_of
-from hypogoal.options.networks import LightQNetwork, PaperQNetwork, standard_in
+from hypogoal.options.networks import GRID, LightQNetwork, PaperQNetwork, standard_in
 from hypogoal.options.windows import SIDE, around_agent, halved, localiser_of
 
 # A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
@@ -71,7 +71,7 @@ class LightPolicies:
         shape = (shape[0] // 2, shape[1] // 2, *shape[2:]) if half else shape
         weights = below("online.", weights)
         make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape), embedding)
-        self.network = load_fitting(make, weights, "options.safetensors", own=embedding not in (AUTO, *NETWORKS))
+        self.network = load_fitting(make, weights, "options.safetensors", own=embedding not in (AUTO, GRID, *NETWORKS))
         self.actions = actions
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

@@ -114,3 +114,22 @@ def test_numbers_and_member_networks_by_name(monkeypatch: pytest.MonkeyPatch) ->
     network = LightQNetwork((24, 40, 3), 2, 7, embedding="tiles")
     assert network(torch.zeros(5, 24, 40, 3, dtype=torch.uint8)).shape == (5, 2, 7)
     assert network.cells.features == 64
+
+
+def test_the_grid_has_one_rule_for_all_places() -> None:
+    """Spec H6: what it makes of a cell depends on the cells within two of it, wherever they are."""
+    torch.manual_seed(0)
+    embedding, images = embedding_for((80, 88, 3), name="grid"), torch.zeros(3, 80, 88, 3, dtype=torch.uint8)
+    tile = torch.randint(256, (8, 8, 3), dtype=torch.uint8)
+    images[1, 32:40, 32:40], images[2, 40:48, 48:56] = tile, tile
+    plain, first, second = embedding(images).view(3, 10, 11, 16)
+    changed = (first - plain).abs().amax(2) > 0
+    assert changed[2:7, 2:7].sum() > 9 and changed.sum() == changed[2:7, 2:7].sum()
+    torch.testing.assert_close(first[2:7, 2:7], second[3:8, 4:9])
+
+
+@pytest.mark.parametrize(("shape", "standard"), [((84, 84, 3), None), ((16,), (np.zeros(16), np.ones(16)))])
+def test_what_is_no_grid_is_refused(shape: tuple[int, ...], standard: object) -> None:
+    """Spec G2."""
+    with pytest.raises(UserError, match=r"fill have a grid: embedding=grid, observations .* Give --set embedding=auto"):
+        embedding_for(shape, standard, "grid")
