@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     try:
-        if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
+        if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background
             signal.signal(signal.SIGINT, stopping.stop)
         os.getcwd()  # which may have been deleted
         return _called(given)

@@ -10,7 +10,7 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
-TOGETHER = 0.5  # seconds within which signals are one: a second would disturb what the first lets be put in order
+TOGETHER = 0.5  # seconds within which signals are one: a second would interrupt the cleaning up after the first
 
 _raised_at = -math.inf
 

@@ -58,7 +58,7 @@ class CellEmbedding(nn.Module):
 
 
 class GridEmbedding(CellEmbedding):
-    """Cells, and ``LAYERS`` residual convolutions of 3 x 3 cells over what each is: the same rule in every place.
+    """Whole cells, and ``LAYERS`` residual convolutions of 3 x 3 over what each is: the same rule in every place.
 
     For options that meet many layouts. The dense layers alone have to learn anew in each place what a key beside the
     agent is worth: docs/results/many-layouts.md.
@@ -68,7 +68,7 @@ class GridEmbedding(CellEmbedding):
 
     def __init__(self, observation_shape: tuple[int, ...]):
         super().__init__(observation_shape, self.CHANNELS)
-        self._cells = (-(-observation_shape[0] // CELL), -(-observation_shape[1] // CELL), self.CHANNELS)
+        self._cells = (observation_shape[0] // CELL, observation_shape[1] // CELL, self.CHANNELS)
         self.layers = nn.ModuleList(nn.Conv2d(self.CHANNELS, self.CHANNELS, 3, padding=1) for _ in range(self.LAYERS))
 
     def forward(self, images: Tensor) -> Tensor:
@@ -80,7 +80,7 @@ class GridEmbedding(CellEmbedding):
         return self._around(super().from_codes(codes, tiles))
 
     def _around(self, features: Tensor) -> Tensor:
-        # Channels stay last in memory, where the look-up puts them: the layers' forward pass takes half the time.
+        # Channels stay last in memory, where the look-up puts them: of 256 states a layer takes half the time.
         grid = features.view(-1, *self._cells).permute(0, 3, 1, 2)
         for layer in self.layers:
             grid = grid + torch.relu(layer(grid))
@@ -160,15 +160,15 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
 
     Where that is too small it is a ``UserError``.
     """
-    if name not in (AUTO, GRID):
-        return OwnEmbedding(name, observation_shape, standard)
-    if standard is not None and name == AUTO:
-        return NumberEmbedding(observation_shape, standard)
     if name == GRID:
         if standard is not None or any(side % CELL for side in observation_shape[:2]):
             what = f"only pictures that whole cells of {CELL} x {CELL} pixels fill have a grid"
             raise UserError(what, f"embedding=grid, observations {observation_shape}", "Give --set embedding=auto.")
         return GridEmbedding(observation_shape)
+    if name != AUTO:
+        return OwnEmbedding(name, observation_shape, standard)
+    if standard is not None:
+        return NumberEmbedding(observation_shape, standard)
     height, width, _depth = observation_shape
     whole = height % CELL == 0 and width % CELL == 0
     if not whole and min(height, width) < SMALLEST:
