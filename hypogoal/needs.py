@@ -21,7 +21,7 @@ BASE = 450e6
 MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal (the paper's for Montezuma)
 WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
-LIGHT_POLICIES = 1e6  # weights of all light policies, which share most of them; 0.4 MB of 15 options
+LIGHT_POLICIES = 1e6  # weights of all light policies, which share most of them; 0.4 MB of 15 options, 0.7 with a grid
 COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
 PER_TRANSITION = 50  # bytes in a replay, its sum tree included
 CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
@@ -83,7 +83,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
     picture = domain.observation_bytes
     paper = config.network == "paper"
     replays = options if paper else 1
-    own = MEMBER if config.embedding != "auto" else 0.0
+    own = 0.0 if config.embedding in ("auto", "grid") else MEMBER
     weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + own
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
@@ -133,3 +134,19 @@ def test_what_is_no_grid_is_refused(shape: tuple[int, ...], standard: object) ->
     """Spec G2."""
     with pytest.raises(UserError, match=r"fill have a grid: embedding=grid, observations .* Give --set embedding=auto"):
         embedding_for(shape, standard, "grid")
+
+
+def test_options_with_a_grid_play_out_of_their_weights() -> None:
+    """Spec D2, G2: the policies of an artefact prefer what the learner preferred."""
+    engine = DoorKeyEngine(3, 4)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        engine.step(rng.integers(7, size=4))
+    learner = LightLearner(engine, oracle_terminations(engine, (0, 1)), OptionConfig(embedding="grid"), 0)
+    policies = make_policies(
+        {**LIGHT, "embedding": "grid"}, learner.state(), {"observation_shape": engine.observation_shape}
+    )
+    ids = np.arange(engine.n_states)
+    for option in (0, 1):
+        greedy = learner.act(ids, np.full(len(ids), option), np.ones(len(ids)), explore=False)
+        assert greedy.tolist() == [policies(option)(image) for image in engine.images(ids)]
