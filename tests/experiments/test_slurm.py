@@ -239,7 +239,8 @@ def test_a_sweep_on_slurm_killed_timed_out_cancelled_and_resumed(slurm: dict[str
         return "\n".join([queue(), str(states()), *logs])
 
     start("1")
-    wait_for(lambda: states()["ensemble-seed-0"] == "running", story)
+    # A cell runs from when it holds its log; killed before it has written its record, it counts as never started.
+    wait_for(lambda: attempts("ensemble-seed-0") == 1 and states()["ensemble-seed-0"] == "running", story)
     os.kill(element(out, "ensemble-seed-0"), signal.SIGKILL)
 
     wait_for(lambda: states()["long"] == "running", story)
