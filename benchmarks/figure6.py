@@ -37,6 +37,7 @@ METHODS = {
     "dqn-tuned": "DQN",
     "ppo-paper": "PPO, the paper's setting",
     "dqn-paper": "DQN, the paper's setting",
+    "literal": "D-BAT, the paper's networks, 150,000 steps",
 }
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
 POINTS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1000, 1250, 1500)  # thousands of steps: of a curve
@@ -83,6 +84,8 @@ def method_of(config: Mapping[str, Any], place: str) -> str:
     """Which of ``METHODS`` an agent is, by its settings and the name of its folder."""
     if config.get("termination") == "oracle":
         return "oracle"
+    if config.get("network") == "paper":
+        return "literal"
     return "ppo-bonus" if config.get("bonus") else next(name for name in METHODS if f"-{name}-" in f"-{place}-")
 
 
@@ -97,7 +100,7 @@ def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
     for name in ("success", "length_over_shortest", "near"):
         yield "agent", name, float(found[name] or 0.0)
     yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
-    for step in (1_000 * point for point in POINTS):
+    for step in (1_000 * point for point in POINTS if 1_000 * point <= run.budget):
         seen = run.episodes.at(run.episodes.step <= step).last()
         yield "agent", f"success_at_{step}", float(seen.succeeded.mean())
         yield "agent", f"length_at_{step}", float(seen.length.mean()) / shortest

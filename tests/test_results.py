@@ -98,6 +98,7 @@ def test_agents_of_figure_6_are_told_apart() -> None:
     assert figure6.method_of({}, place) == "dbat-k3"
     assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
     assert figure6.method_of({"bonus": 0.1}, place) == "ppo-bonus"
+    assert figure6.method_of({"network": "paper"}, "meta") == "literal"
     assert figure6.method_of({"bonus": 0.0}, "agent-dqn-paper-layout-300-seed-3000") == "dqn-paper"
 
 
