@@ -22,12 +22,8 @@ from numpy.typing import NDArray
 
 from benchmarks.cells import interval, table
 from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
-from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.choosing import ENVIRONMENTS, OF_CHOICE, OF_PLAY, UNIFORM, judge, play, qualities
+from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
 from hypogoal.evaluation.curves import LEARNED
-from hypogoal.meta.episodes import agent_of
-from hypogoal.options.choosers import RandomChooser
 
 METHODS = {  # by what the names of artefacts have in them, the longest first
     "dbat-truth-shape": "shape: D-BAT, K = 3",
@@ -88,18 +84,11 @@ def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
 
 def _played(artefact: Artefact) -> list[dict[str, str]]:
     config, seed = artefact.config, artefact.manifest["seed"]
-    loop = agent_of(artefact, seed, ENVIRONMENTS)
-    columns = load_domain(config["domain"]).sub_goals
-    goals = np.repeat([columns.index(goal) for goal in config["sub_goals"]], config["members"])
     policy = PLANNED if config["network"] == PLANNED else "learned"
     about = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
-    rows, quality = [], np.empty(0)
-    for method in (LEARNED, UNIFORM):
-        if method == UNIFORM:
-            loop.chooser = RandomChooser(rng_for(seed, "uniform-choice"))
-        played, choices = play(loop)
-        quality = qualities(loop, goals, choices.states) if method == LEARNED else quality
-        numbers = played | judge(choices, quality, config["members"])
+    played, rows = play_agent(artefact, seed), []
+    assert played is not None
+    for method, numbers in ((LEARNED, played), (UNIFORM, played["uniform"])):
         known = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
         rows += [about | {"method": method, "quantity": name, "value": str(numbers[name])} for name in known]
     if "options_ended_at" in config:

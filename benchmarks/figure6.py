@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from benchmarks.cells import interval, table
 from hypogoal.core.artefacts import Artefact, find_artefacts
 from hypogoal.core.seeding import rng_for
-from hypogoal.evaluation.choosing import ENVIRONMENTS, UNIFORM, play
+from hypogoal.evaluation.choosing import UNIFORM
 from hypogoal.evaluation.curves import WINDOW, Run, read_run, run_numbers
+from hypogoal.evaluation.frozen import ENVIRONMENTS, play
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
 
@@ -106,13 +107,12 @@ def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
         yield "agent", f"length_at_{step}", float(seen.length.mean()) / shortest
     if artefact.kind == "meta":
         loop = agent_of(artefact, run.seed, ENVIRONMENTS)
-        for who in ("frozen", UNIFORM):
-            if who == UNIFORM:
-                loop.chooser = RandomChooser(rng_for(run.seed, "uniform-choice"))
-            played, _ = play(loop)
-            yield who, "success", played["success"]
-            yield who, "near", played["near"]
-            yield who, "length_over_shortest", played["length"] / float(shortest)
+        choosers = {"frozen": loop.chooser, UNIFORM: RandomChooser(rng_for(run.seed, "uniform-choice"))}
+        for name, chooser in choosers.items():
+            episodes = play(loop, chooser)
+            for quantity in ("success", "near"):
+                yield name, quantity, float(episodes.scores(shortest)[quantity].mean())
+            yield name, "length_over_shortest", float(episodes.length.mean()) / shortest
 
 
 def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: float | None) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -18,66 +17,25 @@ from numpy.typing import NDArray
 from rich.table import Table
 from scipy.stats import rankdata
 
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
-from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name, near_shortest
+from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name
 from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
 from hypogoal.evaluation.page import Block, Material, Question
-from hypogoal.evaluation.run import Episodes
 
 if TYPE_CHECKING:
+    from hypogoal.evaluation.frozen import Choices
     from hypogoal.evaluation.judging import Work
     from hypogoal.options.loop import OptionLoop
 
-STEPS, ENVIRONMENTS = 8_000, 16  # played by the agent, and as many by chance
 LEAST = 20.0  # expected choices of a member, below which its preference is not told
 DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to choose
 MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
 TITLE = "What choosing is worth"
-
-
-@dataclass(frozen=True)
-class Choices:
-    """D decisions: the states int64 (D,), the options chosen int64 (D,), and those offered, bool (D, O)."""
-
-    states: NDArray[np.int64]
-    options: NDArray[np.int64]
-    offered: NDArray[np.bool_]
-
-
-def play(loop: OptionLoop, steps: int = STEPS) -> tuple[dict[str, float], Choices]:
-    """Let an agent play; nothing is learned, options are greedy and choices are drawn as in training.
-
-    Gives the decisions, and over whole episodes ``success`` (share solved), ``near`` (see :func:`near_shortest`) and
-    ``length`` (mean steps).
-    """
-    from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome  # with PyTorch, which a report needs not
-
-    heard: list[tuple[NDArray[Any], ...]] = []
-    inner = loop.chooser
-
-    class Heard(Chooser):
-        def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
-            chosen = inner.choose(environments, ids, offered)
-            heard.append((ids.copy(), chosen.copy(), offered.copy()))
-            return chosen
-
-        def record(self, outcome: Outcome) -> None:
-            inner.record(outcome)
-
-    loop.chooser = Heard()
-    first, end = len(loop.recorder.episodes), loop.recorder.steps + steps
-    while loop.recorder.steps < end:
-        loop.advance(explore=False)
-    loop.chooser = inner
-    step, length, reward, *truths = np.array(loop.recorder.episodes[first:], dtype=np.float64).reshape(-1, 5).T
-    episodes = Episodes(step.astype(np.int64), length.astype(np.int64), reward, *(told > 0 for told in truths))
-    played = {"success": mean_of(episodes.succeeded), "near": near_shortest(episodes, loop.engine.shortest_path())}
-    played["length"] = mean_of(episodes.length)
-    return played, Choices(*(np.concatenate(column) for column in zip(*heard, strict=True)))
 
 
 def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -172,46 +130,60 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
 
 def numbers(work: Work) -> dict[str, Any]:
     """Every run of an agent that learned to choose among members' options, in a domain that knows what follows."""
-    from hypogoal.meta.episodes import agent_of  # with PyTorch, which a report needs not
-    from hypogoal.options.choosers import RandomChooser
-
     artefacts = {work.contents.name(artefact): artefact for artefact in work.contents.agents}
     metrics = []
     for agent in work.metrics["agents"]:
         rows = []
-        for about in agent["runs"]:
-            artefact = artefacts[about["path"]]
+        for run in agent["runs"]:
+            artefact = artefacts[run["path"]]
             config = artefact.config
             known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
             known = known and not config.get("layouts")  # whose states are too many to say what follows in each
             if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not known:
                 continue
-            domain, loop = load_domain(config["domain"]), agent_of(artefact, about["seed"], ENVIRONMENTS)
-            if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(domain.sub_goals):
-                continue
-            goals = np.repeat([domain.sub_goals.index(goal) for goal in config["sub_goals"]], config["members"])
-            played, choices = play(loop)
-            quality = qualities(loop, goals, choices.states)
-            row = {name: about[name] for name in ("path", "seed", "layout_seed")} | played
-            judged = judge(choices, quality, config["members"])
-            row["members"] = [
-                {
-                    "sub_goal": config["sub_goals"][option // config["members"]],
-                    "member": option % config["members"],
-                    "quality": float(quality[option]),
-                    "conditional_preference": float(judged["preference"][option]),
-                }
-                for option in range(len(quality))
-            ]
-            row |= {name: judged[name] for name in OF_CHOICE}
-            loop.chooser = RandomChooser(rng_for(about["seed"], "uniform-choice"))
-            played, choices = play(loop)
-            judged = judge(choices, quality, config["members"])
-            row["uniform"] = played | {name: judged[name] for name in OF_CHOICE}
-            rows.append(row)
+            if (played := play_agent(artefact, run["seed"])) is not None:
+                rows.append({name: run[name] for name in ("path", "seed", "layout_seed")} | played)
         if rows:
             metrics.append({"name": agent["name"], "runs": rows, **_over_runs(agent["name"], rows)})
     return {"choosing": metrics}
+
+
+def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
+    """``OF_PLAY`` and ``OF_CHOICE`` of a trained agent played on, frozen; ``uniform``: those of uniform-random choice
+    among its own options; ``members``: each one's quality and conditional preference.
+
+    None where the engine does not know what each action leads to, or the sub-goals are not the domain's.
+    """
+    from hypogoal.evaluation.frozen import ENVIRONMENTS, play  # with PyTorch, which a report does not need
+    from hypogoal.meta.episodes import agent_of
+    from hypogoal.options.choosers import RandomChooser
+
+    config, sub_goals = artefact.config, load_domain(artefact.config["domain"]).sub_goals
+    loop = agent_of(artefact, seed, ENVIRONMENTS)
+    if loop.engine.plan() is None or not set(config["sub_goals"]) <= set(sub_goals):
+        return None
+    members, shortest = config["members"], loop.engine.shortest_path()
+    goals = np.repeat([sub_goals.index(goal) for goal in config["sub_goals"]], members)
+    quality, numbers = np.empty(0), []
+    for chooser in (loop.chooser, RandomChooser(rng_for(seed, "uniform-choice"))):
+        episodes = play(loop, chooser)
+        if not len(quality):  # where the agent itself decides
+            quality = qualities(loop, goals, episodes.choices.states)
+        scores = episodes.scores(shortest) | {"length": episodes.length}
+        played = {name: mean_of(scores[name].ravel()) for name in OF_PLAY}
+        numbers.append(played | judge(episodes.choices, quality, members))
+    preference = numbers[0].pop("preference")
+    del numbers[1]["preference"]
+    rows = [
+        {
+            "sub_goal": config["sub_goals"][option // members],
+            "member": option % members,
+            "quality": float(quality[option]),
+            "conditional_preference": float(preference[option]),
+        }
+        for option in range(len(quality))
+    ]
+    return {**numbers[0], "members": rows, "uniform": numbers[1]}
 
 
 def _over_runs(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:

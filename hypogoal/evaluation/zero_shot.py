@@ -26,14 +26,12 @@ from hypogoal.meta.config import layout_seeds
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
-    from hypogoal.options.choosers import Chooser
     from hypogoal.options.loop import OptionLoop
 
 EPISODES = 3  # of an agent on each layout
 AT_ONCE = 100  # layouts
 PATIENCE = 10  # timeouts after which an option alone is given up
-WITHIN = {"near": NEAR, "within_2": 2.0}  # times the shortest path
-OF_AGENTS, OF_OPTIONS = ("success", *WITHIN, "length"), ("success", *WITHIN, "wrong_yes")
+OF_AGENTS, OF_OPTIONS = ("success", "near", "within_2", "length"), ("success", "near", "within_2", "wrong_yes")
 MEAN = "mean"  # in place of a member's number
 TITLE = "On other layouts, without learning"
 SCOPE = "zero-shot"
@@ -53,35 +51,13 @@ def shortest_ways(engine: Engine) -> NDArray[np.float64]:
     return np.where(steps < FAR, steps, np.nan)
 
 
-def _scored(success: NDArray[np.bool_], steps: NDArray[np.int64], shortest: NDArray[np.float64]) -> Played:
-    """Success, and success in so many times the shortest way, of (E, ...) episodes; ``shortest`` fits them."""
-    known = np.where(np.isnan(shortest), np.nan, 1.0)
-    return {
-        "success": success * 1.0,
-        **{name: known * (success & (steps <= of * shortest)) for name, of in WITHIN.items()},
-    }
-
-
-def play(loop: OptionLoop, chooser: Chooser, shortest: NDArray[np.float64], episodes: int = EPISODES) -> Played:
-    """So many episodes in each environment, ``OF_AGENTS`` (E,), options greedy; ``shortest`` (E,) is to success."""
-    begin_anew(loop, chooser)
-    rows: list[list[tuple[Any, ...]]] = [[] for _ in range(loop.engine.count)]
-    while min(map(len, rows)) < episodes:
-        told = len(loop.recorder.episodes)
-        loop.advance(explore=False)
-        for place, row in zip(np.flatnonzero(loop.engine.elapsed == 0), loop.recorder.episodes[told:], strict=True):
-            rows[place].append(row)
-    _, length, _, _, success = np.moveaxis(np.array([of[:episodes] for of in rows]), 2, 0)
-    scored = _scored(success > 0, length.astype(np.int64), shortest[:, None]) | {"length": length}
-    return {name: of.mean(1) for name, of in scored.items()}
-
-
 def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64]) -> Played:
     """``OF_OPTIONS`` of an option, begun where episodes begin and again when its time is up, till its member says yes.
 
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
     """
+    from hypogoal.evaluation.frozen import begin_anew, scores
     from hypogoal.options.choosers import Chooser
 
     class Always(Chooser):
@@ -93,29 +69,20 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
     holds, (yes, there) = engine.labels(engine.ids)[:, goal], np.zeros((2, engine.count), dtype=np.bool_)
     going = ~yes
     for _ in range(PATIENCE * loop.config.option_timeout):
-        moved = loop.advance(explore=False)
+        moved = loop.advance(learning=False)
         steps[going] += 1
         ends = going & moved.reached
         yes[ends], there[ends] = True, engine.labels(moved.next_ids[ends])[:, goal]
         going &= ~moved.reached & (engine.elapsed > 0)  # nor did the episode end
         if not going.any():
             break
-    scored = _scored(there, steps, shortest) | {"wrong_yes": (yes & ~there) * 1.0}
+    scored = scores(there, steps, shortest) | {"wrong_yes": (yes & ~there) * 1.0}
     return {name: np.where(holds, np.nan, of) for name, of in scored.items()}
-
-
-def begin_anew(loop: OptionLoop, chooser: Chooser) -> None:
-    """All environments at the beginning of an episode, no option running, none recorded."""
-    from hypogoal.learners.episodes import Episodes
-    from hypogoal.options.loop import NONE
-
-    loop.chooser, loop.recorder.episodes = chooser, Episodes(loop.engine.count)
-    loop.option[:] = NONE
-    loop.engine.reset()
 
 
 def played(artefact: Artefact, layouts: tuple[int, ...]) -> dict[tuple[str, ...], Played]:
     """What an agent does, ``("agent",)``, chance among its options, and each option, (sub-goal, member)."""
+    from hypogoal.evaluation.frozen import play
     from hypogoal.meta.episodes import agent_of
     from hypogoal.options.choosers import RandomChooser
 
@@ -125,8 +92,11 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> dict[tuple[str, ...]
     ways = shortest_ways(loop.engine)
     found: dict[tuple[str, ...], Played] = {}
     if artefact.kind == "meta":
-        chance = RandomChooser(rng_for(artefact.seed, "uniform-choice"))
-        found = {("agent",): play(loop, loop.chooser, ways[:, -1]), (UNIFORM,): play(loop, chance, ways[:, -1])}
+        choosers = {"agent": loop.chooser, UNIFORM: RandomChooser(rng_for(artefact.seed, "uniform-choice"))}
+        for name, chooser in choosers.items():
+            episodes = play(loop, chooser, EPISODES)
+            scores = episodes.scores(ways[:, -1:]) | {"length": episodes.length}
+            found[name,] = {quantity: values.mean(1) for quantity, values in scores.items()}
     loop.config, loop.initiation = replace(loop.config, mask_reached=False), None
     for index, sub_goal in enumerate(config["sub_goals"]):
         if sub_goal in known:  # else the user's own labels said it: its truth here is not known

@@ -116,4 +116,4 @@ def _steps(loop: OptionLoop) -> Iterator[Transitions]:
     """The steps of an episode; options are greedy, and drawn as in training."""
     played = len(loop.recorder.episodes)
     while len(loop.recorder.episodes) == played:
-        yield loop.advance(explore=False)
+        yield loop.advance(learning=False)

@@ -75,6 +75,9 @@ class MetaPolicy(Chooser):
         }
         self._finished.append({name: values[outcome.environments] for name, values in self._open.items()} | came_of_it)
 
+    def begin_anew(self) -> None:
+        self._finished = []
+
     def learn(self) -> dict[str, float]:
         if sum(len(part["state"]) for part in self._finished) < self.config.decisions:
             return {}

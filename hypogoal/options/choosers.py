@@ -49,6 +49,9 @@ class Chooser(Resumable, ABC):
     def record(self, outcome: Outcome) -> None:
         """The chosen options ended as ``outcome`` says; by default nothing is remembered."""
 
+    def begin_anew(self) -> None:
+        """Forget the episodes that were broken off: all environments are at the beginning of one."""
+
     def learn(self) -> dict[str, float]:
         """The updates that are due; returns numbers to log, empty when none was due."""
         return {}

@@ -85,11 +85,14 @@ class OptionLoop(Resumable):
         numbers = self.learner.learn() | self.chooser.learn()
         return numbers | self.initiation.learn() if self.initiation else numbers
 
-    def advance(self, *, explore: bool = True) -> Transitions:
-        """One step of every environment, of which nothing is learned yet."""
+    def advance(self, *, learning: bool = True) -> Transitions:
+        """One step of every environment, before the updates that are due.
+
+        Without ``learning`` the agent is frozen: options are greedy, and nothing is kept that could be learned from.
+        """
         self._choose()
         ids, option = self.engine.ids.copy(), self.option.copy()
-        actions = self.learner.act(ids, option, self.age, explore=explore)
+        actions = self.learner.act(ids, option, self.age, explore=learning)
         layouts = [*self.engine.layouts.now] if self.engine.layouts else None
         step = step_of(self.engine, actions)
         reached = self.terminations.reached(step.next_ids, option, self.age)
@@ -101,14 +104,15 @@ class OptionLoop(Resumable):
         moved = Transitions(
             ids, actions, step.next_ids, step.rewards, option, step.terminated, timed_out, reached, ended
         )
-        self.learner.observe(moved)
+        if learning:
+            self.learner.observe(moved)
         if self.config.restart_options:
             step = step._replace(truncated=step.truncated | (ended & ~step.terminated))
             self.engine.restart(ended & ~over)
         if self.visited:
             self.visited.see(step.next_ids, actions, step.terminated | step.truncated, layouts)
         self.recorder.see(step)
-        self._finish_options(step, reached, ended)
+        self._finish_options(step, reached, ended, learning=learning)
         return moved
 
     def _choose(self) -> None:
@@ -130,7 +134,9 @@ class OptionLoop(Resumable):
         self.returns[free] = 0.0
         self.recorder.chose(chosen, offered)
 
-    def _finish_options(self, step: Step, reached: NDArray[np.bool_], ended: NDArray[np.bool_]) -> None:
+    def _finish_options(
+        self, step: Step, reached: NDArray[np.bool_], ended: NDArray[np.bool_], *, learning: bool
+    ) -> None:
         done = np.flatnonzero(ended)
         if not len(done):
             return
@@ -149,11 +155,12 @@ class OptionLoop(Resumable):
             truncated=step.truncated[done],
             succeeded=None if step.succeeded is None else step.succeeded[done],
         )
-        if self.initiation:
+        if self.initiation and learning:
             out_of_time = (outcome.durations >= self.config.option_timeout) & ~outcome.terminated
             judged = done[outcome.reached | out_of_time]  # of those that the episode's end cut short nobody knows
             self.initiation.record(self.began[judged], self.option[judged], reached[judged])
-        self.terminations.finished(done, outcome.options, outcome.reached)
+        if learning:
+            self.terminations.finished(done, outcome.options, outcome.reached)
         self.recorder.finished(outcome)
         self.chooser.record(outcome)
         self.option[done] = NONE

@@ -51,6 +51,9 @@ class ThompsonChooser(Chooser):
         self._due += self._taken[ended[solved]].sum(0), self._taken[ended[~solved]].sum(0)
         self._taken[ended], self._earned[ended] = 0.0, 0.0
 
+    def begin_anew(self) -> None:
+        self._taken[:], self._earned[:] = 0.0, 0.0
+
     def learn(self) -> dict[str, float]:
         self.credit += self._due
         self._due[:] = 0.0

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from planted import NearPlanner, harsh, planted
 
 from hypogoal.core.errors import UserError
-from hypogoal.evaluation.choosing import play
+from hypogoal.evaluation.frozen import play
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.options.choosers import Chooser, Outcome, RandomChooser
 from hypogoal.options.loop import OptionLoop
@@ -107,7 +107,7 @@ def test_thompson_draws_anew_for_every_episode() -> None:
     assert set(first) == {0, 1, 2}
     np.testing.assert_array_equal(bandit.choose(many, many, offered), first)
     loop = loop_of("thompson", PlannedLearner, 0, 1)
-    choices = play(loop, 2_000)[1]
+    choices = play(loop, loop.chooser, 100).choices
     assert len({int(option) for option in choices.options[choices.offered.all(1)]}) > 5
     assert not loop.chooser.credit.any()  # type: ignore[attr-defined]
 

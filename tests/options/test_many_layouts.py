@@ -15,7 +15,8 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.evaluation.zero_shot import OF_AGENTS, alone, play, shortest_ways
+from hypogoal.evaluation.frozen import play
+from hypogoal.evaluation.zero_shot import alone, shortest_ways
 from hypogoal.meta.config import TrainOptionsConfig, layout_seeds
 from hypogoal.meta.training import start_arguments
 from hypogoal.options.choosers import RandomChooser
@@ -108,9 +109,9 @@ def test_planned_options_to_true_sub_goals_are_perfect_without_learning() -> Non
         assert all(told[name].tolist() == [1.0] * 4 for name in ("success", "near", "within_2"))
         assert told["wrong_yes"].tolist() == [0.0] * 4
         assert alone(loop, option, option, ways[:, option] / 2.1)["within_2"].tolist() == [0.0] * 4
-    told = play(loop, loop.chooser, ways[:, -1])
-    assert set(told) == set(OF_AGENTS) and told["success"].tolist() == [1.0] * 4
-    assert (told["length"] >= ways[:, -1]).all()
+    episodes = play(loop, loop.chooser, 3)
+    assert episodes.succeeded.shape == (4, 3) and episodes.succeeded.all()
+    assert (episodes.length >= ways[:, -1:]).all()
 
 
 def test_a_wrong_member_is_told_from_an_option_that_gets_nowhere() -> None:

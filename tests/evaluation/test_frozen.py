@@ -1,0 +1,167 @@
+"""Spec H2: frozen play is measured without bias, on agents whose true success, lengths and choices are forced."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from planted import harsh, planted
+from scipy.stats import binom
+
+from hypogoal.domains.doorkey_engine import DoorKeyEngine
+from hypogoal.evaluation.frozen import Play, play
+from hypogoal.meta.config import TrainMetaConfig
+from hypogoal.options.choosers import Chooser, Outcome, RandomChooser
+from hypogoal.options.initiation import FEWEST, Initiation
+from hypogoal.options.loop import OptionLoop
+from hypogoal.options.planned import PlannedLearner
+from hypogoal.options.recording import Recorder
+from hypogoal.options.termination import Patience, oracle_terminations
+from hypogoal.options.thompson import ThompsonChooser
+
+LAYOUT, DONE = 70010, 6  # 'done' does nothing
+
+
+class Forgetful(PlannedLearner):
+    """In a share of the episodes it plays 'done' until the cap; else it follows the plan."""
+
+    failures, rng = 0.0, np.random.default_rng(0)
+    failing: NDArray[np.bool_]
+
+    def act(
+        self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64], *, explore: bool = True
+    ) -> NDArray[np.int64]:
+        begins = self.engine.elapsed == 0
+        if begins.all():
+            self.failing = np.zeros(len(ids), np.bool_)
+        self.failing[begins] = self.rng.random(begins.sum()) < self.failures
+        return np.where(self.failing, DONE, super().act(ids, options, age, explore=explore))
+
+
+def forced_loop(failures: float, cap: int, environments: int) -> OptionLoop:
+    """An agent with the true sub-goals that solves a forced share of its episodes, each in the fewest steps."""
+    engine = DoorKeyEngine(LAYOUT, environments)
+    engine.max_steps = cap
+    config = TrainMetaConfig(network="planned", termination="oracle")
+    terminations = oracle_terminations(engine, (4,))  # go-to-goal alone: the shortest path
+    learner = Forgetful(engine, terminations, config, seed=0)
+    learner.failures, learner.rng = failures, np.random.default_rng(cap)
+    chooser = RandomChooser(np.random.default_rng(0))
+    return OptionLoop(engine, terminations, learner, chooser, Recorder(1, engine), config, config.gamma)
+
+
+@pytest.mark.parametrize("cap", [57, 500])
+@pytest.mark.parametrize("share", [0.9, 0.7, 0.3])
+def test_forced_shares_of_failures_are_measured(share: float, cap: int) -> None:
+    """Success, near and length lie within the binomial's interval of their true values (three in a million miss)."""
+    loop = forced_loop(1 - share, cap, 64)
+    shortest = loop.engine.shortest_path()
+    assert shortest is not None and 1.5 * shortest < cap
+    episodes = play(loop, loop.chooser, 4)
+    count, scores = episodes.length.size, episodes.scores(shortest)
+    assert episodes.length.shape == (64, 4)
+    least, most = binom.interval(1 - 3e-6, count, share)
+    assert least <= episodes.succeeded.sum() <= most
+    assert np.array_equal(scores["success"], scores["near"])
+    solved = int(episodes.succeeded.sum())
+    assert episodes.length.sum() == solved * shortest + (count - solved) * cap
+
+
+def test_an_environment_that_ends_early_adds_no_episodes() -> None:
+    """The first n of each, also where one environment needs as long for one episode as another for seven."""
+    loop = forced_loop(0.5, 500, 16)
+    episodes = play(loop, loop.chooser, 1)
+    assert episodes.length.shape == (16, 1)
+    assert set(episodes.length.ravel().tolist()) == {loop.engine.shortest_path(), 500}
+
+
+class Noting(Chooser):
+    """Takes the first option offered and notes where it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[NDArray[np.int64]] = []
+
+    def choose(self, environments: Any, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.int64]:
+        self.asked.append(ids.copy())
+        return offered.argmax(1)
+
+
+def test_nothing_of_an_earlier_chooser_is_left() -> None:
+    """The second one is asked first where episodes begin, in every environment, and plays as if it were alone."""
+
+    def loop_at(seed: int) -> OptionLoop:
+        engine, config = harsh(220, 16), TrainMetaConfig(network="planned")
+        terminations, rng = planted(engine), np.random.default_rng(seed)
+        learner = PlannedLearner(engine, terminations, config, seed=0)
+        return OptionLoop(engine, terminations, learner, RandomChooser(rng), Recorder(15, engine), config, config.gamma)
+
+    loop, noting = loop_at(1), Noting()
+    begin = loop.engine.ids.copy()
+    for _ in range(7):
+        loop.step()
+    assert loop.engine.elapsed.any() and (loop.option >= 0).any()
+    second = play(loop, noting, 2)
+    assert np.array_equal(noting.asked[0], begin)
+    alone = play(loop_at(2), Noting(), 2)
+    assert second.length.tolist() == alone.length.tolist()
+    assert second.choices.options.tolist() == alone.choices.options.tolist()
+
+
+def test_decisions_are_those_of_the_episodes_that_count() -> None:
+    """Of environments that wait for the slowest one no decision is kept; every other one is, in the order made."""
+    loop = forced_loop(0.5, 500, 16)
+    timeout = loop.config.option_timeout
+    episodes = play(loop, loop.chooser, 1)
+    assert len(episodes.choices.options) == sum(math.ceil(length / timeout) for length in episodes.length.ravel())
+
+
+def test_play_teaches_nothing() -> None:
+    """Thresholds, bandits' credit, initiation sets and replays are after it what they were before."""
+    engine = harsh(220, 16)
+    config = TrainMetaConfig(network="planned")
+    truth = planted(engine)
+    patience = Patience(truth.classify, 15, None, None, engine.count, 3)
+    learner = PlannedLearner(engine, patience, config, seed=0)
+    initiation = Initiation(engine, 15, config, 0)
+    chooser = ThompsonChooser(15, 16, np.random.default_rng(0))
+    patience.thresholds = np.full(15, 0.5, np.float32)
+    loop = OptionLoop(
+        engine, patience, learner, chooser, Recorder(15, engine), config, config.gamma, initiation=initiation
+    )
+
+    def kept() -> list[list[float]]:
+        counters = (patience.thresholds, patience._executions, chooser.credit, chooser._due, initiation.executions)
+        return [values.tolist() for values in (*counters, learner.option_steps)]
+
+    before = kept()
+    play(loop, chooser, 3)
+    assert initiation.count == 0 and FEWEST > 0
+    after = kept()
+    assert after[0] == before[0] and after[2] == before[2] and after[4:] == before[4:]
+
+
+def test_a_bandit_begins_anew() -> None:
+    """Options of an episode that was broken off earn no credit for the next one."""
+    bandit = ThompsonChooser(3, 2, np.random.default_rng(0))
+    everything = np.ones((2, 3), np.bool_)
+    places = np.arange(2)
+    bandit.choose(places, places, everything)
+    bandit.begin_anew()
+    chosen = bandit.choose(places, places, everything)
+    no, yes, one = np.zeros(2, np.bool_), np.ones(2, np.bool_), np.ones(2)
+    bandit.record(Outcome(places, chosen, places, no, no, yes, one, places, one, places, yes, no))
+    bandit.learn()
+    assert bandit.credit[0].sum() == 2
+
+
+def test_scores_by_hand() -> None:
+    """Near: solved within one and a half shortest paths; NaN where no shortest path is known."""
+    episodes = Play(np.array([[10, 15], [16, 15]]), np.array([[True, True], [True, False]]), None)  # type: ignore[arg-type]
+    scores = episodes.scores(10)
+    assert scores["success"].tolist() == [[1, 1], [1, 0]]
+    assert scores["near"].tolist() == [[1, 1], [0, 0]]
+    assert scores["within_2"].tolist() == [[1, 1], [1, 0]]
+    assert np.isnan(episodes.scores(None)["near"]).all()
