@@ -1,4 +1,4 @@
-"""What choosing is worth: how good options are, whether the better one is taken, and chance among the same (Spec H2).
+"""What choosing is worth: how good options are, whether the better one is taken, and what random choice does (Spec H2).
 
 An option is good where its execution brings about the true sub-goal; how well its classifier matches the truth on all
 states says little of that. Choice is judged among the members of the sub-goal that was chosen, since which sub-goal is
@@ -94,7 +94,7 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
         ``preference`` (G*K,): chosen / expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected;
         ``within_rho``: Spearman's rho of the two, mean over sub-goals whose members' qualities differ by
         ``DIFFERENCE``; ``pair``: of two members offered whose qualities differ by that, how often the better of those
-        taken (chance .5); ``score``: (quality taken - mean quality) / (best - mean), over decisions (chance 0).
+        taken (.5 at random); ``score``: (quality taken - mean quality) / (best - mean), over decisions (0 at random).
     """
     options = np.arange(len(quality))
     of_goal = choices.offered & (options // members == (choices.options // members)[:, None])
@@ -199,14 +199,14 @@ def _over_runs(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
-    """Of every run the agent's, chance's, and every member's."""
+    """Of every run the agent's, those of uniform-random choice, and every member's."""
     for agent in metrics["choosing"]:
         for run in agent["runs"]:
             about = {"layout": run["layout_seed"], "seed": run["seed"], "artefact": run["path"]}
             values = {name: run[name] for name in (*OF_PLAY, *OF_CHOICE)}
             yield from rows_of(values, method=agent["name"], scope=FROZEN, **about)
-            chance = {name: run["uniform"][name] for name in values}
-            yield from rows_of(chance, method=UNIFORM, scope=FROZEN, **about)
+            uniform = {name: run["uniform"][name] for name in values}
+            yield from rows_of(uniform, method=UNIFORM, scope=FROZEN, **about)
             for member in run["members"]:
                 place = {"sub_goal": member["sub_goal"], "member": member["member"]}
                 values = {name: member[name] for name in ("quality", "conditional_preference")}
@@ -228,7 +228,7 @@ COLUMNS = (
 
 
 def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
-    """Each agent, and below it chance among its own options."""
+    """Each agent, and below it uniform-random choice among its own options."""
     both = ((agent | {"chooser": agent["name"]}, agent["uniform"] | {"chooser": UNIFORM}) for agent in agents)
     return [chooser for pair in both for chooser in pair]
 
@@ -245,11 +245,12 @@ def sections(material: Material) -> list[Block]:
     if not agents:
         return []
     text = (
-        "The trained agent plays on, frozen. Beside it uniform choice plays with the agent's own final options. An "
+        "The trained agent plays without learning: the first episodes of each of many environments, as many in each. "
+        "For comparison, uniform-random choice plays with the agent's own final options. An "
         "option's quality is the share of its executions that reach the true sub-goal, begun where agents decide. "
         "Choice is judged among the members of the sub-goal that was chosen: the rank correlation of preference with "
-        "quality, how often the better of two that differ by .2 is taken (chance .5), and how much of the way from the "
-        "mean to the best quality it goes (chance 0)."
+        "quality, how often the better of two that differ by .2 is taken (.5 at random), and how much of the way from "
+        "the mean to the best quality it goes (0 at random)."
     )
     table = page.table(COLUMNS, _choosers(agents), main=lambda entry: entry["chooser"] == LEARNED)
     return [page.section("choosing", TITLE, [text], [table])]
