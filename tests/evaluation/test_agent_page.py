@@ -172,8 +172,8 @@ def test_an_agent_that_played_on_has_chance_among_its_own_options_beside_it():
         for name, (own, chance) in shares.items()
     ]
     dbat, none = summary_section(material)["paragraphs"]
-    assert dbat.endswith("Evaluated without further training it solves 92 %; uniform-random choice among its own options 61 %.")
-    assert none.endswith("Evaluated without further training it solves 25 %; uniform-random choice among its own options 25 %.")
+    assert dbat.endswith("Without further training it solves 92 %; uniform-random choice among its options 61 %.")
+    assert none.endswith("Without further training it solves 25 %; uniform-random choice among its options 25 %.")
 
 
 def test_of_one_variant_nothing_is_said_of_variants():
