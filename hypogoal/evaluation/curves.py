@@ -388,7 +388,8 @@ def _answers(material: Material) -> list[str]:
             text += "".join(f" {_briefly(other)}" for other in material.metrics["agents"] if other is not agent)
         for entry in (entry for entry in material.metrics["choosing"] if entry["name"] == agent["name"]):
             solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
-            text += " Without further training it solves {}; uniform-random choice among its options {}.".format(*solved)
+            form = " Without further training it solves {}; uniform-random choice among its options {}."
+            text += form.format(*solved)
         if len(agent["runs"]) < SEVERAL and len(shown) == 1:
             text += " So few runs decide nothing: run more seeds and layouts."
         paragraphs.append(text)
