@@ -47,6 +47,7 @@ test: $(STAMP) ## the tests, without those marked slow or slurm
 	$(BIN)/python -m pytest $(PARALLEL) $(TESTS)
 
 # Other processors round otherwise: the oldest kernels, made (tests/uneven.py) to depend on the batch around a state.
+# Both at once are stricter than each alone, at half the cost; tests/uneven.py without OLDEST shows which one failed.
 NUMERIC := tests/hypotheses tests/options/test_termination.py tests/meta/test_resuming.py
 OLDEST := ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 ONEDNN_MAX_CPU_ISA=SSE41
 kernels: $(STAMP) ## the tests of what is computed, as on other processors

@@ -118,6 +118,8 @@ class TrainEnsembleConfig(EnsembleConfig):
     """Which sub-goals to train an ensemble for."""
 
     sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
+    # Scores at many lengths cost about a fifth of one training (one cell); training anew for each of thirteen lengths
+    # would cost four trainings.
     score_every: int = setting(
         0,
         "gradient steps between scores of the members on held-out states, in scores.jsonl; 0 for none",

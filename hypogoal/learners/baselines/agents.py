@@ -201,7 +201,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
     """An agent between two rollouts, its environments, and the global generators that it draws from (Spec G1).
 
     The library saves its agents as pickles, without their environments and random numbers. Here what it knows between
-    two rollouts is written down field by field; within a rollout it cannot be interrupted.
+    two rollouts is written down field by field; within a rollout (under a second) it cannot be interrupted.
     """
     assert agent._last_obs is not None
     dqn: dict[str, Any] = {}
