@@ -138,9 +138,9 @@ def student_interval(values: NDArray[np.float64]) -> tuple[float, float]:
 def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, str]:
     """Spec F5: a 95 % interval: below 8 values Student's, of the mean; from 8 on a bootstrap, of the middle half's.
 
-    A percentile bootstrap of few values is too narrow: of two it would hold in half of the cases. SciPy's bootstrap gave
-    the same numbers as rliable's, which fails with pandas 3. Returns the bounds for (n,) independent values, NaN for
-    fewer than two, and the interval's kind; ``rng`` draws the resamples.
+    A percentile bootstrap of few values is too narrow: of two it would hold in half of the cases. SciPy's bootstrap
+    gave the same numbers as rliable's, which fails with pandas 3. Returns the bounds for (n,) independent values, NaN
+    for fewer than two, and the interval's kind; ``rng`` draws the resamples.
     """
     if len(values) < BOOTSTRAP_FROM:
         return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
