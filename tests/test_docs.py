@@ -147,3 +147,13 @@ def test_equations_lead_to_code() -> None:
             else:
                 module = importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
                 assert hasattr(module, name), (row, name)
+
+
+def test_requirements_lead_to_code_and_tests() -> None:
+    """Each requirement's row names files that exist."""
+    rows = re.findall(r"^\| [A-H]\d \| .+ \| ([^|]+) \| ([^|]+) \|$", (DOCS / "requirements.md").read_text(), re.M)
+    assert len(rows) == 56
+    for row in rows:
+        for folder, cell in zip(("hypogoal", "tests"), row, strict=True):
+            for name in re.findall(r"`([^`]+)`", cell):
+                assert (ROOT / folder / name).exists(), (row, name)
