@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.cells import Row, interval, run_cells, table
 from hypogoal.cli import main as hypogoal
 
-CHOOSERS = {"thompson": "Thompson sampling", "ppo": "PPO", "random": "chance"}
+CHOOSERS = {"thompson": "Thompson sampling", "ppo": "PPO", "random": "uniform-random"}
 # By name as in the CSV; Exp3 is gone, since it was slower than Thompson sampling: for the rows that were made with it.
 TITLES = {"thompson": CHOOSERS["thompson"], "exp3": "Exp3", **CHOOSERS}
 METHODS = {"dbat": "D-BAT, K = 3", "one": "one classifier, K = 1"}

@@ -49,6 +49,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 WEIGHTS = (1e-5, 1e-4, 1e-3, 1e-2)
 LOOKS = (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1300, 1600, 2000, 2600)
+LONG = (150, 600, 1000, 2600)  # looks at the seed that was trained longer
 LAYOUTS = {"choice": 500, "test": 1000}  # the first of twenty held-out layouts
 KEYS = ("layouts", "method", "sub_goal", "seed", "step", "member")
 OF_ALL = ("ranking", "balanced_accuracy", "precision", "recall", "at_q95", "at_best")
@@ -192,6 +193,7 @@ SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
     "above the 95th percentile, mean": lambda members: float(members["at_q95"].mean()),
     "at its best threshold, mean": lambda members: float(members["at_best"].mean()),
 }
+CROSSED = ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best")
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -199,16 +201,15 @@ def tables(path: Path) -> Iterator[str]:
     choice, test = read(path, "choice"), read(path, "test")
     everything = lengths(choice)
     chosen = {method: steps for method, steps in everything.items() if method in METHODS}
-    for name in ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best"):
-        yield f"{name[0].upper()}{name[1:]} on the layouts for choosing by steps, {_seeds(choice)}; in bold the chosen."
-        yield ""
-        yield from _curves(choice, chosen, SHOWN[name])
+    scores = "ranking / balanced accuracy at 0.5 of the cross-fitted best member, by steps"
+    yield f"Layouts for choosing, {_seeds(choice)}: {scores}; in bold the chosen length."
+    yield ""
+    yield from _curves(choice, chosen, LOOKS)
     first = min(seed for _, _, seed in choice)
     alone = {cell: steps for cell, steps in choice.items() if cell[2] == first}
-    for name in ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best"):
-        yield f"{name[0].upper()}{name[1:]} there, seed {first} alone."
-        yield ""
-        yield from _curves(alone, dict.fromkeys(chosen, 0), SHOWN[name])
+    yield f"Seed {first} alone, trained longer: the same."
+    yield ""
+    yield from _curves(alone, dict.fromkeys(chosen, 0), LONG)
     if len(everything) > len(chosen):
         yield f"Other weights and objectives there, seed {first} alone: the highest ranking by weight (at steps)."
         yield ""
@@ -227,30 +228,27 @@ def tables(path: Path) -> Iterator[str]:
             for m in tested
         ),
     )
-    for name in ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best"):
-        yield f"{name[0].upper()}{name[1:]}, by sub-goal."
-        yield ""
-        yield from table(
-            ["", *every],
-            ([m, *(interval(by_seed(test, m, chosen[m], SHOWN[name], [goal])) for goal in every)] for m in tested),
-        )
-    yield "D-BAT minus the other, cross-fitted ranking, seed by seed."
+    yield "By sub-goal: ranking / balanced accuracy at 0.5, cross-fitted best."
     yield ""
-    yield from table(["", "difference", "seeds in which D-BAT is above"], _differences(test, chosen, tested))
+
+    def both(method: str, goal: str) -> str:
+        return " / ".join(f"{by_seed(test, method, chosen[method], SHOWN[n], [goal]).mean():.3f}" for n in CROSSED)
+
+    yield from table(["", *every], ([m, *(both(m, goal) for goal in every)] for m in tested))
+    yield "D-BAT minus the other, cross-fitted ranking, seed by seed (seeds in which D-BAT is above)."
+    yield ""
+    yield from table(["", "all", *every], _differences(test, chosen, tested))
 
 
-def _curves(
-    numbers: Numbers, chosen: dict[str, int], of: Callable[[dict[str, NDArray[np.float64]]], float]
-) -> Iterator[str]:
-    curves = {method: curve(numbers, method, of) for method in chosen}
-    looks = sorted(set().union(*curves.values()))
-    texts = {
-        method: {
-            step: f"**{value:.3f}**" if step == chosen[method] else f"{value:.3f}" for step, value in steps.items()
-        }
-        for method, steps in curves.items()
-    }
-    yield from table(["", *map(str, looks)], ([m, *(texts[m].get(step, "-") for step in looks)] for m in chosen))
+def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> Iterator[str]:
+    curves = {method: [curve(numbers, method, SHOWN[name]) for name in CROSSED] for method in chosen}
+    looks = [step for step in shown if any(step in scores for scores, _ in curves.values())]
+
+    def cell(method: str, step: int) -> str:
+        text = " / ".join(f"{scores[step]:.3f}" if step in scores else "-" for scores in curves[method])
+        return f"**{text}**" if step == chosen[method] else text
+
+    yield from table(["", *map(str, looks)], ([m, *(cell(m, step) for step in looks)] for m in chosen))
 
 
 def _weights(numbers: Numbers) -> Iterator[list[str]]:
@@ -268,13 +266,13 @@ def _weights(numbers: Numbers) -> Iterator[list[str]]:
 
 
 def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -> Iterator[list[str]]:
-    ranking = SHOWN["ranking, cross-fitted best"]
-    for goals, title in ((DOMAIN.sub_goals, ""), *(((goal,), f", {goal}") for goal in DOMAIN.sub_goals)):
-        own = by_seed(test, "dbat", chosen["dbat"], ranking, goals)
-        for method in tested:
-            other = by_seed(test, method, chosen[method], ranking, goals)
-            if method != "dbat" and len(own) == len(other):
-                yield [f"{method}{title}", interval(own - other), f"{(own > other).sum()} of {len(own)}"]
+    for method in tested:
+        cells = []
+        for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
+            own, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
+            cells.append(f"{interval(own - other)} ({(own > other).sum()})" if len(own) == len(other) else "-")
+        if method != "dbat":
+            yield [method, *cells]
 
 
 def _seeds(numbers: Numbers) -> str:

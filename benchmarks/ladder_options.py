@@ -152,10 +152,10 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
     methods = [method for method in METHODS if any(name == method for name, _ in found)]
     learned = [method for method in methods if method != "oracle"]  # the control may lag behind
     whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in learned)]
-    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member, mean over seeds."
+    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one number if equal)."
     yield ""
     yield from table(
-        ["ladder", *(METHODS[method][0] for method in methods), "began inside: D-BAT, no diversity, CNN"],
+        ["ladder", *(METHODS[method][0] for method in methods), "started inside: D-BAT, no diversity, CNN"],
         (
             [
                 ladder,
@@ -262,8 +262,16 @@ def _ladders(found: Distances, method: str) -> list[str]:
 def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
     if not seeds:
         return "-"
-    best, mean, worst = (np.mean([of(members) for members in seeds.values()]) for of in (np.min, np.mean, np.max))
-    return f"{best:.1f} / **{mean:.1f}** / {worst:.1f} ({len(seeds)})"
+    best, mean, worst = _best_mean_worst(seeds)
+    text = f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
+    return f"{text} ({len(seeds)})"
+
+
+def _best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:
+    best, mean, worst = (
+        float(np.mean([of(members) for members in seeds.values()])) for of in (np.min, np.mean, np.max)
+    )
+    return best, mean, worst
 
 
 def _of_group(found: Distances, methods: list[str], ladders: list[str]) -> str:
@@ -285,7 +293,8 @@ def _share(reached: Distances, found: Distances, method: str, ladder: str) -> st
 def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
     if not seeds:
         return "-"
-    return " / ".join(f"{np.mean([of(members) for members in seeds.values()]):.0f}" for of in (np.min, np.mean, np.max))
+    numbers = [f"{number:.0f}" for number in _best_mean_worst(seeds)]
+    return " / ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
 
 
 def over(

@@ -167,7 +167,7 @@ def tables(path: Path) -> Iterator[str]:
     yield "Student's 95 % interval over seeds. Picked: the member that is best on layouts trained on."
     yield ""
     yield from table(
-        ["options", "steps", "trained layouts", "**new layouts**", "picked", "wrong yes there", "steps/s", "seeds"],
+        ["options", "steps", "trained layouts", "**new layouts**", "picked", "false positives", "steps/s", "seeds"],
         (
             [
                 METHODS[method][0],
@@ -182,7 +182,7 @@ def tables(path: Path) -> Iterator[str]:
             for step in steps[method]
         ),
     )
-    yield "By sub-goal, new layouts, the last look: within twice the shortest path / wrong yes, mean member."
+    yield "By sub-goal, new layouts, the last look: within twice the shortest path / false positive, mean member."
     yield ""
     last = [(method, steps[method][-1], "new") for method in there]
 

@@ -115,33 +115,53 @@ def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     with path.open(encoding="utf-8", newline="") as file:
         every = list(csv.DictReader(file))
-    for layouts in ("choice", "test"):
-        for step in map(str, LOOKS):
-            rows = [row for row in every if (row["layouts"], row["step"]) == (layouts, step)]
-            if not rows:
-                continue
-            seeds = len({row["seed"] for row in rows})
-            methods = [method for method in METHODS if any(row["method"] == method for row in rows)]
-            yield f"Layouts for {'choosing' if layouts == 'choice' else 'the test'}, {seeds} seeds, {step} steps."
-            yield ""
-            yield from table(
-                ["", *methods, *(f"{goal} (D-BAT)" for goal in DOMAIN.sub_goals)],
-                (
-                    [
-                        "the best there is" if rule == "best" else rule,
-                        *(interval(by_seed(rows, rule, method)) for method in methods),
-                        *(f"{by_seed(rows, rule, 'dbat', goal).mean():.3f}" for goal in DOMAIN.sub_goals),
-                    ]
-                    for rule in COLUMNS[len(KEYS) :]
-                ),
-            )
+    choice, test = ([row for row in every if row["layouts"] == layouts] for layouts in ("choice", "test"))
+    yield f"Mean member's balanced accuracy: {_seeds(choice)} for choosing, {_seeds(test)} for the test."
+    yield ""
+    cells = {f"{method}, {step}": (method, step) for step in LOOKS for method in TRAINED}
+    rules = {"the best there is" if rule == "best" else rule: rule for rule in COLUMNS[len(KEYS) :]}
+
+    def gain(method: str = "", step: int = 0) -> str:
+        return interval(by_seed(test, "split", method, step) - by_seed(test, "0.5", method, step))
+
+    yield from table(
+        ["", "choosing, mean", "test, mean", *cells],
+        [
+            *(
+                [
+                    title,
+                    f"{by_seed(choice, rule).mean():.3f}",
+                    interval(by_seed(test, rule)),
+                    *(interval(by_seed(test, rule, *cell)) for cell in cells.values()),
+                ]
+                for title, rule in rules.items()
+            ),
+            ["split minus 0.5", "-", gain(), *(gain(*cell) for cell in cells.values())],
+        ],
+    )
+    yield f"D-BAT, {LOOKS[0]} steps, test, by sub-goal."
+    yield ""
+    yield from table(
+        ["", *DOMAIN.sub_goals],
+        (
+            [title, *(f"{by_seed(test, rules[title], 'dbat', LOOKS[0], goal).mean():.3f}" for goal in DOMAIN.sub_goals)]
+            for title in ("0.5", "base-rate", "split", "the best there is")
+        ),
+    )
 
 
-def by_seed(rows: list[dict[str, str]], rule: str, method: str, sub_goal: str = "") -> NDArray[np.float64]:
-    """Balanced accuracy at a rule's threshold, mean over members and sub-goals (or of one): float64 (seeds,)."""
-    of = [row for row in rows if row["method"] == method and sub_goal in ("", row["sub_goal"])]
-    seeds = sorted({row["seed"] for row in of})
-    return np.array([np.mean([float(row[rule]) for row in of if row["seed"] == seed]) for seed in seeds])
+def _seeds(rows: list[dict[str, str]]) -> str:
+    return f"{len({row['seed'] for row in rows})} seeds"
+
+
+def by_seed(
+    rows: list[dict[str, str]], rule: str, method: str = "", step: int = 0, sub_goal: str = ""
+) -> NDArray[np.float64]:
+    """Balanced accuracy at a rule's threshold, mean over cells (of one method, step, sub-goal): float64 (seeds,)."""
+    wanted = {"method": method, "step": str(step or ""), "sub_goal": sub_goal}
+    chosen = [row for row in rows if all(value in ("", row[name]) for name, value in wanted.items())]
+    seeds = sorted({row["seed"] for row in chosen})
+    return np.array([np.mean([float(row[rule]) for row in chosen if row["seed"] == seed]) for seed in seeds])
 
 
 def main() -> None:

@@ -237,7 +237,7 @@ def tables(path: Path) -> Iterator[str]:
     none = best(found, "ppo")
     paid = [("none", found["ppo", LONG][none])]
     paid += [(str(BONUSES[trial]), rows) for trial, rows in sorted(found[BONUS, LONG].items())]
-    yield f"PPO's best setting (trial {none}) with a bonus for each member's first yes in an episode, {LONG:,} steps."
+    yield f"PPO's best setting (trial {none}), {LONG:,} steps, a bonus for each member's first positive in an episode."
     yield ""
     yield from table(
         ["bonus", "solved", "layout by layout", "first success, mean"],
