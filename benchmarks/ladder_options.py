@@ -152,7 +152,7 @@ def _tables(groups: int, found: Distances, reached: Distances, inside: Distances
     methods = [method for method in METHODS if any(name == method for name, _ in found)]
     learned = [method for method in methods if method != "oracle"]  # the control may lag behind
     whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in learned)]
-    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one number if equal)."
+    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one if equal)."
     yield ""
     yield from table(
         ["ladder", *(METHODS[method][0] for method in methods), "started inside: D-BAT, no diversity, CNN"],
