@@ -80,6 +80,12 @@ class Collected:
     features: tuple[str, ...] = ()
 
 
+class Unmet(UserError):
+    """Play did not meet the states that were needed; ``collected`` is what it met, where that is known."""
+
+    collected: Collected | None = None
+
+
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
     """What tells observations of one shape and type, with these labels, apart: 16 bytes."""
     return blake2b(observation.tobytes() + labels, digest_size=16).digest()
@@ -133,11 +139,11 @@ def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
 
 
 def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: object, do: str) -> None:
-    """Refuse (``UserError``) labels (N, G) of labelled states with one class only of some sub-goal."""
+    """Refuse (``Unmet``) labels (N, G) of labelled states with one class only of some sub-goal."""
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
             lacking = "negatives" if column.any() else "positives"
-            raise UserError(f"{goal} has no {lacking} among {len(labels)} labelled states", where, do)
+            raise Unmet(f"{goal} has no {lacking} among {len(labels)} labelled states", where, do)
 
 
 def require_names(sub_goals: Sequence[str]) -> None:

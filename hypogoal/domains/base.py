@@ -339,6 +339,14 @@ class Domain(ABC):
         """Settings with which ``check`` collects: as in ``config``, but for fewer states."""
         return config
 
+    def shortened(self, config: Any, steps: int) -> Any:
+        """Settings with which ``check`` collects a slow domain in about so many steps; needs ``collected_steps``."""
+        return config
+
+    def collected_steps(self, config: Any) -> int:
+        """Steps that ``collect`` will play in an environment; 0 where not known."""
+        return 0
+
     def inputs(self, config: Any) -> Sequence[Path]:
         """Files that ``collect`` reads."""
         return ()
