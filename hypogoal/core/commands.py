@@ -2,6 +2,7 @@
 
 Words are quoted. Where a file that the command reads names code of the user's own, ``HYPOGOAL_TRUST`` stands in front,
 for what the user allowed in this process; of other code, a stranger's perhaps, it is asked whether the user trusts it.
+It stands there even if the environment has it now: perhaps for this command only.
 """
 
 import re
@@ -14,7 +15,7 @@ from hypogoal.core.artefacts import MANIFEST, find_input, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import visible
 from hypogoal.core.hdf5 import attribute, open_hdf5
-from hypogoal.core.own_code import allowed_before, in_environment, permission
+from hypogoal.core.own_code import allowed_before, permission
 
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")  # module:object
 GENERATIONS = 3  # of artefacts that one was made from: ensemble, options, options that these continue
@@ -22,26 +23,25 @@ GENERATIONS = 3  # of artefacts that one was made from: ensemble, options, optio
 
 def command(*words: object) -> str:
     """A command of ours, ``words`` without ``hypogoal``, as one types it after what this process did."""
-    return _typed(words, [name for name in _lacking(words) if name in allowed_before()])
+    return _typed(words, [name for name in _named(words) if name in allowed_before()])
 
 
 def advice(lead: str, *words: object) -> str:
     """``lead`` and a command that an error advises: 'First run: hypogoal evaluate runs/mine'."""
-    lacking = _lacking(words)
-    unsure = [name for name in lacking if name not in allowed_before()]
+    names = _named(words)
+    unsure = [name for name in names if name not in allowed_before()]
     lead += f", if you trust {' and '.join(unsure)}" if unsure else ""
-    return f"{lead}: {_typed(words, lacking)}"
+    return f"{lead}: {_typed(words, names)}"
 
 
 def _typed(words: tuple[object, ...], names: list[str]) -> str:
     line = shlex.join(["hypogoal", *map(str, words)])
-    return f"{permission(*names)} {line}" if names else line
+    return f"{permission(names)} {line}" if names else line
 
 
-def _lacking(words: tuple[object, ...]) -> list[str]:
-    """Own code that files among the words name and that the environment does not allow."""
-    names = dict.fromkeys(name for word in words[1:] for name in _named_at(Path(str(word))))
-    return [name for name in names if name not in in_environment()]
+def _named(words: tuple[object, ...]) -> list[str]:
+    """Own code that files among the words name."""
+    return [*dict.fromkeys(name for word in words[1:] for name in _named_at(Path(str(word))))]
 
 
 def _named_at(path: Path) -> Iterator[str]:

@@ -21,7 +21,7 @@ import sys
 import sysconfig
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
@@ -70,9 +70,9 @@ def in_environment() -> list[str]:
     return [name for text in os.environ.get(TRUST, "").split(",") if ":" in (name := text.strip())]
 
 
-def permission(*names: str) -> str:
-    """``HYPOGOAL_TRUST`` as one sets it in a shell, so that these names are allowed beside those that are already."""
-    return f"{TRUST}={shlex.quote(','.join(dict.fromkeys([*names, *in_environment()])))}"
+def permission(names: Iterable[str]) -> str:
+    """``HYPOGOAL_TRUST`` as one sets it in a shell to allow these names."""
+    return f"{TRUST}={shlex.quote(','.join(dict.fromkeys(names)))}"
 
 
 def environment_of_children() -> dict[str, str]:
@@ -86,7 +86,7 @@ def require_trust(name: str, what: str) -> None:
     ``what`` it is to be ("domain") stands in the message.
     """
     if ":" in name and name not in allowed():
-        do = f"Do you trust it? Set {permission(name)}"
+        do = f"Do you trust it? Set {permission([name, *in_environment()])}"
         raise UserError(f"a file names code of its own as its {what}", name, do)
 
 

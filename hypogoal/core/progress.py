@@ -85,8 +85,10 @@ class Progress:
         text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value))
         if self._bar is not None:
             self._bar.update(self._task, completed=done, numbers=text)
-        elif done < self.total and time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
-            self._line(text)
+        elif done < self.total:
+            first = done > self._before and not self._said  # it says how long all will take
+            if time.monotonic() - self._last >= (FIRST_SECONDS if first else PLAIN_INTERVAL_SECONDS):
+                self._line(text)
 
     @contextmanager
     def following(self, count: Callable[[], int]) -> Iterator[None]:
@@ -107,11 +109,11 @@ class Progress:
         self.update(count())
 
     def _begin(self) -> None:
-        self._start = time.monotonic()
-        self._last = self._start + min(0.0, FIRST_SECONDS - PLAIN_INTERVAL_SECONDS)
+        self._start = self._last = time.monotonic()
+        self._said = False
 
     def _line(self, text: str) -> None:
-        self._last = time.monotonic()
+        self._last, self._said = time.monotonic(), True
         seconds = max(self._last - self._start, 1e-9)
         rate = max(self.done - self._before, 0) / seconds
         speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""

@@ -268,6 +268,7 @@ class Domain(ABC):
         many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence on how to read its observations, for people.
+        labels_stand_in: where its author adds a sub-goal, for people.
         packed: about how many times smaller collected states are on disk than in memory; 1 where not known.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
@@ -285,6 +286,7 @@ class Domain(ABC):
     many_starts: bool = False
     many_layouts = False
     reading = ""
+    labels_stand_in = "its sub_goals and what its engine's labels() return"
     measures = pictures = sees_agent = False
     near = 0
     packed = 1

@@ -98,7 +98,7 @@ def test_options_do_what_their_members_say(options: Options) -> None:
 
 
 def test_a_masked_option_is_never_silent(options: Options) -> None:
-    """Spec D6, E1: it runs, info says so, and a warning the first time; or none, or it is refused and nothing played."""
+    """Spec D6, E1: it runs, info says so, and a warning the first time; or none; or it is refused, nothing played."""
     envs = {masked: hypogoal.OptionEnv(corridor(), options, masked=masked) for masked in ("warn", "run", "raise")}
     for env in envs.values():
         env.reset(seed=0)
@@ -112,7 +112,7 @@ def test_a_masked_option_is_never_silent(options: Options) -> None:
         envs["raise"].step(1)
     _, _, terminated, _, info = envs["raise"].step(2)
     assert terminated and info["duration"] == 5 and not info["masked"], "nothing was played in between"
-    with pytest.raises(UserError, match="masked='ignore'. Choose of warn, run, raise"):
+    with pytest.raises(UserError, match=r"masked='ignore'\. Choose of warn, run, raise"):
         hypogoal.OptionEnv(corridor(), options, masked="ignore")
 
 
