@@ -385,7 +385,7 @@ class Domain(ABC):
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
     """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
     step: Any = engine.step(actions)
-    do = f"Give a Step of arrays of length {engine.count}; 'hypogoal check' says of which types."
+    do = f"Give a Step of arrays of length {engine.count}, of the types that hypogoal.domains.base.Step says."
     if not isinstance(step, Step):
         UsersCode("the engine's step", engine, "step").refuse(f"gave a {type(step).__name__}, not a Step", do)
     for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):

@@ -178,8 +178,8 @@ def missing(work: Work) -> list[str]:
         do = f"add {name} to {found.labels_stand_in}"
         do = "import them under one of these names, if it is one of them" if domain in BUILT_IN else do
         lines.append(
-            f"no truth of {name} to match members with: {domain} has {page.listed(found.sub_goals)}; {do}, then evaluate "
-            "again"
+            f"no truth of {name} to match members with: {domain} has {page.listed(found.sub_goals)}; {do}, then "
+            "evaluate again"
         )
     return lines
 
