@@ -174,6 +174,8 @@ class UsersCode:
             text, do = f"{_quoted(repr, error)}, to end the program", "Have it raise an error that says what is wrong."
         frames = traceback.extract_tb(error.__traceback__)
         theirs = [frame for frame in frames if not frame.filename.startswith(_libraries())]
+        if inspect.isclass(self.of) and not any(self._in_it(frame) for frame in theirs):
+            theirs = []  # it raised in what called it, since it cannot be called so, or gave what it should not
         place = _place(theirs[-1].filename, theirs[-1].lineno) if theirs else ""
         if isinstance(self.of, str):
             place = f"{self.of} ({place})" if place else self.of
@@ -185,18 +187,24 @@ class UsersCode:
 
     def _place(self) -> str:
         """Where the code begins; of an environment the user's own layers, the outermost first, else the innermost."""
-        starts = [start for layer in layers(self.of) if (start := self._start(layer))]
-        theirs = [start for start in starts if not start[0].startswith(_libraries())]
-        return ", around ".join(dict.fromkeys(_place(*start) for start in theirs or starts[-1:]))
+        spans = [span for layer in layers(self.of) if (span := self._span(layer))]
+        theirs = [span for span in spans if not span[0].startswith(_libraries())]
+        return ", around ".join(dict.fromkeys(_place(*span[:2]) for span in theirs or spans[-1:]))
 
-    def _start(self, of: Any) -> tuple[str, int] | None:
-        """File and line of the method, function or class; None where Python does not know."""
+    def _span(self, of: Any) -> tuple[str, int, int] | None:
+        """File, first line and number of lines of the method, function or class; None where Python does not know."""
         try:
             of = inspect.unwrap(getattr(of, self.method) if self.method else getattr(of, "func", of))
             of = of if inspect.isroutine(of) or inspect.isclass(of) else type(of)
-            return inspect.getsourcefile(of) or "", inspect.getsourcelines(of)[1]
+            source, first = inspect.getsourcelines(of)
+            return inspect.getsourcefile(of) or "", first, len(source)
         except Exception:  # noqa: BLE001 - whatever own objects do when they are asked
             return None
+
+    def _in_it(self, frame: traceback.FrameSummary) -> bool:
+        """Whether a frame is one of the method, function or class."""
+        file, first, count = self._span(self.of) or ("", 0, 0)
+        return frame.filename == file and first <= (frame.lineno or 0) < first + count
 
     def truth(self, value: Any, name: str) -> bool:
         """A truth value, or a number that is 0 or 1, of Python's or of any array library's."""

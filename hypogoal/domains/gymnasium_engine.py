@@ -147,8 +147,13 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
     """What ``env.reset(**arguments)`` gives: an observation, see :class:`Look`, and a dict; else a ``UserError``."""
     with UsersCode("the environment's reset", env, "reset") as code:
-        given: Any = env.reset(**arguments)
-        if not isinstance(given, tuple | list) or len(given) != 2 or not isinstance(given[1], dict):
+        try:
+            given: Any = env.reset(**arguments)
+        except Exception:
+            code.of = _bad_reset(env, arguments)
+            raise
+        if not _complete(given, 2):
+            code.of = _bad_reset(env, arguments)
             code.refuse(f"gave {_kinds(given)}", "Give (observation, info), info a dict.")
         return given[0], given[1]
 
@@ -156,8 +161,13 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """What ``env.step(action)`` gives: an observation, see :class:`Look`, and the rest; else a ``UserError``."""
     with UsersCode("the environment's step", env, "step") as code:
-        given: Any = env.step(action)
-        if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
+        try:
+            given: Any = env.step(action)
+        except Exception:
+            code.of = _bad_step(env, action)
+            raise
+        if not _complete(given, 5):
+            code.of = _bad_step(env, action)
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_kinds(given)}", do)
         number, over = code.number(given[1], "the reward"), code.truth(given[2], "terminated")
@@ -176,16 +186,40 @@ class Starts:
         observation, _info = begun(env, seed=seed)
         start = digest(self.look.read(env, observation, "reset"), repr(_generator(env)).encode())
         if self._known.setdefault(seed, start) != start:
-            layer = innermost(env, lambda layer: not _repeats(layer, seed))
             do = "Pass the seed on: super().reset(seed=seed), in a wrapper self.env.reset(seed=seed, options=options)."
-            code = UsersCode("the environment's reset", type(layer), "reset")
+            layer = culprit(env, lambda layer: not _repeats(layer, seed))
+            code = UsersCode("the environment's reset", layer, "reset")
             code.refuse(f"began two different episodes with seed={seed}", do)
         return observation
 
 
-def innermost(env: gymnasium.Env, broken: Callable[[gymnasium.Env], bool]) -> gymnasium.Env:
-    """The innermost layer, of an environment and its wrappers, that is ``broken``: those around it are so, too."""
-    return next((layer for layer in reversed(layers(env)) if broken(layer)), env)
+def culprit(env: gymnasium.Env, broken: Callable[[gymnasium.Env], bool]) -> Any:
+    """Of an environment and its wrappers the class of the innermost that is ``broken``; all where it does not show.
+
+    Those around a broken one are broken, too.
+    """
+    return next((type(layer) for layer in reversed(layers(env)) if broken(layer)), env)
+
+
+def _bad_reset(env: gymnasium.Env, arguments: Mapping[str, Any]) -> Any:
+    return culprit(env, lambda layer: _broken(lambda: layer.reset(**arguments), 2))
+
+
+def _bad_step(env: gymnasium.Env, action: int) -> Any:
+    return culprit(env, lambda layer: _broken(lambda: (layer.reset(), layer.step(action))[1], 5))
+
+
+def _complete(given: Any, size: int) -> bool:
+    """Whether this is what ``reset`` (2 parts) or ``step`` (5) should give, as far as its form goes."""
+    return isinstance(given, tuple | list) and len(given) == size and isinstance(given[-1], dict)
+
+
+def _broken(call: Callable[[], Any], size: int) -> bool:
+    """Whether a call of ``reset`` or ``step`` fails, or does not give so many parts."""
+    try:
+        return not _complete(call(), size)
+    except Exception:  # noqa: BLE001 - whatever own code raises
+        return True
 
 
 def _repeats(env: gymnasium.Env, seed: int) -> bool:

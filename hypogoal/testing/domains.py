@@ -30,7 +30,7 @@ from hypogoal.dataset import (
     require_names,
 )
 from hypogoal.domains.base import Domain, Engine, Step
-from hypogoal.domains.gymnasium_engine import innermost
+from hypogoal.domains.gymnasium_engine import culprit
 from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Test, TimeUp, Verdict, promise, run
 
@@ -165,7 +165,7 @@ class _Contract:
             except Exception as error:
                 names = " ".join(frame.name for frame in traceback.extract_tb(error.__traceback__))
                 method = next((method for method in ("reset", "step") if method in names), "")
-                layer = type(innermost(env, _breaks))
+                layer = culprit(env, _breaks)
                 with UsersCode("the environment", layer, method, failed="breaks Gymnasium's contract:"):
                     raise
         for warning in given:

@@ -184,11 +184,12 @@ def test_a_strangers_code_is_never_allowed_in_passing(shell: Shell, monkeypatch:
 
 def texts(tree: ast.AST) -> Iterator[ast.Constant | ast.JoinedStr]:
     """The texts in a module that are no docstrings; of one that has parts, the whole."""
-    passed = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
-    for node in ast.walk(tree):
+    passed: set[int] = set()
+    for node in ast.walk(tree):  # what stands around another comes before it
         if isinstance(node, ast.Expr):
             passed.add(id(node.value))
-        elif isinstance(node, ast.JoinedStr) and id(node) not in passed:
+        elif isinstance(node, ast.JoinedStr):
+            passed |= {id(part) for part in node.values}
             yield node
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in passed:
             yield node

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from corridor_env import ALWAYS, NEVER, SUB_GOALS, CorridorEnv, all_labels, at_l
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
+from benchmarks.own_code import FAMILIES
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
@@ -375,6 +377,12 @@ def test_a_wrapper_that_breaks_the_contract_is_named(
     err = capsys.readouterr().err
     assert here in err and err.count("\n") == 1, err
     assert not [*tmp_path.glob("*")]
+
+
+@pytest.mark.parametrize("family", [*FAMILIES])
+def test_a_few_of_many_stacks_and_commands(family: str) -> None:
+    """Spec B6, G2: a few of the cases of ``benchmarks.own_code``."""
+    assert all(FAMILIES[family](random.Random(f"test {family} {case}")) for case in range(30))
 
 
 def test_an_environment_that_drops_the_seed_is_named(
