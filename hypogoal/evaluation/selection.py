@@ -194,7 +194,8 @@ PRACTISED = (
 
 def summary(metrics: Metrics) -> list[Table]:
     """What options do, for a terminal, where no policy over them tells it."""
-    agents = [] if variants(metrics["selection"]) else metrics["selection"]
+    agents = metrics.get("selection", [])
+    agents = [] if variants(agents) else agents
     members: dict[str, list[Entry]] = {}
     for goal in (goal for agent in agents for run in agent["runs"] for goal in run["sub_goals"]):
         members.setdefault(goal["sub_goal"], []).extend(goal["members"])
