@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core import hdf5
 from hypogoal.core.artefacts import DATA, claim, versions
+from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
 
@@ -80,6 +81,12 @@ class Collected:
     features: tuple[str, ...] = ()
 
 
+class Unmet(UserError):
+    """Play did not meet the states that were needed; ``collected`` is what it met, where that is known."""
+
+    collected: Collected | None = None
+
+
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
     """What tells observations of one shape and type, with these labels, apart: 16 bytes."""
     return blake2b(observation.tobytes() + labels, digest_size=16).digest()
@@ -133,11 +140,11 @@ def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
 
 
 def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: object, do: str) -> None:
-    """Refuse (``UserError``) labels (N, G) of labelled states with one class only of some sub-goal."""
+    """Refuse (``Unmet``) labels (N, G) of labelled states with one class only of some sub-goal."""
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
             lacking = "negatives" if column.any() else "positives"
-            raise UserError(f"{goal} has no {lacking} among {len(labels)} labelled states", where, do)
+            raise Unmet(f"{goal} has no {lacking} among {len(labels)} labelled states", where, do)
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
@@ -238,7 +245,7 @@ class Dataset:
 
     def __init__(self, path: Path):
         self.path = path
-        foreign = UserError("not a hypogoal data file", path, "Make one with 'hypogoal collect'.")
+        foreign = UserError("not a hypogoal data file", path, advice("How to make one", "collect", "--help"))
         with self._file() as file:
             version = hdf5.attribute(file, "format")
             if not isinstance(version, int) or isinstance(version, bool):
@@ -370,8 +377,8 @@ class Dataset:
 def open_dataset(path: Path) -> Dataset:
     """Open a data file written by ``collect`` (or by the user in the same schema); ``UserError`` if it is not one."""
     if path.is_dir():
-        do = "Give the .h5 file that 'hypogoal collect' wrote."
+        do = "Give the .h5 file in it."
         raise UserError("a folder where a data file is needed", path, do)
     if not path.exists():
-        raise UserError("no such data file", path, "Make it with 'hypogoal collect'.")
+        raise UserError("no such data file", path, advice("How to make it", "collect", "--help"))
     return Dataset(path)

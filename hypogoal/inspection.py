@@ -14,6 +14,7 @@ from rich.console import Group
 from rich.table import Table
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
+from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, visible
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
@@ -141,11 +142,12 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
     from hypogoal.evaluation.pictures import contact_sheets
 
     if not path.is_file():
-        raise UserError("contact sheets need a data file", path, "Give the .h5 file that 'hypogoal collect' wrote.")
+        raise UserError("contact sheets need a data file", path, "Give the .h5 file of the states.")
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
         given = f"{dataset.observation_dtype} {dataset.observation_shape}"
-        raise UserError("the states are not pictures", given, f"Read them with 'hypogoal export {path} --out X.npz'.")
+        do = advice("Read them as arrays", "export", path, "--out", f"{path.stem}.npz")
+        raise UserError("the states are not pictures", given, do)
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []

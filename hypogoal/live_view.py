@@ -93,7 +93,7 @@ def finished(run: Path) -> bool:
 def read_progress(run: Path) -> list[Progressing]:
     """What is being made first, then what is complete, each by its path; a ``UserError`` where nothing logs."""
     if not run.is_dir():
-        raise UserError("no such run", run, "Give the folder that 'hypogoal run' or a stage writes into.")
+        raise UserError("no such run", run, "Give the folder that 'run' or a stage writes into.")
     logs = [*run.rglob(LOG), *run.rglob(f".*{PARTIAL}/{FOLDER}/*.jsonl")]  # an ensemble's sub-goals have one each
     found = [_read(log, run) for log in sorted(logs)]
     if not found:

@@ -18,7 +18,7 @@ from typer import Option
 from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: skip  # so --help has them in this order
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core import stopping
-from hypogoal.core.errors import Complete, NumericalError, UserError
+from hypogoal.core.errors import Complete, NumericalError, UserError, one_line
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
 from hypogoal.settings import CONFIGS, TABLES
 
@@ -183,7 +183,7 @@ def notes_of(error: BaseException) -> list[str]:
 
 
 def _fail(message: str, code: int) -> int:
-    say(f"hypogoal: {' '.join(message.split())}", err=True)
+    say(f"hypogoal: {one_line(message)}", err=True)
     return code
 
 

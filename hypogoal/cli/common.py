@@ -3,7 +3,6 @@
 import contextlib
 import inspect
 import json
-import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from importlib.metadata import entry_points
@@ -216,7 +215,9 @@ def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
 def print_next(quiet: bool, *words: object) -> None:
     """The command that follows, as one would type it; nothing where none does."""
     if words and not quiet:
-        say(f"next: {shlex.join(['hypogoal', *map(str, words)])}")
+        from hypogoal.core.commands import command as typed
+
+        say(f"next: {typed(*words)}")
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:

@@ -13,6 +13,7 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER
+from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import give, say
 from hypogoal.settings import configuration
 
@@ -136,6 +137,7 @@ def check(
     play: cli.Play = None,
     seed: cli.Seed = 0,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play.")] = 0,
+    minutes: Annotated[float, Option(min=0.01, help="A slow domain plays less, so that it takes about so long.")] = 2.0,
 ) -> None:
     """Check that your domain, objective or network keeps its contract.
 
@@ -149,16 +151,19 @@ def check(
     kept = True
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
         config = configuration("collect", domain, None, set_, {"play": play}, given=True) if domain else None
-        for verdict in _verdicts(domain, diversity, network, config, seed, layout_seed):
-            for line in verdict.lines:
-                say(line)
-            kept &= verdict.ok
+        with Progress("check", total=1, quiet=domain is None) as progress:
+            told = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
+            for verdict in _verdicts(domain, diversity, network, config, told):
+                with progress.paused():
+                    for line in verdict.lines:
+                        say(line)
+                kept &= verdict.ok
     if not kept:
         raise typer.Exit(2)
 
 
 def _verdicts(
-    domain: str | None, diversity: str | None, network: str | None, config: Any, seed: int, layout_seed: int
+    domain: str | None, diversity: str | None, network: str | None, config: Any, told: dict[str, Any]
 ) -> Iterator[Verdict]:
     from hypogoal.testing import check_domain, check_network, check_objective
 
@@ -167,7 +172,7 @@ def _verdicts(
         from hypogoal.domains.base import load_domain
 
         found = load_domain(domain, given=True)
-        yield from check_domain(found, config, layout_seed=layout_seed, seed=seed)
+        yield from check_domain(found, config, name=domain, **told)
         seen = tuple(found.observation_shape), found.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective

@@ -108,6 +108,7 @@ def sweep(
         return
 
     from hypogoal.core import own_code
+    from hypogoal.core.commands import advice
     from hypogoal.core.compute import prepare
     from hypogoal.core.errors import UserError
     from hypogoal.experiments.runners.slurm import Options
@@ -117,7 +118,7 @@ def sweep(
         give(stage.gather(out))
         return
     if experiment is None:
-        raise UserError("which experiment?", "hypogoal sweep", "See 'hypogoal sweep --help'.")
+        raise UserError("which experiment?", "sweep", advice("Which there are", "sweep", "--help"))
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
     planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)

@@ -266,7 +266,7 @@ def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefa
 def find_artefacts(run: Path, kind: str) -> list[Artefact]:
     """All complete artefacts of ``kind`` below ``run`` (and ``run`` itself), sorted by path."""
     if not run.is_dir():
-        raise UserError("no such run", run, "Give the folder that 'hypogoal run' wrote.")
+        raise UserError("no such run", run, "Give the folder of a run.")
     near = [path.parent for path in visible(run, MANIFEST) if len(path.relative_to(run).parts) <= DEPTH + 1]
     return [artefact for artefact in map(open_artefact, near) if artefact.kind == kind]
 

@@ -118,17 +118,20 @@ def resolve(
     values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})
     values.update(parse_assignments(assignments))
-    return from_values(config_class, values, stage)
+    return from_values(config_class, values, stage, domain)
 
 
-def from_values(config_class: type[T], values: Mapping[str, Any], stage: str) -> T:
-    """Build ``config_class`` from plain values (text, TOML or JSON), checking each of them."""
+def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, domain: str = DOMAIN) -> T:
+    """Build ``config_class`` from plain values (text, TOML or JSON), checking each; ``domain`` is for messages."""
     fields = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     kinds = typing.get_type_hints(config_class)
     checked: dict[str, Any] = {}
     for key, value in values.items():
         if key not in fields:
-            raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}See 'hypogoal config {stage}'.")
+            from hypogoal.core.commands import advice  # which needs more than this module may load
+
+            do = advice("All of them", "config", stage, *([] if domain == DOMAIN else ["--domain", domain]))
+            raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}{do}")
         checked[key] = _checked(fields[key], kinds[key], value, stage)
     return config_class(**checked)
 

@@ -3,6 +3,11 @@
 from hypogoal.core.terminal import printable
 
 
+def one_line(text: str) -> str:
+    """A text without its ends of lines; spaces within one stay, since a path may have them."""
+    return " ".join(line.strip() for line in text.expandtabs(1).splitlines() if line.strip())
+
+
 class UserError(Exception):
     """A mistake that the user can fix. The command line prints it as one line and exits with code 2.
 
@@ -15,8 +20,7 @@ class UserError(Exception):
     def __init__(self, what: str, where: object = None, do: str = ""):
         self.what, self.where, self.do = what, where, do
         line = what if where is None else f"{what}: {where}"
-        text = " ".join((f"{line}. {do}" if do else line).split())
-        super().__init__(printable(text))
+        super().__init__(printable(one_line(f"{line}. {do}" if do else line)))
 
 
 class Killed(UserError):

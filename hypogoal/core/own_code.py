@@ -11,15 +11,17 @@ Whatever such code does, raises or gives back ends as one line that says where i
 """
 
 import contextlib
+import functools
 import importlib
 import inspect
 import operator
 import os
+import shlex
 import sys
 import sysconfig
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
@@ -33,6 +35,7 @@ OF_FILE = "HYPOGOAL_COMMAND_OF_FILE"  # in the environment: this process runs a 
 MOST = 3.4028234663852886e38  # float32's: rewards are kept as such
 LONGEST = 200  # signs of what own code says that are quoted
 _given: ContextVar[frozenset[str]] = ContextVar("_given", default=frozenset())
+_before: set[str] = set()  # all that were ever given in this process
 _own: set[str] = set()  # top-level modules that were loaded by name and are not hypogoal's
 
 
@@ -45,6 +48,7 @@ def given(*names: str) -> contextlib.AbstractContextManager[None]:
 def vouched(*names: str) -> Iterator[None]:
     """Within the block these names may be loaded: code that runs already says them, such as a domain its network."""
     token = _given.set(_given.get() | set(names))
+    _before.update(names)
     try:
         yield
     finally:
@@ -53,8 +57,22 @@ def vouched(*names: str) -> Iterator[None]:
 
 def allowed() -> frozenset[str]:
     """The ``module:object`` that may be loaded here: what the user gave, and what ``HYPOGOAL_TRUST`` names."""
-    names = {*_given.get(), *os.environ.get(TRUST, "").split(",")}
-    return frozenset(name.strip() for name in names if ":" in name)
+    return frozenset(name.strip() for name in (*_given.get(), *in_environment()) if ":" in name)
+
+
+def allowed_before() -> frozenset[str]:
+    """The ``module:object`` that the user allowed at some time in this process."""
+    return frozenset({*_before, *in_environment()})
+
+
+def in_environment() -> list[str]:
+    """What ``HYPOGOAL_TRUST`` names."""
+    return [name for text in os.environ.get(TRUST, "").split(",") if ":" in (name := text.strip())]
+
+
+def permission(names: Iterable[str]) -> str:
+    """``HYPOGOAL_TRUST`` as one sets it in a shell to allow these names."""
+    return f"{TRUST}={shlex.quote(','.join(dict.fromkeys(names)))}"
 
 
 def environment_of_children() -> dict[str, str]:
@@ -68,7 +86,8 @@ def require_trust(name: str, what: str) -> None:
     ``what`` it is to be ("domain") stands in the message.
     """
     if ":" in name and name not in allowed():
-        raise UserError(f"a file names code of its own as its {what}", name, f"Do you trust it? Set {TRUST}={name}")
+        do = f"Do you trust it? Set {permission([name, *in_environment()])}"
+        raise UserError(f"a file names code of its own as its {what}", name, do)
 
 
 def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> Any:
@@ -153,9 +172,10 @@ class UsersCode:
         text = f"{type(error).__name__}: {_quoted(str, error)}"
         if isinstance(error, SystemExit):
             text, do = f"{_quoted(repr, error)}, to end the program", "Have it raise an error that says what is wrong."
-        libraries = [sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")]
-        others = (*(f"{folder}{os.sep}" for folder in (*libraries, Path(__file__).parents[1])), "<")
-        theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(others)]
+        frames = traceback.extract_tb(error.__traceback__)
+        theirs = [frame for frame in frames if not frame.filename.startswith(_libraries())]
+        if inspect.isclass(self.of) and not any(self._in_it(frame) for frame in theirs):
+            theirs = []  # it raised in what called it, since it cannot be called so, or gave what it should not
         place = _place(theirs[-1].filename, theirs[-1].lineno) if theirs else ""
         if isinstance(self.of, str):
             place = f"{self.of} ({place})" if place else self.of
@@ -166,14 +186,25 @@ class UsersCode:
         raise UserError(f"{self.what} {gave}", self._place() or None, do)
 
     def _place(self) -> str:
-        """Where the code begins: an environment's own, behind its wrappers; nothing where Python does not know."""
+        """Where the code begins; of an environment the user's own layers, the outermost first, else the innermost."""
+        spans = [span for layer in layers(self.of) if (span := self._span(layer))]
+        theirs = [span for span in spans if not span[0].startswith(_libraries())]
+        return ", around ".join(dict.fromkeys(_place(*span[:2]) for span in theirs or spans[-1:]))
+
+    def _span(self, of: Any) -> tuple[str, int, int] | None:
+        """File, first line and number of lines of the method, function or class; None where Python does not know."""
         try:
-            of: Any = getattr(self.of, "unwrapped", self.of)
             of = inspect.unwrap(getattr(of, self.method) if self.method else getattr(of, "func", of))
             of = of if inspect.isroutine(of) or inspect.isclass(of) else type(of)
-            return _place(inspect.getsourcefile(of) or "", inspect.getsourcelines(of)[1])
+            source, first = inspect.getsourcelines(of)
+            return inspect.getsourcefile(of) or "", first, len(source)
         except Exception:  # noqa: BLE001 - whatever own objects do when they are asked
-            return ""
+            return None
+
+    def _in_it(self, frame: traceback.FrameSummary) -> bool:
+        """Whether a frame is one of the method, function or class."""
+        file, first, count = self._span(self.of) or ("", 0, 0)
+        return frame.filename == file and first <= (frame.lineno or 0) < first + count
 
     def truth(self, value: Any, name: str) -> bool:
         """A truth value, or a number that is 0 or 1, of Python's or of any array library's."""
@@ -226,6 +257,21 @@ def as_number(value: Any) -> int | None:
 def _plain(value: Any) -> Any:
     """Python's number of a scalar of any array library's; anything else as it is."""
     return value.item() if getattr(value, "shape", None) == () else value
+
+
+def layers(of: Any) -> list[Any]:
+    """An environment's wrappers and itself, the outermost first; anything else alone."""
+    found = [of]
+    while hasattr(type(of), "unwrapped") and (of := getattr(of, "__dict__", {}).get("env")) is not None:
+        found.append(of)
+    return found
+
+
+@functools.cache
+def _libraries() -> tuple[str, ...]:
+    """What the names of files begin with that are nobody's own code: Python's, installed packages' and ours."""
+    folders = (*(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")), Path(__file__).parents[1])
+    return (*(f"{folder}{os.sep}" for folder in folders), "<")
 
 
 def _module(frame: FrameType) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from hypogoal.core.terminal import printable, say, screen
 
-PLAIN_INTERVAL_SECONDS = 10.0
+FIRST_SECONDS, PLAIN_INTERVAL_SECONDS = 2.0, 10.0  # until the first line says how long it will take, and the next
 LOOK_SECONDS = 1.0
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86400.0}  # of time, and their seconds
 
@@ -25,7 +25,7 @@ class Progress:
     def __init__(self, title: str, total: int, quiet: bool = False):
         self.title, self.total, self.quiet = title, total, quiet
         self.done = self._before = 0
-        self._start = self._last = time.monotonic()
+        self._begin()
         self._bar: Any = None
         self._task: Any = None
 
@@ -49,8 +49,17 @@ class Progress:
     def __exit__(self, kind: object, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
-        elif not self.quiet and kind is None:
+        elif not self.quiet and kind is None and self.done:
             self._line(f"done in {duration(time.monotonic() - self._start)}")
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Within the block something else is printed: no bar is in its way."""
+        if self._bar is not None:
+            self._bar.stop()
+        yield
+        if self._bar is not None:
+            self._bar.start()
 
     def expect(self, total: int) -> None:
         """How many units there will be, where that is known only now."""
@@ -59,8 +68,9 @@ class Progress:
             self._bar.update(self._task, total=total)
 
     def resume(self, done: int) -> None:
-        """``done`` units were done before this."""
+        """``done`` units were done before this moment."""
         self._before = done
+        self._begin()
         self.update(done)
 
     def advance(self, n: int = 1, **numbers: float) -> None:
@@ -75,8 +85,10 @@ class Progress:
         text = " ".join(f"{name} {value:.3g}" for name, value in numbers.items() if not math.isnan(value))
         if self._bar is not None:
             self._bar.update(self._task, completed=done, numbers=text)
-        elif done < self.total and time.monotonic() - self._last >= PLAIN_INTERVAL_SECONDS:
-            self._line(text)
+        elif done < self.total:
+            first = done > self._before and not self._said  # it says how long all will take
+            if time.monotonic() - self._last >= (FIRST_SECONDS if first else PLAIN_INTERVAL_SECONDS):
+                self._line(text)
 
     @contextmanager
     def following(self, count: Callable[[], int]) -> Iterator[None]:
@@ -96,8 +108,12 @@ class Progress:
             thread.join()
         self.update(count())
 
+    def _begin(self) -> None:
+        self._start = self._last = time.monotonic()
+        self._said = False
+
     def _line(self, text: str) -> None:
-        self._last = time.monotonic()
+        self._last, self._said = time.monotonic(), True
         seconds = max(self._last - self._start, 1e-9)
         rate = max(self.done - self._before, 0) / seconds
         speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""

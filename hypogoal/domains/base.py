@@ -268,6 +268,7 @@ class Domain(ABC):
         many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
         reading: a sentence on how to read its observations, for people.
+        labels_stand_in: where its author adds a sub-goal, for people.
         packed: about how many times smaller collected states are on disk than in memory; 1 where not known.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
@@ -285,6 +286,7 @@ class Domain(ABC):
     many_starts: bool = False
     many_layouts = False
     reading = ""
+    labels_stand_in = "its sub_goals and what its engine's labels() return"
     measures = pictures = sees_agent = False
     near = 0
     packed = 1
@@ -339,6 +341,14 @@ class Domain(ABC):
         """Settings with which ``check`` collects: as in ``config``, but for fewer states."""
         return config
 
+    def shortened(self, config: Any, steps: int) -> Any:
+        """Settings with which ``check`` collects a slow domain in about so many steps; needs ``collected_steps``."""
+        return config
+
+    def collected_steps(self, config: Any) -> int:
+        """Steps that ``collect`` will play in an environment; 0 where not known."""
+        return 0
+
     def inputs(self, config: Any) -> Sequence[Path]:
         """Files that ``collect`` reads."""
         return ()
@@ -375,7 +385,7 @@ class Domain(ABC):
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
     """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
     step: Any = engine.step(actions)
-    do = f"Give a Step of arrays of length {engine.count}; 'hypogoal check' says of which types."
+    do = f"Give a Step of arrays of length {engine.count}, of the types that hypogoal.domains.base.Step says."
     if not isinstance(step, Step):
         UsersCode("the engine's step", engine, "step").refuse(f"gave a {type(step).__name__}, not a Step", do)
     for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):

@@ -16,13 +16,15 @@ from hypogoal.core.config import as_dict, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.seeding import rng_for
-from hypogoal.dataset import GET_MORE, Collected, Observations, States, digest, require_classes
+from hypogoal.dataset import GET_MORE, Collected, Observations, States, Unmet, digest, require_classes
 from hypogoal.domains import gymnasium_engine as engines
 from hypogoal.domains.base import Domain
 from hypogoal.domains.recorded_play import MINARI, Recorded, read_play
 
 Policy = Callable[[gymnasium.Env, Any, np.random.Generator], int]
 """What is played to collect states: (environment, observation, random numbers) -> action."""
+SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
+FEW_STEPS = 200  # on a layout: of fewer, check plays on fewer layouts
 _Layout = tuple[int, list[Recorded]]  # its seed, and what was recorded on it
 
 
@@ -82,6 +84,7 @@ class GymnasiumDomain(Domain):
     """
 
     many_layouts = True
+    labels_stand_in = "the sub-goals of its GymnasiumDomain, with a function that says where it holds"
 
     def __init__(
         self,
@@ -152,6 +155,20 @@ class GymnasiumDomain(Domain):
     def small(self, config: GymnasiumConfig) -> GymnasiumConfig:
         return replace(config, states=min(config.states, 200))
 
+    def shortened(self, config: GymnasiumConfig, steps: int) -> GymnasiumConfig:
+        """Fewer steps on each layout; where that would be few, one layout of each set, unless play may be of others."""
+        seeds = {name: getattr(config, name) for name in SEEDS}
+        if not config.play and steps < FEW_STEPS * sum(map(len, seeds.values())):
+            seeds = {name: values[:1] for name, values in seeds.items()}
+        replayed = self.collected_steps(replace(config, steps=0))
+        share = max(1, (steps - replayed) // max(1, sum(map(len, seeds.values()))))
+        return replace(config, **seeds, steps=min(config.steps, share))
+
+    def collected_steps(self, config: GymnasiumConfig) -> int:
+        recorded = (way for path in config.play for way in read_play(Path(path)))
+        layouts = sum(len(getattr(config, name)) for name in SEEDS)
+        return layouts * config.steps + sum(len(way.actions) for way in recorded)
+
     def inputs(self, config: GymnasiumConfig) -> list[Path]:
         return [path / MINARI if path.is_dir() else path for path in map(Path, config.play)]
 
@@ -166,10 +183,10 @@ class GymnasiumDomain(Domain):
         """Labelled, unlabelled and held-out states met in play on each layout, each picture once.
 
         Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
-        and ``step``, counted from 0. Raises ``UserError`` if the labelled states have one class only, if there are no
-        unlabelled or no held-out states, or if recorded play cannot be replayed.
+        and ``step``, counted from 0. Raises ``Unmet`` if the labelled states have one class only, or if there are no
+        unlabelled or no held-out states, ``UserError`` if recorded play cannot be replayed.
         """
-        seeds_of_sets = config.labelled_seeds, config.unlabelled_seeds, config.heldout_seeds
+        seeds_of_sets = [getattr(config, name) for name in SEEDS]
         env = engines.make_checked(partial(self.make_env, **self.world(as_dict(config))))
         recorded = [way for path in config.play for way in read_play(Path(path))]
         for way in recorded:
@@ -178,7 +195,7 @@ class GymnasiumDomain(Domain):
                 what = f"recorded play has layout seed {way.layout_seed} and actions up to {max(way.actions)}"
                 do = f"The seed must be in labelled_seeds, unlabelled_seeds or heldout_seeds, actions in 0 to {most}."
                 raise UserError(what, way.where, do)
-        progress.expect(sum(map(len, seeds_of_sets)) * config.steps + sum(len(way.actions) for way in recorded))
+        progress.expect(self.collected_steps(config))
         learnt: set[bytes] = set()  # what the labelled and the unlabelled states look like
         sets: list[States] = []
         for seeds in seeds_of_sets:
@@ -189,13 +206,18 @@ class GymnasiumDomain(Domain):
             learnt.update(map(digest, sets[-1].observations))
         env.close()
         labelled, unlabelled, heldout = sets
+        collected = Collected(self.look.shape, self.sub_goals, labelled, unlabelled, heldout, self.look.features)
         where = f"steps={config.steps}"
-        for states, what in ((unlabelled, "unlabelled"), (heldout, "held-out")):
-            if not len(states.observations):
-                do = "Give other seeds, or more steps: states that look like training states do not count."
-                raise UserError(f"there are no {what} states", where, do)
-        require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
-        return Collected(self.look.shape, self.sub_goals, labelled, unlabelled, heldout, self.look.features)
+        try:
+            for states, name in ((unlabelled, "unlabelled"), (heldout, "held-out")):
+                if not len(states.observations):
+                    do = "Give other seeds, or more steps: states that look like training states do not count."
+                    raise Unmet(f"there are no {name} states", where, do)
+            require_classes(labelled.labels, self.sub_goals, where, GET_MORE)
+        except Unmet as error:
+            error.collected = collected
+            raise
+        return collected
 
     def _play(
         self, env: gymnasium.Env, config: GymnasiumConfig, on: _Layout, seed: int, avoid: set[bytes], progress: Any
@@ -210,6 +232,7 @@ class GymnasiumDomain(Domain):
         groups: dict[bytes, _Sample] = {}
         episode, step, last = -1, 0, 0
         actions = int(env.action_space.n)  # type: ignore[attr-defined]
+        starts = engines.Starts(self.look)
 
         def look(observation: Any) -> None:
             image = self.look.read(env, observation)
@@ -229,7 +252,7 @@ class GymnasiumDomain(Domain):
             over = True
             for left in range(steps, 0, -1):
                 if over or step == last:
-                    observation, _info = engines.begun(env, seed=layout)
+                    observation = starts.begin(env, layout)
                     episode, step = episode + 1, 0
                     look(observation)
                     way = ways[int(rng.integers(len(ways)))].actions if ways else ()

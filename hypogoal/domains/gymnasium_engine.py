@@ -2,16 +2,18 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 from PIL import Image
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode
+from hypogoal.core.own_code import UsersCode, layers
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 
@@ -20,6 +22,7 @@ Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
 MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
+RESETS = 5  # which a wrapper that drops the seed hardly passes by chance
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
 
@@ -66,9 +69,9 @@ class Look(NamedTuple):
     features: tuple[str, ...] = ()
     key: str = ""
 
-    def read(self, env: gymnasium.Env, observation: Any) -> Any:
-        """An observation (*shape), in memory of its own; a ``UserError`` where its space says other."""
-        code = UsersCode("the environment", env, "step")
+    def read(self, env: gymnasium.Env, observation: Any, method: str = "step") -> Any:
+        """An observation (*shape) that ``method`` gave, in memory of its own; ``UserError`` if its space says other."""
+        code = UsersCode("the environment", env, method)
         with code:
             if self.key:
                 observation = observation[self.key]
@@ -144,8 +147,13 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
     """What ``env.reset(**arguments)`` gives: an observation, see :class:`Look`, and a dict; else a ``UserError``."""
     with UsersCode("the environment's reset", env, "reset") as code:
-        given: Any = env.reset(**arguments)
-        if not isinstance(given, tuple | list) or len(given) != 2 or not isinstance(given[1], dict):
+        try:
+            given: Any = env.reset(**arguments)
+        except Exception:
+            code.of = _bad_reset(env, arguments)
+            raise
+        if not _complete(given, 2):
+            code.of = _bad_reset(env, arguments)
             code.refuse(f"gave {_kinds(given)}", "Give (observation, info), info a dict.")
         return given[0], given[1]
 
@@ -153,12 +161,80 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """What ``env.step(action)`` gives: an observation, see :class:`Look`, and the rest; else a ``UserError``."""
     with UsersCode("the environment's step", env, "step") as code:
-        given: Any = env.step(action)
-        if not isinstance(given, tuple | list) or len(given) != 5 or not isinstance(given[4], dict):
+        try:
+            given: Any = env.step(action)
+        except Exception:
+            code.of = _bad_step(env, action)
+            raise
+        if not _complete(given, 5):
+            code.of = _bad_step(env, action)
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_kinds(given)}", do)
         number, over = code.number(given[1], "the reward"), code.truth(given[2], "terminated")
         return given[0], number, over, code.truth(given[3], "truncated"), given[4]
+
+
+class Starts:
+    """How the episodes of each layout begin: training relies on the same seed to begin the same episode."""
+
+    def __init__(self, look: Look):
+        self.look = look
+        self._known: dict[int, bytes] = {}  # by seed, a digest of the first observation and the generator
+
+    def begin(self, env: gymnasium.Env, seed: int) -> Any:
+        """What ``env.reset(seed=seed)`` shows; a ``UserError`` where it showed, or will draw, something else before."""
+        observation, _info = begun(env, seed=seed)
+        start = digest(self.look.read(env, observation, "reset"), repr(_generator(env)).encode())
+        if self._known.setdefault(seed, start) != start:
+            do = "Pass the seed on: super().reset(seed=seed), in a wrapper self.env.reset(seed=seed, options=options)."
+            layer = culprit(env, lambda layer: not _repeats(layer, seed))
+            code = UsersCode("the environment's reset", layer, "reset")
+            code.refuse(f"began two different episodes with seed={seed}", do)
+        return observation
+
+
+def culprit(env: gymnasium.Env, broken: Callable[[gymnasium.Env], bool]) -> Any:
+    """Of an environment and its wrappers the class of the innermost that is ``broken``; all where it does not show.
+
+    Those around a broken one are broken, too.
+    """
+    return next((type(layer) for layer in reversed(layers(env)) if broken(layer)), env)
+
+
+def _bad_reset(env: gymnasium.Env, arguments: Mapping[str, Any]) -> Any:
+    return culprit(env, lambda layer: _broken(lambda: layer.reset(**arguments), 2))
+
+
+def _bad_step(env: gymnasium.Env, action: int) -> Any:
+    return culprit(env, lambda layer: _broken(lambda: (layer.reset(), layer.step(action))[1], 5))
+
+
+def _complete(given: Any, size: int) -> bool:
+    """Whether this is what ``reset`` (2 parts) or ``step`` (5) should give, as far as its form goes."""
+    return isinstance(given, tuple | list) and len(given) == size and isinstance(given[-1], dict)
+
+
+def _broken(call: Callable[[], Any], size: int) -> bool:
+    """Whether a call of ``reset`` or ``step`` fails, or does not give so many parts."""
+    try:
+        return not _complete(call(), size)
+    except Exception:  # noqa: BLE001 - whatever own code raises
+        return True
+
+
+def _repeats(env: gymnasium.Env, seed: int) -> bool:
+    """Whether episodes begin alike for the same seed, as far as ``RESETS`` show it."""
+    try:
+        starts = [(deepcopy(env.reset(seed=seed)[0]), _generator(env)) for _ in range(RESETS)]
+    except Exception:  # noqa: BLE001 - whatever own code raises
+        return False
+    return all(data_equivalence(start, starts[0], exact=True) for start in starts)
+
+
+def _generator(env: gymnasium.Env) -> Any:
+    """The state of the environment's random numbers; None where it has none so far."""
+    generator = getattr(env.unwrapped, "_np_random", None)
+    return getattr(getattr(generator, "bit_generator", None), "state", None)
 
 
 def _kinds(given: object) -> str:
@@ -240,6 +316,7 @@ class GymnasiumEngine(TurnEngine):
         self._ask, self._success = labels, success
         self._earned, self._succeeded = [0.0] * count, [False] * count  # in the episode so far; it ended so just now
         self.look = look_of(self._envs[0])
+        self._starts = Starts(self.look)
         self.observation_shape, self.observation_dtype = self.look.shape, self.look.dtype
         self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
         self._ring: list[Observations] = []
@@ -257,7 +334,7 @@ class GymnasiumEngine(TurnEngine):
         return self.n_states - len(self._ring)
 
     def _begin(self, number: int) -> int:
-        observation, _info = begun(self._envs[number], seed=self.layouts.begin(number))
+        observation = self._starts.begin(self._envs[number], self.layouts.begin(number))
         self._played[number], self._earned[number] = [], 0.0
         return self._remember(self._envs[number], observation)
 

@@ -379,8 +379,14 @@ def summary_section(material: Material) -> Block:
 
 
 def _answers(material: Material) -> list[str]:
-    """What came out: a paragraph for each variant of the option agent, with its name where there are several."""
-    shown = variants(material.metrics["agents"])
+    """What came out: a paragraph for each variant of the option agent, with its name where there are several.
+
+    Where no such agent was trained, one for each that was.
+    """
+    agents = material.metrics["agents"]
+    shown = variants(agents)
+    if not shown:
+        return [f"No policy over options was trained. {_achieved(agent, agent['name'])}" for agent in agents]
     paragraphs = []
     for agent in shown:
         text = _achieved(agent, f"the agent '{agent['name']}'" if len(shown) > 1 else "the option agent")

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
+from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import plain_name, read_json, read_text
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
@@ -77,7 +78,7 @@ def find(run: Path) -> Contents:
     agents = [*metas, *others, *find_artefacts(run, "baseline")]
     contents = Contents(run, find_artefacts(run, "ensemble"), agents, ladders, silent, continued)
     if not contents.everything():
-        raise UserError("nothing to evaluate", run, "Train something into it first, see 'hypogoal run --help'.")
+        raise UserError("nothing to evaluate", run, advice("Train something into it first", "run", "--help"))
     return contents
 
 
@@ -268,7 +269,7 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     """
     found = find_artefacts(run, "evaluation")
     if not found:
-        raise UserError("this run was not evaluated", run, f"First run: hypogoal evaluate {run}")
+        raise UserError("this run was not evaluated", run, advice("First run", "evaluate", run))
     source = next((artefact for artefact in found if artefact.path == run / "evaluation"), found[0])
     source.whole()
     metrics = _metrics(source.path / "metrics.json")
@@ -295,7 +296,9 @@ def _since(run: Path, source: Artefact) -> list[str]:
     except UserError:  # evaluations may lie where nothing else does
         return []
     names = [contents.name(of) for of in contents.everything() if sha256_of(of.path / MANIFEST) not in evaluated]
-    return [f"{name}: made since this evaluation ('hypogoal evaluate {run} --force' reads it)" for name in names]
+    elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
+    do = advice("evaluate it again", "evaluate", run, *elsewhere, "--force") if names else ""
+    return [f"{name}: made since this evaluation ({do})" for name in names]
 
 
 def _metrics(path: Path) -> dict[str, Any]:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rich.table import Table
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import PICTURE
-from hypogoal.domains.base import Engine, Layouts, load_domain, step_of
+from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, THOMPSON, base_name, variants, which
 from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
@@ -162,11 +163,54 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
 
 
 def missing(work: Work) -> list[str]:
-    """Sub-goals of which the domain does not know where they are reached."""
-    goals = [goal for agent in work.metrics["selection"] for run in agent["runs"] for goal in run["sub_goals"]]
-    unknown = [goal for goal in goals if all(math.isnan(member["match"]) for member in goal["members"])]
-    names = dict.fromkeys(goal["sub_goal"] for goal in unknown)
-    return [f"no truth of {name} in its domain, to match members with" for name in names]
+    """Sub-goals of which the domain does not know where they are reached, and where to say it."""
+    domains = {work.contents.name(artefact): artefact.config["domain"] for artefact in work.contents.agents}
+    unknown = {
+        (goal["sub_goal"], domains[run["path"]]): None
+        for agent in work.metrics["selection"]
+        for run in agent["runs"]
+        for goal in run["sub_goals"]
+        if all(math.isnan(member["match"]) for member in goal["members"])
+    }
+    lines = []
+    for name, domain in unknown:
+        found = load_domain(domain)
+        do = f"add {name} to {found.labels_stand_in}"
+        do = "import them under one of these names, if it is one of them" if domain in BUILT_IN else do
+        lines.append(
+            f"no truth of {name} to match members with: {domain} has {page.listed(found.sub_goals)}; {do}, then "
+            "evaluate again"
+        )
+    return lines
+
+
+PRACTISED = (
+    page.label("options of", "sub_goal"),
+    page.number("executions", "chosen"),
+    page.number("reached", "reached", page.percent),
+    page.number("steps", "duration", page.fixed, 1),
+)
+
+
+def summary(metrics: Metrics) -> list[Table]:
+    """What options do, for a terminal, where no policy over them tells it."""
+    agents = metrics.get("selection", [])
+    agents = [] if variants(agents) else agents
+    members: dict[str, list[Entry]] = {}
+    for goal in (goal for agent in agents for run in agent["runs"] for goal in run["sub_goals"]):
+        members.setdefault(goal["sub_goal"], []).extend(goal["members"])
+    rows = [practised(name, of_goal) for name, of_goal in members.items()]
+    return [page.terminal("What options did while they learned", PRACTISED, rows)] if rows else []
+
+
+def practised(name: str, members: Sequence[Entry]) -> Entry:
+    """How often the options of a sub-goal were executed, the share that reached it, and their mean duration."""
+    executed = [member for member in members if member["chosen"]]
+    count = sum(member["chosen"] for member in executed)
+    reached = sum(member["reached"] for member in executed)
+    steps = sum(member["chosen"] * member["duration"] for member in executed)
+    shares = {"reached": reached / count, "duration": steps / count} if count else {"reached": None, "duration": None}
+    return {"sub_goal": name, "chosen": count, **shares}
 
 
 MEMBERS = (
@@ -270,6 +314,7 @@ QUESTION = Question(
     numbers=numbers,
     missing=missing,
     rows=rows,
+    summary=summary,
     sections=sections,
     figures=figures,
     needed={

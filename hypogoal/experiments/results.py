@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, read_text, write_table
 from hypogoal.core.manifests import AGAIN
@@ -30,7 +31,7 @@ def write_results(plan: Plan, run: Path) -> Path:
         write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         what = f"an artefact is damaged ({type(error).__name__} {error})"
-        raise UserError(what, run, "'hypogoal verify' says which.") from None
+        raise UserError(what, run, advice("Which one", "verify", run)) from None
     return path
 
 

@@ -1,5 +1,6 @@
 """Options played as the actions of a Gymnasium environment."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +20,8 @@ from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.initiation import Narrowing
 from hypogoal.options.loop import offered_options
 from hypogoal.options.policies import Policies
+
+MASKED = ("warn", "run", "raise")  # what OptionEnv does when it is given an option that is masked
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,15 +100,18 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached, ``info["option"]`` its name.
 
     sb3-contrib's MaskablePPO calls ``action_masks()``; for a ``gymnasium.vector.SyncVectorEnv``, use
-    ``envs.call("action_masks")``.
+    ``envs.call("action_masks")``. A masked option runs all the same, since agents without masks (stable-baselines3's
+    PPO) and Gymnasium's ``check_env`` draw from all of ``action_space``; ``info["masked"]`` says so.
 
     Args:
         env: an environment with the observations that the options were trained on.
         options: from :func:`hypogoal.load_options`.
         gamma: discount per environment step inside an option; 1 for the plain sum.
+        masked: what else a masked option does: ``warn``, a ``UserWarning`` at the first one; ``run``, nothing;
+            ``raise``, a ``UserError`` before anything is played, for agents that are to respect the masks.
 
     Raises:
-        UserError: the environment has other observations.
+        UserError: the environment has other observations, or ``masked`` is none of these.
 
     >>> import gymnasium, hypogoal
     >>> options = hypogoal.load_options("runs/demo/meta")
@@ -120,33 +126,44 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     (True, 'open-red-door/2')
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], options: Options, gamma: float = 1.0):
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma)
+    def __init__(self, env: gymnasium.Env[Any, Any], options: Options, gamma: float = 1.0, masked: str = MASKED[0]):
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, options=options, gamma=gamma, masked=masked)
         gymnasium.Wrapper.__init__(self, env)
-        self.options, self.gamma = options, gamma
+        if masked not in MASKED:
+            raise UserError("what should a masked option do?", f"masked={masked!r}", f"Choose of {', '.join(MASKED)}.")
+        self.options, self.gamma, self.masked = options, gamma, masked
         self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._image: Observations | None = None
+        self._warned = False
+        self._masks: NDArray[np.bool_] | None = None  # of the current observation, once they were asked for
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Like the environment's own."""
         observation, info = begun(self.env, seed=seed, options=options)
-        self._image = self._look.read(self.env, observation)
+        self._image, self._masks = self._look.read(self.env, observation), None
         return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Spec D6, D7: which options may start here, bool (G*K,)."""
-        return self.options.offered(self._current())
+        image = self._current()
+        if self._masks is None:
+            self._masks = self.options.offered(image)
+        return self._masks.copy()
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Run option ``action`` to its end.
+        """Run option ``action`` to its end, though it be masked (see ``masked``).
 
         Raises:
-            UserError: there is no such option, or the environment was not reset.
+            UserError: there is no such option, the environment was not reset, or the option is masked and ``masked`` is
+                ``raise``.
         """
         option = as_number(action)
         if option is None or not 0 <= option < self.options.count:
             raise UserError("no such option", repr(action), f"They are 0 to {self.options.count - 1}.")
+        masked = not self.action_masks()[option]
+        if masked and self.masked != "run":
+            self._refuse(option)
         act = self.options.policies(option)
         total, duration, held, reached, ended = 0.0, 0, 0, False, False
         image, observation = self._current(), None
@@ -160,9 +177,20 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             held = held + 1 if self.options.holds(option, image) else 0
             reached = held >= self.options.dwell
             ended = reached or terminated or truncated or duration >= self.options.timeout
-        self._image = image
-        info = info | {"duration": duration, "reached": reached, "option": self.options.name(option)}
+        self._image, self._masks = image, None
+        info = info | {"duration": duration, "reached": reached, "option": self.options.name(option), "masked": masked}
         return observation, total, terminated, truncated, info
+
+    def _refuse(self, option: int) -> None:
+        """Raise, or warn once, since this option is masked."""
+        what, do = f"option {option} ({self.options.name(option)}) is masked here", "Choose by action_masks()"
+        if self.masked == "raise":
+            raise UserError(what, None, f"{do}, as MaskablePPO does, or give OptionEnv masked='run'.")
+        if self._warned:
+            return
+        self._warned = True
+        text = f"{what} and runs all the same. {do}, or give OptionEnv masked='run' to hear no more of it, or 'raise'."
+        warnings.warn(text, UserWarning, stacklevel=3)
 
     def _current(self) -> Observations:
         if self._image is None:

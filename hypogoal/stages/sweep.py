@@ -169,8 +169,8 @@ def submit(
     with sole_writer(out):
         planned = _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
         if planned.anew:
-            what = f"{len(planned.anew)} cells are still to be made again, as 'hypogoal run --force' began to"
-            raise UserError(what, out, "Let 'hypogoal run --resume' do that.")
+            what = f"{len(planned.anew)} cells are still to be made again, as 'run --force' began to"
+            raise UserError(what, out, records.GIVE)
         todo = left_of(planned.cells)
         return slurm.submit(planned, out, todo, options) if todo else []
 

@@ -1,38 +1,127 @@
 """The contract of a domain, as a test that its author runs (Spec B6; see ``hypogoal.domains.base``)."""
 
 import dataclasses
+import math
+import traceback
 import warnings
 from collections.abc import Iterator, Mapping
+from time import monotonic
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.commands import command
 from hypogoal.core.config import from_values, meant, resolve
+from hypogoal.core.own_code import UsersCode
 from hypogoal.core.preflight import human
-from hypogoal.core.progress import Progress
+from hypogoal.core.progress import Progress, duration
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.dataset import GET_MORE, NUMBERS, PICTURE, Collected, States, hard_to_learn, leave_out, require_names
+from hypogoal.core.terminal import say
+from hypogoal.dataset import (
+    GET_MORE,
+    NUMBERS,
+    PICTURE,
+    Collected,
+    States,
+    Unmet,
+    hard_to_learn,
+    leave_out,
+    require_names,
+)
 from hypogoal.domains.base import Domain, Engine, Step
+from hypogoal.domains.gymnasium_engine import culprit
 from hypogoal.settings import CONFIGS
-from hypogoal.testing.verdict import Test, Verdict, promise, run
+from hypogoal.testing.verdict import Test, TimeUp, Verdict, promise, run
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
+LEAST_STEPS = 4  # of those STEPS, however slow the environment is
+PLAYS = 6  # how often tests of an engine play so many steps
+SECONDS = 120.0  # that a check takes at most
+TIMED_SECONDS, TIMED_STEPS = 1.0, 5  # of play, whichever is shorter: then it is known what a step takes
+OF_ENGINE, OF_COLLECTING = 1 / 3, 0.8  # shares of the time that is left when it is planned
 GYMNASIUM_SAYS_NOT = ("is different from the unwrapped version",)  # of its checker's warnings: wrappers are the point
 
 
-def check_domain(domain: Domain, config: Any = None, *, layout_seed: int = 0, seed: int = 0) -> Iterator[Verdict]:
+def check_domain(
+    domain: Domain,
+    config: Any = None,
+    *,
+    layout_seed: int = 0,
+    seed: int = 0,
+    seconds: float = SECONDS,
+    name: str = "",
+    progress: Progress | None = None,
+) -> Iterator[Verdict]:
     """Whether a domain keeps to what the stages rely on.
 
-    Collects a few states twice, with ``config``, an instance of its ``config_class`` (None: the defaults), and plays a
-    layout at random. ``seed`` is for both.
+    Plays a layout at random, and collects a few states twice, with ``config``, an instance of its ``config_class``
+    (None: the defaults). ``seed`` is for both. Of a slow domain it plays less, so that it takes no more than about
+    ``seconds``; what is then not looked at is a warning, and so is a sub-goal that play does not meet. ``name`` is what
+    the user calls the domain, ``progress`` where it is said how long this takes.
     """
-    return run(_Contract(domain, config, layout_seed, seed).tests())
+    clock = _Clock(seconds, progress or Progress("check", total=1, quiet=True))
+    yield from run(_Contract(domain, config, layout_seed, seed, clock, name).tests())
+    clock.progress.expect(clock.progress.done)
+
+
+class _Clock:
+    """The time that a check has, and what a step takes."""
+
+    def __init__(self, seconds: float, progress: Progress):
+        self.seconds, self.progress = seconds, progress
+        self._end = monotonic() + seconds
+        self._spent, self._steps = 0.0, 0
+
+    @property
+    def left(self) -> float:
+        """Seconds."""
+        return self._end - monotonic()
+
+    @property
+    def pace(self) -> float:
+        """Seconds that a step of one environment takes, and what else comes with it: new episodes, labels."""
+        return self._spent / max(1, self._steps)
+
+    @property
+    def timed(self) -> bool:
+        """Whether enough was played to tell the pace."""
+        return self._spent >= TIMED_SECONDS or self._steps >= TIMED_STEPS * COUNT
+
+    def count(self, started: float) -> None:
+        """One more step of all environments, which began at ``started``."""
+        self._spent += monotonic() - started
+        self._steps += COUNT
+
+    def require(self) -> None:
+        """Stop here (``TimeUp``) if time is up."""
+        if self.left < 0:
+            do = "Give it more with --minutes, or seconds= in Python."
+            raise TimeUp(f"the {duration(self.seconds)} that a check may take are over", None, do)
+
+
+class _Collecting(Progress):
+    """The progress of collecting, of which ``times`` are to come, as a part of a check's."""
+
+    def __init__(self, clock: _Clock, times: int):
+        super().__init__("collect", total=1, quiet=True)
+        self._clock, self._times = clock, times
+
+    def expect(self, total: int) -> None:
+        whole = self._clock.progress
+        whole.expect(whole.done + self._times * total)
+
+    def update(self, done: int, **numbers: float) -> None:
+        self._clock.progress.advance(done - self.done)
+        self.done = done
+        self._clock.require()
 
 
 class _Contract:
-    def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int):
+    def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int, clock: _Clock, name: str):
         self.domain, self.config, self.layout_seed, self.seed = domain, config, layout_seed, seed
+        self.clock, self.name, self.met_all = clock, name, True
+        self.count = STEPS  # that each test of an engine plays
 
     def tests(self) -> Iterator[Test]:
         yield "names", self.names
@@ -41,7 +130,7 @@ class _Contract:
         if self.domain.has_env:
             yield "gymnasium", self.gymnasium
         of_engine = (self.engine, self.images, self.steps, self.labels, self.determinism, self.going_on)
-        of_states = (self.collection, self.classes, self.collected_again, self.heldout, self.network)
+        of_states = (self.collection, self.classes, self.heldout, self.network, self.collected_again)
         for test in (*of_engine, *of_states):
             yield test.__name__.replace("_", " "), test
 
@@ -67,13 +156,18 @@ class _Contract:
         return ", ".join(f"{stage} {len(values)}" for stage, values in self.domain.defaults.items())
 
     def gymnasium(self) -> str:
-        """Gymnasium's own checker."""
-        from gymnasium.utils.env_checker import check_env
-
+        """Gymnasium's own checker; what it does not like is whose layer first has it."""
         env = self.domain.make_env()
         with warnings.catch_warnings(record=True) as given:
             warnings.simplefilter("always")
-            check_env(env, skip_render_check=True, skip_close_check=True)  # closing makes it anew
+            try:
+                _check_env(env)
+            except Exception as error:
+                names = " ".join(frame.name for frame in traceback.extract_tb(error.__traceback__))
+                method = next((method for method in ("reset", "step") if method in names), "")
+                layer = culprit(env, _breaks)
+                with UsersCode("the environment", layer, method, failed="breaks Gymnasium's contract:"):
+                    raise
         for warning in given:
             if not any(text in str(warning.message) for text in GYMNASIUM_SAYS_NOT):
                 warnings.warn(str(warning.message), stacklevel=2)
@@ -116,8 +210,9 @@ class _Contract:
 
     def steps(self) -> str:
         engine = self.make_engine()
-        ended = 0
-        for actions in self.actions(engine):
+        ended = played = 0
+        for actions in self.actions(engine, timed=True):
+            played += 1
             before = engine.elapsed.copy()
             step: Step = engine.step(actions)
             _array(step.next_ids, np.int64, (COUNT,), "next_ids of a step")
@@ -136,7 +231,7 @@ class _Contract:
             same = engine.ids[~over] == step.next_ids[~over]
             promise(bool(same.all()), "ids differ from next_ids", "They differ only where an episode ended.")
             ended += int(over.sum())
-        return f"{STEPS} random steps, {ended} episodes ended"
+        return f"{played} random steps, {ended} episodes ended"
 
     def labels(self) -> str:
         """Of every state that random play meets, asked twice; and whether what is seen says them."""
@@ -159,14 +254,14 @@ class _Contract:
             text = f"{torn} of {len(rows)} observations came with different labels: no classifier can tell those apart"
             warnings.warn(text, stacklevel=2)
         counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, met, strict=True))
-        return f"held in random play, of {STEPS * COUNT} states: {counts}"
+        return f"held in random play, of {self.count * COUNT} states: {counts}"
 
     def determinism(self) -> str:
         first, second = self.make_engine(), self.make_engine()
         for number, actions in enumerate(self.actions(first), 1):
             where = f"two engines of layout_seed {self.layout_seed}, step {number}"
             _same_step(first, second, actions, where, DETERMINISM)
-        return f"two engines of one layout seed stay the same for {STEPS} steps"
+        return f"two engines of one layout seed stay the same for {self.count} steps"
 
     def going_on(self) -> str:
         saved = self.make_engine()
@@ -174,28 +269,47 @@ class _Contract:
             text = "the engine has no snapshot and restore (resumes is false): training on it cannot be resumed"
             warnings.warn(text, stacklevel=2)
             return "not looked at"
-        actions = list(self.actions(saved))
-        for row in actions[: STEPS // 2]:
-            saved.step(row)
+        actions = self.actions(saved)
+        for _ in range(self.count // 2):
+            saved.step(next(actions))
         restored = self.make_engine()
         restored.restore(saved.snapshot())
-        for number, row in enumerate(actions[STEPS // 2 :], 1):
+        for number, row in enumerate(actions, 1):
             where = f"step {number} after restore()"
             _same_step(saved, restored, row, where, "Save all that the next steps depend on.")
         return "a restored engine goes on as the one it was saved from"
 
-    def collect(self) -> Collected:
-        return self.domain.collect(self.domain.small(self.config), self.seed, Progress("check", total=1, quiet=True))
+    def collect(self, times: int) -> Collected:
+        """What is collected; so many ``times`` are to come."""
+        try:
+            return self.domain.collect(self.small, self.seed, _Collecting(self.clock, times))
+        except Unmet as error:
+            if error.collected is None:
+                raise
+            self.met_all = False
+            return error.collected
 
     def collection(self) -> str:
-        self.collected = self.collect()
+        self.small = self.domain.small(self.config)
+        wanted = self.domain.collected_steps(self.small)
+        few = int(OF_COLLECTING * self.clock.left / 2 / self.clock.pace)
+        self.hurried = wanted > few
+        if self.hurried:
+            self.small = self.domain.shortened(self.small, few)
+            steps = self.domain.collected_steps(self.small)
+            text = f"played {steps:,} of the {wanted:,} steps that 'collect' plays, for want of time"
+            warnings.warn(f"{text}: --minutes {self.minutes_for_all()} plays all", stacklevel=2)
+        self.collected = self.collect(2)
         goals = len(self.domain.sub_goals)
         text = f"the states' sub_goals are {self.collected.sub_goals}"
         same = tuple(self.collected.sub_goals) == tuple(self.domain.sub_goals)
         promise(same, text, "Give those of the domain, in their order.")
         for name, states in _sets(self.collected):
             count = len(states.observations)
-            promise(count > 0, f"there are no {name} states", "Collect some: other seeds, or more steps.")
+            text, do = f"there are no {name} states", "Collect some: other seeds, or more steps."
+            promise(count > 0 or not self.met_all, text, do)
+            if not count:
+                warnings.warn(f"{text}: 'collect' would stop here. {do}", stacklevel=2)
             kind, shape = self.domain.observation_dtype, self.domain.observation_shape
             _array(states.observations, kind, (count, *shape), f"{name} observations")
             _array(states.labels, np.bool_, (count, goals), f"{name} labels")
@@ -210,16 +324,21 @@ class _Contract:
         text = []
         for column, goal in enumerate(self.domain.sub_goals):
             labelled, heldout = self.collected.labelled.labels[:, column], self.collected.heldout.labels[:, column]
-            promise(len(np.unique(labelled)) == 2, *_missing(goal, "labelled", labelled))
+            both = len(np.unique(labelled)) == 2
+            promise(both or not self.met_all, *_missing(goal, "labelled", labelled))
+            if not both:
+                warnings.warn(self.never_met(goal, bool(labelled.any())), stacklevel=2)
             if len(np.unique(heldout)) < 2:
                 warnings.warn(". ".join(_missing(goal, "held-out", heldout)), stacklevel=2)
             text.append(f"{goal} {int(labelled.sum())} of {len(labelled)}")
-        for line in hard_to_learn(self.collected.labelled.labels, self.domain.sub_goals):
+        known = [len(np.unique(column)) > 1 for column in self.collected.labelled.labels.T]
+        goals = [goal for goal, both in zip(self.domain.sub_goals, known, strict=True) if both]
+        for line in hard_to_learn(self.collected.labelled.labels[:, known], goals):
             warnings.warn(f"{line}. {GET_MORE}", stacklevel=2)
         return f"positives among labelled: {', '.join(text)}"
 
     def collected_again(self) -> str:
-        for (name, states), (_, again) in zip(_sets(self.collected), _sets(self.collect()), strict=True):
+        for (name, states), (_, again) in zip(_sets(self.collected), _sets(self.collect(1)), strict=True):
             same = all(np.array_equal(getattr(states, of), getattr(again, of)) for of in ("observations", "labels"))
             promise(same, f"{name} states differ when collected again with seed {self.seed}", DETERMINISM)
         return "the same states for the same seed"
@@ -242,11 +361,71 @@ class _Contract:
         build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"))
         return f"member network {name!r} takes the observations"
 
-    def actions(self, engine: Engine) -> Iterator[NDArray[np.int64]]:
-        """The same random actions (E,) at every call."""
+    def never_met(self, goal: str, always: bool) -> str:
+        """What to say of a sub-goal that held in none, or in each (``always``), of the labelled states."""
+        text = f"{goal} held in {'every' if always else 'no'} state that play met on the labelled layouts, "
+        text += "in the time that there was: " if self.hurried else "so 'collect' would stop here: "
+        text += f"it is {'hard to leave' if always else 'rare'}, or its function errs"
+        if self.domain.observation_dtype != PICTURE or not self.domain.has_env or not self.name:
+            return f"{text}. {GET_MORE}"
+        seeds = getattr(self.config, "labelled_seeds", (0,))[:1]
+        words = ("label", self.name, "--out", f"marks/{goal}", "--record", f"{goal}.json", "--layout-seed", *seeds)
+        do = f"Bring a policy that gets there, or play it by hand and give --play {goal}.json"
+        return f"{text}. {do}: {command(*words)}"
+
+    def actions(self, engine: Engine, *, timed: bool = False) -> Iterator[NDArray[np.int64]]:
+        """The same random actions (E,) at every call; ``timed``: plan the check by how long the first ones take."""
         rng = rng_for(self.seed, "check")
-        for _ in range(STEPS):
+        number = 0
+        while number < self.count:
+            self.clock.require()
+            started, number = monotonic(), number + 1
             yield rng.integers(engine.n_actions, size=COUNT)
+            if timed:
+                known = self.clock.timed
+                self.clock.count(started)
+                if self.clock.timed and not known:
+                    self.plan()
+            self.clock.progress.advance(COUNT)
+
+    def plan(self) -> None:
+        """How many steps to play in the time that there is; says so."""
+        pace, clock = self.clock.pace, self.clock
+        self.count = max(LEAST_STEPS, min(STEPS, int(OF_ENGINE * clock.left / (PLAYS * COUNT * pace))))
+        engine, collecting = PLAYS * COUNT * self.count, 2 * self.domain.collected_steps(self.domain.small(self.config))
+        steps = engine + min(collecting, int(OF_COLLECTING * max(0.0, clock.left / pace - engine)))
+        clock.progress.resume(0)
+        clock.progress.expect(steps)
+        took = f"{1000 * pace:.2g} ms" if pace < 0.1 else f"{pace:.2g} s"
+        text = f"check: a step takes {took}: about {duration(pace * steps)} for {steps:,} steps"
+        if steps < engine + collecting:
+            text += f" of {engine + collecting:,}; --minutes {self.minutes_for_all()} plays all"
+        if not clock.progress.quiet:
+            with clock.progress.paused():
+                say(text, err=True)
+
+    def minutes_for_all(self) -> int:
+        """How long the check would take if it played all that it wants to."""
+        steps = PLAYS * COUNT * STEPS / OF_ENGINE + 2 * self.domain.collected_steps(self.domain.small(self.config))
+        return math.ceil(steps * self.clock.pace / OF_COLLECTING / 60)
+
+
+def _check_env(env: Any) -> None:
+    """Gymnasium's checker, but for closing, which makes it anew, and drawing."""
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(env, skip_render_check=True, skip_close_check=True)
+
+
+def _breaks(env: Any) -> bool:
+    """Whether Gymnasium's checker does not like it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            _check_env(env)
+        except Exception:  # noqa: BLE001 - whatever own code raises
+            return True
+    return False
 
 
 DETERMINISM = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.core.terminal import printable
+from hypogoal.dataset import Unmet
 
 Test = tuple[str, Callable[[], str]]
+
+
+class TimeUp(UserError):
+    """A check took as long as it may: what is left is not looked at, and no promise is broken by that."""
 
 
 def promise(kept: bool, what: str, do: str) -> None:
@@ -43,18 +48,26 @@ class Verdict:
 def run(tests: Iterable[Test]) -> Iterator[Verdict]:
     """Run tests, names and functions, one after the other, until one fails: those after it build on what it found.
 
-    A function says what it found, or raises. Warnings that it gives are kept.
+    A function says what it found, or raises. Warnings that it gives are kept. Where time is up, or play did not meet
+    what the next ones need, the rest is not looked at, which is no failure.
     """
+    tests = iter(tests)
     for name, test in tests:
         with warnings.catch_warnings(record=True) as given:
             warnings.simplefilter("always")
+            ok, over = True, False
             try:
                 with UsersCode("what is checked"):
-                    ok, text = True, test()
+                    text = test()
+            except (TimeUp, Unmet) as error:
+                text, over = "not looked at to the end", True
+                warnings.warn(str(error), stacklevel=1)
+                if rest := [later for later, _ in tests]:
+                    warnings.warn(f"not looked at: {', '.join(rest)}", stacklevel=1)
             except UserError as error:
                 ok, text = False, str(error)
         yield Verdict(name, ok, " ".join(text.split()), tuple(dict.fromkeys(str(warning.message) for warning in given)))
-        if not ok:
+        if over or not ok:
             return
 
 

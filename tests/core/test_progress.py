@@ -16,6 +16,7 @@ from hypogoal.core.progress import Progress
 
 def test_what_is_not_known_yet_is_not_said(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """A run without a whole episode has no success, and no 'nan' either."""
+    monkeypatch.setattr(progress, "FIRST_SECONDS", 0.0)
     monkeypatch.setattr(progress, "PLAIN_INTERVAL_SECONDS", 0.0)
     with Progress("train", total=10) as bar:
         bar.update(5, success=math.nan, loss=0.25)
@@ -27,6 +28,7 @@ def test_what_is_not_known_yet_is_not_said(capsys: pytest.CaptureFixture[str], m
 
 def test_what_others_do_is_counted(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec A6: how far other processes are is asked again and again, so that a line comes while they work."""
+    monkeypatch.setattr(progress, "FIRST_SECONDS", 0.0)
     monkeypatch.setattr(progress, "PLAIN_INTERVAL_SECONDS", 0.0)
     monkeypatch.setattr(progress, "LOOK_SECONDS", 0.01)
     asked: list[int] = []
@@ -44,6 +46,25 @@ def test_what_others_do_is_counted(capsys: pytest.CaptureFixture[str], monkeypat
     assert re.search(r"^train: 5/1000 \(\d+/s, \d+ s left\)$", capsys.readouterr().err, re.MULTILINE)
     time.sleep(0.05)
     assert bar.done == len(asked), "it is asked no more"
+
+
+def test_how_long_it_will_take_is_said_early(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After two seconds, once anything is done, and then every ten; what was done before a resume is no rate."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    bar = Progress("collect", total=1000)
+    for step in range(1, 26):
+        now = step * 1.0
+        bar.update(0 if step < 3 else 10 * step)
+    said = [re.search(r"(\d+)/1000 \((.*) left\)", line) for line in capsys.readouterr().err.splitlines()]
+    assert [match[1] for match in said if match] == ["30", "130", "230"]
+    assert said[0] and said[0][2] == "10/s, 2 min"
+    bar.resume(500)
+    now += 3
+    bar.update(600)
+    assert capsys.readouterr().err == "collect: 600/1000 (33/s, 12 s left)\n"
 
 
 @pytest.mark.parametrize("seconds", [3, 600, 9000, 400_000])

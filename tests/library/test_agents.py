@@ -18,7 +18,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from sb3_contrib import MaskablePPO
-from stable_baselines3 import DQN
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_checker import check_env as check_sb3
 from toy_data import reseal
 
 import hypogoal
@@ -93,6 +95,47 @@ def test_options_do_what_their_members_say(options: Options) -> None:
         assert info["option"] == f"{'right' if right else 'left'}-end/{option % MEMBERS}"
         expected = [True, True, False, False] if right else [False, False, True, True]
         assert env.action_masks().tolist() == expected
+
+
+def test_a_masked_option_is_never_silent(options: Options) -> None:
+    """Spec D6, E1: it runs, info says so, and a warning the first time; or none; or it is refused, nothing played."""
+    envs = {masked: hypogoal.OptionEnv(corridor(), options, masked=masked) for masked in ("warn", "run", "raise")}
+    for env in envs.values():
+        env.reset(seed=0)
+        assert env.step(0)[4]["masked"] is False
+        assert env.action_masks().tolist() == [False, False, True, True]
+    with pytest.warns(UserWarning, match=r"option 1 \(left-end/1\) is masked here and runs all the same"):
+        _, _, _, _, info = envs["warn"].step(1)
+    assert (info["masked"], info["duration"], info["reached"]) == (True, 1, True)
+    assert envs["warn"].step(1)[4] == envs["run"].step(1)[4] == info, "it warns once"
+    with pytest.raises(UserError, match=r"option 1 \(left-end/1\) is masked here. Choose by action_masks\(\), as"):
+        envs["raise"].step(1)
+    _, _, terminated, _, info = envs["raise"].step(2)
+    assert terminated and info["duration"] == 5 and not info["masked"], "nothing was played in between"
+    with pytest.raises(UserError, match=r"masked='ignore'\. Choose of warn, run, raise"):
+        hypogoal.OptionEnv(corridor(), options, masked="ignore")
+
+
+@pytest.mark.filterwarnings("ignore:.*is masked here and runs all the same")
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
+def test_agents_without_masks_play_masked_options(options: Options) -> None:
+    """Spec E1: stable-baselines3's PPO, its checker and Gymnasium's, which draw from all actions."""
+    env = hypogoal.OptionEnv(SameLayout(corridor()), options, masked="run")
+    check_env(hypogoal.OptionEnv(corridor(), options), skip_render_check=True)
+    check_sb3(env, skip_render_check=True)
+    met: list[bool] = []
+
+    class Met(BaseCallback):
+        def _on_step(self) -> bool:
+            met.extend(info["masked"] for info in self.locals["infos"])
+            return True
+
+    PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0).learn(64, callback=Met())
+    assert {*met} == {True, False}
+    maskable = MaskablePPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0)
+    met.clear()
+    maskable.learn(64, callback=Met())
+    assert met and not any(met)
 
 
 def test_what_a_session_shows_is_one_useful_line(options: Options) -> None:

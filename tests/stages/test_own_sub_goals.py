@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import corridor_env
 import gymnasium
 import numpy as np
 import pytest
+from corridor_env import SUB_GOALS as SUB_GOALS_OF_CORRIDOR
+from corridor_env import CorridorEnv
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.domains.doorkey_env import SUB_GOALS
+from hypogoal.domains.gymnasium_domain import GymnasiumDomain
+from hypogoal.evaluation.selection import practised
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.training import assemble
 
@@ -52,10 +57,58 @@ def test_an_agent_of_own_labels_is_evaluated(run: Path) -> None:
     (goal,) = metrics["selection"][0]["runs"][0]["sub_goals"]
     assert goal["sub_goal"] == "at-the-door" and [member["match"] for member in goal["members"]] == [None, None]
     assert sum(member["chosen"] for member in goal["members"]) > 0
-    assert "no truth of at-the-door in its domain, to match members with" in metrics["missing"]
+    text = "no truth of at-the-door to match members with: doorkey has collect-blue-key, collect-green-key, "
+    (line,) = (line for line in metrics["missing"] if line.startswith(text))
+    assert line.endswith(
+        "and go-to-goal; import them under one of these names, if it is one of them, then evaluate again"
+    )
     assert not (run / "meta" / "exploits.csv").exists() and metrics["exploits"]["over_runs"] == []
     assert main(["report", str(run)]) == 0
     assert "no truth of at-the-door" in (run / "report" / "index.html").read_text(encoding="utf-8")
+
+
+def test_a_run_of_options_only_says_what_they_did_and_where_to_add_the_truth(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec A5, F6: of a domain of one's own, the place where the sub-goal's function belongs; added, it is matched."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+    env, rng = CorridorEnv(), np.random.default_rng(0)
+    pictures = {}
+    for seed in range(8):
+        env.reset(seed=seed)
+        for _ in range(60):
+            if env.step(int(rng.integers(2)))[2]:
+                env.reset(seed=seed)
+            pictures[env.image().tobytes()] = env.image(), env.cell == 4
+    shown, labels = (np.stack(column) for column in zip(*pictures.values(), strict=True))
+    np.savez(tmp_path / "own.npz", observations=shown, labels=labels, unlabelled=shown)
+    data, made = tmp_path / "data.h5", tmp_path / "made"
+    given = ["--sub-goal", "near-the-end", "--domain", "corridor_env:DOMAIN", "-q"]
+    assert main(["import", str(tmp_path / "own.npz"), "--out", str(data), *given]) == 0
+    few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
+    assert main(["train-ensemble", str(data), "--out", str(tmp_path / "ensemble"), *few]) == 0
+    assert main(["train-options", str(tmp_path / "ensemble"), "--out", str(made / "options"), *FEW]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(made)]) == 0
+    shown_text = " ".join(capsys.readouterr().out.split())
+    assert "What options did while they learned" in shown_text and "near-the-end" in shown_text
+    metrics = json.loads((made / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
+    assert metrics["missing"][1:] == [
+        "no truth of near-the-end to match members with: corridor_env:DOMAIN has left-end and right-end; add "
+        "near-the-end to the sub-goals of its GymnasiumDomain, with a function that says where it holds, then evaluate "
+        "again"
+    ]
+    members = metrics["selection"][0]["runs"][0]["sub_goals"][0]["members"]
+    row = practised("near-the-end", members)
+    assert row["chosen"] == sum(member["chosen"] for member in members) > 0 and 1 <= row["duration"] <= 10
+    assert main(["report", str(made)]) == 0
+    page = (made / "report" / "index.html").read_text(encoding="utf-8")
+    assert "No policy over options was trained. Random choice while options learn reached the goal in" in page
+    known = GymnasiumDomain(CorridorEnv, {**SUB_GOALS_OF_CORRIDOR, "near-the-end": lambda env: env.unwrapped.cell == 4})
+    monkeypatch.setattr(corridor_env, "DOMAIN", known)
+    assert main(["evaluate", str(made), "--force", "-q"]) == 0
+    assert json.loads((made / "evaluation" / "metrics.json").read_text())["missing"] == ["no ensemble"]
 
 
 def test_true_sub_goals_that_the_domain_does_not_have_are_refused(

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import itertools
+import random
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from corridor import Corridor
-from corridor_env import CorridorEnv, all_labels, at_left, swift
+from corridor_env import ALWAYS, NEVER, SUB_GOALS, CorridorEnv, all_labels, at_left, swift
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
+from benchmarks.own_code import FAMILIES
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
+from hypogoal.core.progress import Progress
 from hypogoal.dataset import Collected
 from hypogoal.diversity import OBJECTIVES as OURS
 from hypogoal.diversity import Objective, dbat, load_objective, none
+from hypogoal.domains import base as bases
 from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.hypotheses.networks import NETWORKS
-from hypogoal.testing import Verdict, check_domain, check_network, check_objective, require
+from hypogoal.testing import Verdict, check_domain, check_network, check_objective, domains, require
 
 TESTS = Path(__file__).parents[1]
 
@@ -221,6 +227,185 @@ def test_a_label_of_the_way_there_is_named() -> None:
         assert "asked twice in the same state, labels differ: odd. A label is a function of the state" in fault.text
     both = ("left-end", "right-end")
     require(check_domain(GymnasiumDomain(CorridorEnv, both, labels=all_labels, success=swift), small))
+
+
+class Slow:
+    """A clock, and domains whose environments take some of its seconds, so that nobody needs to wait for them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch):
+        self.now = 0.0
+        monkeypatch.setattr(domains, "monotonic", lambda: self.now)
+
+    def domain(self, step: float, reset: float = 0.0, make: float = 0.0) -> GymnasiumDomain:
+        clock = self
+
+        class Env(CorridorEnv):
+            def __init__(self) -> None:
+                clock.now += make
+
+            def reset(self, **kwargs: Any) -> Any:
+                clock.now += reset
+                return super().reset(**kwargs)
+
+            def step(self, action: int) -> Any:
+                clock.now += step
+                return super().step(action)
+
+        return GymnasiumDomain(Env, SUB_GOALS)
+
+
+@pytest.mark.parametrize(
+    ("step", "reset", "minutes"), [(0.051, 0.0, 2), (0.051, 0.0, 5), (0.002, 0.5, 2), (0.4, 0.4, 2), (1.0, 0.0, 2)]
+)
+def test_a_slow_domain_takes_no_longer_than_it_may(
+    step: float, reset: float, minutes: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec B6: it is timed, less is played, and all is looked at; what all would take is said before it is begun."""
+    clock = Slow(monkeypatch)
+    with Progress("check", total=1) as progress:
+        verdicts = list(check_domain(clock.domain(step, reset), seconds=60 * minutes, progress=progress))
+    require(verdicts)
+    assert verdicts[-1].name == "collected again" and verdicts[-1].text == "the same states for the same seed"
+    assert 30 * minutes < clock.now < 66 * minutes, "seconds"
+    (told,) = (verdict.warnings for verdict in verdicts if verdict.name == "collection")
+    assert re.match(r"played [\d,]+ of the 39,000 steps that 'collect' plays, for want of time: --minutes", told[0])
+    said = re.search(
+        r"^check: a step takes .* for .* steps of 7\d,\d+; --minutes (\d+) plays all$", capsys.readouterr().err, re.M
+    )
+    assert said and 78_000 * step / 60 < int(said[1]) < 4 * 78_000 * (step + reset) / 60
+
+
+def test_what_there_is_no_time_for_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6: it ends where it is, and no promise is broken by that: too slow a step, too slow to make."""
+    clock = Slow(monkeypatch)
+    for domain in (clock.domain(30.0), clock.domain(0.0, make=20.0)):
+        *_, last = check_domain(domain)
+        assert last.ok and last.text == "not looked at to the end"
+        assert "the 2 min that a check may take are over. Give it more with --minutes" in last.warnings[0]
+        assert last.warnings[1].startswith("not looked at: ") and last.warnings[1].endswith("collected again")
+
+
+def test_a_quick_domain_is_looked_at_whole(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6."""
+    clock = Slow(monkeypatch)
+    few = GymnasiumConfig(steps=500, heldout_seeds=(4, 5))
+    with Progress("check", total=1) as progress:
+        verdicts = list(check_domain(clock.domain(0.01), few, progress=progress))
+    require(verdicts)
+    assert "check: a step takes 10 ms: about 61 s for 6,080 steps\n" in capsys.readouterr().err
+    assert [verdict.name for verdict in verdicts if verdict.warnings] == ["classes"]
+    assert progress.done == progress.total
+
+
+@pytest.mark.parametrize(("domain", "goal", "word"), [(NEVER, "on-the-moon", "no"), (ALWAYS, "somewhere", "every")])
+def test_a_rare_sub_goal_is_no_broken_contract(domain: GymnasiumDomain, goal: str, word: str) -> None:
+    """Spec B6: a warning that says what to do, and the rest is looked at; ``collect`` itself still refuses."""
+    small = GymnasiumConfig(steps=150, heldout_seeds=(4, 5))
+    verdicts = {verdict.name: verdict for verdict in check_domain(domain, small, name="mine:DOMAIN")}
+    assert all(verdict.ok for verdict in verdicts.values()) and "collected again" in verdicts
+    text = verdicts["classes"].warnings[0]
+    assert text.startswith(
+        f"{goal} held in {word} state that play met on the labelled layouts, so 'collect' would stop"
+    )
+    assert "--play" in text and f"hypogoal label mine:DOMAIN --out marks/{goal} --record {goal}.json" in text
+    with pytest.raises(UserError, match=f"{goal} has no"):
+        domain.collect(small, 0, Progress("collect", 1, quiet=True))
+
+
+class Wrapped(gymnasium.Wrapper):  # type: ignore[type-arg]
+    """A wrapper that changes nothing."""
+
+
+def wrapper(**methods: Any) -> type[gymnasium.Wrapper]:  # type: ignore[type-arg]
+    return type("Bad", (gymnasium.Wrapper,), methods)
+
+
+def _drops(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+    return self.env.reset(options=options)
+
+
+def _takes_none(self: Any) -> Any:
+    return self.env.reset()
+
+
+def _gives_one(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+    return self.env.reset(seed=seed)[0]
+
+
+def _gives_four(self: Any, action: int) -> Any:
+    return self.env.step(action)[:4]
+
+
+def _gives_text(self: Any, action: int) -> Any:
+    observation, reward, *rest = self.env.step(action)
+    return observation, str(reward), *rest
+
+
+def _gives_more(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+    observation, info = self.env.reset(seed=seed)
+    return np.concatenate([observation, observation]), info
+
+
+def _draws(self: Any, *, seed: Any = None, options: Any = None) -> Any:
+    return self.env.reset(seed=int(NOBODYS.integers(1_000)))
+
+
+BAD = [
+    *(("reset", method) for method in (_drops, _takes_none, _gives_one, _gives_more, _draws)),
+    *(("step", method) for method in (_gives_four, _gives_text)),
+]
+
+
+@pytest.mark.parametrize(("name", "method"), BAD)
+@pytest.mark.parametrize("around", [lambda env: env, Wrapped, gymnasium.wrappers.OrderEnforcing])
+def test_a_wrapper_that_breaks_the_contract_is_named(
+    name: str, method: Any, around: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    """Spec B6, G2: by its own file and line, wherever it is met; where it shows which layer it is, by them alone."""
+    bad = wrapper(**{name: method})
+    domain = GymnasiumDomain(lambda: around(bad(Wrapped(CorridorEnv()))), SUB_GOALS)
+    here = f"test_check.py, line {method.__code__.co_firstlineno}"
+    fault = first_fault(check_domain(domain, GymnasiumConfig(steps=150, heldout_seeds=(4, 5))))
+    assert here in fault.text and fault.text.count("test_check.py") == 1, fault.text
+    assert (fault.name == "gymnasium" and "corridor_env.py" not in fault.text) or method is _gives_text
+    monkeypatch.setitem(bases.here, "bad", domain)
+    few = [word for pair in ("steps=200", "heldout_seeds=4") for word in ("--set", pair)]
+    assert main(["collect", "bad", "--out", str(tmp_path / "data.h5"), *few, "-q"]) == 2
+    err = capsys.readouterr().err
+    assert here in err and err.count("\n") == 1, err
+    assert main(["train-baseline", "bad", "--out", str(tmp_path / "ppo"), "--set", "steps=256", "-q"]) == 2
+    err = capsys.readouterr().err
+    assert here in err and err.count("\n") == 1, err
+    assert not [*tmp_path.glob("*")]
+
+
+@pytest.mark.parametrize("family", [*FAMILIES])
+def test_a_few_of_many_stacks_and_commands(family: str) -> None:
+    """Spec B6, G2: a few of the cases of ``benchmarks.own_code``."""
+    assert all(FAMILIES[family](random.Random(f"test {family} {case}")) for case in range(30))
+
+
+def test_an_environment_that_drops_the_seed_is_named(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec B6: what draws from nobody's seed, seen in what is shown or in what will be drawn."""
+
+    class Own(CorridorEnv):
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return super().reset(seed=int(NOBODYS.integers(8)))
+
+    class Later(CorridorEnv):
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            _, info = super().reset()  # as if it drew only later
+            self.layout = 0
+            return self.image(), info
+
+    for made in (Own, Later):
+        monkeypatch.setitem(bases.here, "bad", GymnasiumDomain(made, SUB_GOALS))
+        assert main(["collect", "bad", "--out", str(tmp_path / "data.h5"), "--set", "steps=200", "-q"]) == 2
+        (err,) = capsys.readouterr().err.splitlines()
+        line = made.reset.__code__.co_firstlineno
+        assert f"reset began two different episodes with seed=0: test_check.py, line {line}. Pass the seed on" in err
 
 
 @pytest.mark.parametrize("name", [name for name in OURS if name != "none"])

@@ -1,0 +1,210 @@
+"""What is printed as a command works as printed: after a stage, and as what an error says to do (Spec A8, G2)."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from keyboard import label
+from PIL import Image
+from typer.main import get_command
+
+from hypogoal.cli import app, main
+from hypogoal.core import own_code
+from hypogoal.core.commands import advice, command
+from hypogoal.core.own_code import TRUST
+from hypogoal.evaluation.run import read_evaluation
+
+TESTS, PACKAGE = Path(__file__).parents[1], Path(own_code.__file__).parents[1]
+PRINTED = re.compile(r"(?:HYPOGOAL_TRUST=\S+ )?hypogoal .*$")
+OWN = """
+from corridor_env import NEVER, SUB_GOALS, CorridorEnv, Sensed
+from hypogoal import GymnasiumDomain
+from margin import pair_loss
+from wide_network import wide
+
+PLAY = {"steps": 200, "environments": 4, "warm_up": 50, "max_episode_steps": 20, "random_episodes": 1}
+FEW = {
+    "collect": {"steps": 150, "heldout_seeds": (4, 5)},
+    "train-ensemble": {"steps": 2, "members": 2, "workers": 1},
+    "train-options": PLAY,
+    "train-meta": PLAY,
+}
+DOMAIN = GymnasiumDomain(CorridorEnv, SUB_GOALS, defaults=FEW)
+NUMBERS = GymnasiumDomain(Sensed, SUB_GOALS, defaults=FEW)
+"""
+Shell = Callable[[str], str]
+
+
+@pytest.fixture
+def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Shell]:
+    """Types a line into ``sh``, whose words our program gets, in a folder with own code; gives back all it prints."""
+    folder = tmp_path / "where it's  at"
+    folder.mkdir()
+    (folder / "tiny.py").write_text(OWN)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(own_code, "_before", set())
+    for place in (TESTS, TESTS.parent / "examples", folder):
+        monkeypatch.syspath_prepend(str(place))
+
+    def typed(line: str, code: int = 0) -> str:
+        script = f'hypogoal() {{ printf \'%s\\0\' "${TRUST}" "$@"; }}; {line}'
+        done = subprocess.run(["sh", "-c", script], env={}, capture_output=True, text=True, check=True)
+        allowed, *words = done.stdout.split("\0")[:-1]
+        with monkeypatch.context() as here:
+            here.setattr(own_code, "_before", set())  # as in a process of its own
+            here.setenv(TRUST, allowed)
+            capsys.readouterr()
+            assert main(words) == code, (line, capsys.readouterr())
+        printed = capsys.readouterr()
+        return printed.out + printed.err
+
+    yield typed
+    sys.modules.pop("tiny", None)
+
+
+def printed(text: str, lead: str) -> str:
+    """The command behind ``lead``, which is all that is behind it in its line."""
+    (line,) = (line for line in text.splitlines() if lead in line)
+    command_line = line.partition(lead)[2].rstrip(")")
+    assert PRINTED.fullmatch(command_line), line
+    return command_line
+
+
+def test_what_follows_a_stage_with_code_of_ones_own(shell: Shell) -> None:
+    """From collecting to the report nothing is typed but what was printed; paths have spaces and a quote in them."""
+    line = 'hypogoal collect tiny:DOMAIN --out "it\'s  mine/data.h5"'
+    ran = []
+    while line:
+        ran.append(line)
+        text = shell(line)
+        line = printed(text, "next: ") if "next: " in text else ""
+    stages = ["collect", "train-ensemble", "train-options", "train-meta", "evaluate", "report"]
+    assert [shlex.split(line)[min(1, i) + 1] for i, line in enumerate(ran)] == stages
+    assert all(line.startswith("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal ") for line in ran[1:])
+    assert Path("it's  mine/report/index.html").is_file()
+
+
+def test_what_follows_allows_networks_and_objectives_too(shell: Shell) -> None:
+    """All code that the next command's files name, whoever named it: an option, or the domain's defaults."""
+    text = shell("hypogoal collect tiny:DOMAIN --out data.h5")
+    line = printed(text, "next: ") + " --diversity tiny:pair_loss --set network=tiny:wide"
+    line = printed(shell(line), "next: ")
+    names, _, rest = line.removeprefix("HYPOGOAL_TRUST=").partition(" ")
+    assert {*names.split(",")} == {"tiny:DOMAIN", "tiny:pair_loss", "tiny:wide"}
+    assert rest == "hypogoal train-options ensemble --out options"
+    assert "next: " in shell(line)
+
+
+def test_what_follows_pictures_and_marks(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An imported folder of images, and states marked by hand; training is shortened by what is added behind."""
+    few = " --steps 2 --members 2 --set workers=1"
+    for number, kind in enumerate(("positive", "negative", "unlabelled")):
+        folder = Path("my  photos") / kind
+        folder.mkdir(parents=True)
+        for index in range(6):
+            picture = np.full((48, 48, 3), 40 * number + index, np.uint8)
+            Image.fromarray(picture).save(folder / f"{index}.png")
+    line = printed(shell("hypogoal import 'my  photos' --out 'my  photos.h5' --domain tiny:DOMAIN"), "next: ")
+    assert line.startswith("HYPOGOAL_TRUST=tiny:DOMAIN ") and "next: " in shell(line + few)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv(TRUST, "tiny:DOMAIN")
+    assert label("n 1 p m 1 0 u 0 0 u", "tiny:DOMAIN", "--out", "the  marks", "--layout-seed", "1") == 0
+
+
+def test_a_rare_sub_goal_is_played_by_hand_as_printed(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command of ``check`` records play, and what it says of the file is what ``check`` then takes."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    text = shell("hypogoal check tiny:NEVER --set steps=150 --set heldout_seeds=4,5")
+    line = printed(text, "play it by hand and give --play on-the-moon.json: ")
+    assert label("0 1 1", *shlex.split(line)[2:]) == 0
+    assert json.loads(Path("on-the-moon.json").read_text()) == [{"layout_seed": 0, "actions": [0, 1, 1]}]
+    text = shell("hypogoal check tiny:NEVER --set steps=150 --set heldout_seeds=4,5 --play on-the-moon.json")
+    assert "ok   collected again" in text
+
+
+def test_what_an_error_says_to_do(shell: Shell) -> None:
+    """Each is typed as it stands, with code of one's own that this process was not told of."""
+    shell("hypogoal collect tiny:DOMAIN --out 'a run/data.h5' -q")
+    shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble 'a run/data.h5' --out 'a run/ensemble' -q")
+    lead = "First run, if you trust tiny:DOMAIN: "
+    shell(printed(shell("hypogoal report 'a run'", 2), lead))
+    shell("hypogoal report 'a run'")
+    shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-options 'a run/ensemble' --out 'a run/options' -q")
+    since = read_evaluation(Path("a run")).metrics["missing"]
+    line = printed(since[-1], "options: made since this evaluation (evaluate it again, if you trust tiny:DOMAIN: ")
+    shell(line)
+    assert read_evaluation(Path("a run")).metrics["missing"] == []
+    shell("hypogoal collect tiny:NUMBERS --out 'num  bers.h5' -q")
+    text = shell("hypogoal show 'num  bers.h5' --pictures sheets", 2)
+    assert "num  bers.npz" in shell(printed(text, "Read them as arrays, if you trust tiny:NUMBERS: "))
+    for given in ("collect tiny:DOMAIN", "collect doorkey", "collect montezuma", "train-baseline doorkey"):
+        text = shell(f"hypogoal {given} --out x --set bogus=1", 2)
+        assert " = " in shell(printed(text, "All of them: "))
+    shell(printed(shell("hypogoal train-ensemble nothing.h5 --out x", 2), "How to make it: "))
+    Path("not yet").mkdir()
+    shell(printed(shell("hypogoal evaluate 'not yet'", 2), "Train something into it first: "))
+    for given in ("collect", "train-meta e --out o --gae-lambda 3", "show runs --bogus", "benchmark which-feature"):
+        (line,) = re.findall(r"'(hypogoal [^']+)'", shell(f"hypogoal {given}", 2))
+        shell(line)
+
+
+def test_permissions_asked_for_add_up(shell: Shell) -> None:
+    """Whoever sets what each refusal says gets there, though two names are needed."""
+    shell("hypogoal collect tiny:DOMAIN --out data.h5 -q")
+    shell("HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble data.h5 --out run/ensemble --set network=tiny:wide -q")
+    line = "hypogoal train-options run/ensemble --out run/options -q"
+    first = shell(line, 2).rpartition(" Set ")[2].strip()
+    second = shell(f"{first} {line}", 2).rpartition(" Set ")[2].strip()
+    assert {first, second} == {"HYPOGOAL_TRUST=tiny:DOMAIN", "HYPOGOAL_TRUST=tiny:wide,tiny:DOMAIN"}
+    shell(f"{second} {line}")
+
+
+def test_a_strangers_code_is_never_allowed_in_passing(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what this process was not told to load a command says nothing, and advice asks."""
+    shell("hypogoal collect tiny:DOMAIN --out theirs.h5 -q")
+    monkeypatch.setattr(own_code, "_before", set())
+    monkeypatch.delenv(TRUST, raising=False)
+    assert command("train-ensemble", "theirs.h5") == "hypogoal train-ensemble theirs.h5"
+    asked = "Do, if you trust tiny:DOMAIN: HYPOGOAL_TRUST=tiny:DOMAIN hypogoal train-ensemble theirs.h5"
+    assert advice("Do", "train-ensemble", "theirs.h5") == asked
+    monkeypatch.setenv(TRUST, "others:DOMAIN")
+    assert advice("Do", "train-ensemble", "theirs.h5") == asked
+    with own_code.given("tiny:DOMAIN"):
+        assert command("show", "theirs.h5") == "HYPOGOAL_TRUST=tiny:DOMAIN hypogoal show theirs.h5"
+
+
+def texts(tree: ast.AST) -> Iterator[ast.Constant | ast.JoinedStr]:
+    """The texts in a module that are no docstrings; of one that has parts, the whole."""
+    passed: set[int] = set()
+    for node in ast.walk(tree):  # what stands around another comes before it
+        if isinstance(node, ast.Expr):
+            passed.add(id(node.value))
+        elif isinstance(node, ast.JoinedStr):
+            passed |= {id(part) for part in node.values}
+            yield node
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in passed:
+            yield node
+
+
+def test_commands_in_texts_work(shell: Shell) -> None:
+    """Those that stand in our texts are typed; those with something filled in come from one place, which quotes."""
+    known = "|".join(get_command(app).commands)  # type: ignore[attr-defined]
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in texts(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant):
+                found |= {*re.findall(r"'(hypogoal [^']+)'", node.value)}
+            elif path.name != "slurm.py" and path.parent.name != "cli":  # a script; names of commands
+                assert not re.search(rf"hypogoal ({known}) .*\{{", ast.unparse(node)), path
+    assert found == {"hypogoal config"}
+    for line in found:
+        shell(line)
