@@ -6,6 +6,7 @@ all that is not read by a library of its own is opened with :func:`open_file`, w
 
 import contextlib
 import csv
+import functools
 import io
 import json
 import os
@@ -22,6 +23,12 @@ from hypogoal.core.errors import UserError, printable
 MAX_TEXT_BYTES = 64 * 2**20
 END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
 MAX_JSON_DEPTH = 32
+MOST_HOLE, HOLE_RATIO = 2**30, 1000  # a larger file that stores less than a thousandth of its bytes is no data
+# File systems on which the kernel makes up a file as it is read: its size is none, and some never end.
+KERNEL = frozenset(
+    "binfmt_misc bpf cgroup cgroup2 configfs debugfs efivarfs fusectl mqueue nsfs proc pstore rpc_pipefs securityfs "
+    "selinuxfs sysfs tracefs".split()
+)
 MAX_NAME_BYTES = 200
 MOST_DOTS = 256  # in a line of TOML
 MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
@@ -35,19 +42,39 @@ def require_file(path: Path, what: str, do: str) -> int:
     ``what`` it is stands in the message with its verb ("the weights are"), ``do`` is what to do about it.
     """
     try:
-        if path.is_file():
-            return path.stat().st_size
-        there = path.exists()
-    except OSError as error:  # a name that is too long, a folder that may not be entered
-        raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    raise UserError(f"{what} not a regular file" if there else f"{what} missing", path, do)
+        state = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"{what} missing", path, do) from None
+    except (OSError, ValueError) as error:  # a name too long or with a zero, a folder that may not be entered
+        raise UserError(f"{what} not readable ({getattr(error, 'strerror', error)})", path, do) from None
+    if not is_regular(state):
+        raise UserError(f"{what} not a regular file", path, do)
+    return state.st_size
+
+
+def is_regular(state: os.stat_result) -> bool:
+    """Whether it is a file on a disk, of as many bytes as it says; one of the kernel's (``/proc``, ``/sys``) is not."""
+    return stat.S_ISREG(state.st_mode) and state.st_dev not in _kernel_devices()
+
+
+@functools.cache
+def _kernel_devices() -> frozenset[int]:
+    """The numbers of the file systems in ``KERNEL`` that are mounted; none where the system does not say."""
+    devices = set()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            place, _, kind = line.partition(" - ")
+            if kind.split(" ")[0] in KERNEL:
+                major, minor = place.split()[2].split(":")
+                devices.add(os.makedev(int(major), int(minor)))
+    return frozenset(devices)
 
 
 def open_file(path: Path, what: str, do: str) -> BufferedReader:
     """A regular file, or a link to one, opened for reading bytes; see :func:`require_file`.
 
     What lies there may be exchanged for a pipe at any time: opening does not wait for its other end, and what was
-    opened is looked at once more.
+    opened is looked at once more. A file that is nearly all hole is a ``UserError``: reading it would never end.
     """
     require_file(path, what, do)
     flags = [getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY", "O_NOINHERIT")]
@@ -55,23 +82,35 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
         file = os.fdopen(os.open(path, os.O_RDONLY | sum(flags)), "rb")
     except OSError as error:
         raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+    state = os.fstat(file.fileno())
+    fault = "not a regular file" if not is_regular(state) else "nearly all hole" if _is_hole(file, state) else ""
+    if fault:
         file.close()
-        raise UserError(f"{what} not a regular file", path, do)
+        raise UserError(f"{what} {fault}", path, do)
     return file
 
 
+def _is_hole(file: BufferedReader, state: os.stat_result) -> bool:
+    """Whether a file declares a thousand times what it stores, as its file system says, which says where holes are."""
+    stored = 512 * getattr(state, "st_blocks", state.st_size)
+    if state.st_size <= max(MOST_HOLE, HOLE_RATIO * stored) or not hasattr(os, "SEEK_HOLE"):
+        return False
+    hole = os.lseek(file.fileno(), 0, os.SEEK_HOLE)
+    os.lseek(file.fileno(), 0, os.SEEK_SET)
+    return hole < state.st_size
+
+
 def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
-    """A regular file, see :func:`require_file`; of more than ``limit`` bytes, or not readable, a ``UserError``."""
+    """A regular file, as many bytes as it had when it was opened; of more than ``limit``, or not readable, a
+    ``UserError``."""
     with open_file(path, what, do) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise UserError(f"{what} too large ({size} bytes, at most {limit} are read)", path, do)
         try:
-            size = os.fstat(file.fileno()).st_size
-            data = b"" if size > limit else file.read(limit + 1)  # it may have grown since
+            return file.read(size)
         except OSError as error:
             raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    if max(size, len(data)) > limit:
-        raise UserError(f"{what} too large ({max(size, len(data))} bytes, at most {limit} are read)", path, do)
-    return data
 
 
 def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
