@@ -25,10 +25,10 @@ END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
 MAX_JSON_DEPTH = 32
 MOST_HOLE, HOLE_RATIO = 2**30, 1000  # a larger file that stores less than a thousandth of its bytes is no data
 # File systems on which the kernel makes up a file as it is read: its size is none, and some never end.
-KERNEL = frozenset(
-    "binfmt_misc bpf cgroup cgroup2 configfs debugfs efivarfs fusectl mqueue nsfs proc pstore rpc_pipefs securityfs "
-    "selinuxfs sysfs tracefs".split()
-)
+KERNEL = frozenset([
+    "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "efivarfs", "fusectl", "mqueue", "nsfs", "proc",
+    "pstore", "rpc_pipefs", "securityfs", "selinuxfs", "sysfs", "tracefs",
+])  # fmt: skip
 MAX_NAME_BYTES = 200
 MOST_DOTS = 256  # in a line of TOML
 MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
@@ -140,22 +140,40 @@ def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> An
 
 
 def parse_json(text: str, where: object, what: str, do: str) -> Any:
-    """JSON whose numbers are finite, ``MAX_JSON_DEPTH`` deep at most, its texts printable; else a ``UserError``."""
+    """JSON of finite numbers, its integers exact in a float, ``MAX_JSON_DEPTH`` deep at most; else a ``UserError``."""
     try:
-        value = json.loads(text)
-        _check_depth(value)
-        json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, NaN, 1e999
-    except (ValueError, RecursionError):
+        return _parsed(text)
+    except ValueError:
         raise UserError(f"{what} not valid JSON", where, do) from None
-    return value
 
 
 def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """The objects in lines of a log; what is only half written yet, damaged or none is left out."""
+    """The objects in lines of a log, as :func:`parse_json` takes them, though a number that was not there yet may be
+    NaN; what is only half written yet, damaged or none is left out."""
     for line in lines:
-        with contextlib.suppress(ValueError, RecursionError):
-            if isinstance(value := json.loads(line), dict):
+        with contextlib.suppress(ValueError):
+            if isinstance(value := _parsed(line, nan=True), dict):
                 yield value
+
+
+def _parsed(text: str, *, nan: bool = False) -> Any:
+    """What JSON says; a ``ValueError`` where it says more than is read."""
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError("too deep") from None
+    level = [value]
+    for _ in range(MAX_JSON_DEPTH):
+        if any(isinstance(item, int) and abs(item) > MOST_INTEGER for item in level):
+            raise ValueError("an integer is too large")
+        groups = (item for item in level if isinstance(item, (dict, list)))
+        level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
+        if not level:
+            break
+    else:
+        raise ValueError("too deep")
+    json.dumps(value, ensure_ascii=False, allow_nan=nan).encode()  # half a surrogate pair, NaN, 1e999
+    return value
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
@@ -169,16 +187,6 @@ def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
         return table
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
-
-
-def _check_depth(value: Any) -> None:
-    level = [value]
-    for _ in range(MAX_JSON_DEPTH):
-        groups = (item for item in level if isinstance(item, (dict, list)))
-        level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
-        if not level:
-            return
-    raise RecursionError
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -57,7 +57,7 @@ STYLE: dict[str, Any] = {
     "savefig.facecolor": "none",
     "svg.fonttype": "none",
 }
-# matplotlib's own, whatever a notebook or somebody's ``matplotlibrc`` has set; which window it opens is not ours to say.
+# matplotlib's own, whatever a notebook or a ``matplotlibrc`` has set; which windows it opens is not ours to say.
 DEFAULTS = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
 PICTURE_TITLE = 0.34  # inches above a picture
 
