@@ -92,7 +92,7 @@ PLAN_FAULTS: list[tuple[str, Any]] = [
 CELL_FAULTS: list[tuple[str, Any]] = [
     ("arguments", ["evaluate", "/"]), ("arguments", ["report", "/"]), ("arguments", ["evaluate", "{run}/.."]),
     ("arguments", ["evaluate", "{run}", "--out", "/x"]), ("arguments", []), ("arguments", ["verify", "{run}"]),
-    ("arguments", ["collect", "doorkey"]), ("arguments", ["collect", "doorkey", "--out", "{run}/../x"]),
+    ("arguments", ["collect", "doorkey", "--out", "{run}/../x"]),
     ("arguments", ["collect", "{run}/../../x", "--out", "{run}/data.h5"]), ("arguments", "collect"),
     ("arguments", ["collect", "--out=/x", "--out", "{run}/data.h5"]), ("arguments", [["collect"], 3]),
     ("arguments", ["collect", "doorkey", "--force", "--out", "{run}/data.h5"]), ("out", "{run}"), ("out", "/x"),

@@ -18,7 +18,7 @@ from typing import Any, Self
 from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json, visible
+from hypogoal.core.files import MAX_NAME_BYTES, inside, is_hole, open_file, read_json, visible
 from hypogoal.core.hdf5 import Busy, open_hdf5
 from hypogoal.core.manifests import (
     AGAIN,
@@ -100,6 +100,8 @@ def sha256_of(path: Path) -> str:
     """The sha256 of a regular file, as large as when it was opened, as hexadecimal digits; else a ``UserError``."""
     digest = hashlib.sha256()
     with open_file(path, THE_FILE, AGAIN) as file:
+        if is_hole(file):
+            raise UserError(f"{THE_FILE} nearly all hole", path, AGAIN)
         left = os.fstat(file.fileno()).st_size
         while piece := file.read(min(left, PIECE)):
             digest.update(piece)

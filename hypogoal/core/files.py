@@ -74,7 +74,7 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
     """A regular file, or a link to one, opened for reading bytes; see :func:`require_file`.
 
     What lies there may be exchanged for a pipe at any time: opening does not wait for its other end, and what was
-    opened is looked at once more. A file that is nearly all hole is a ``UserError``: reading it would never end.
+    opened is looked at once more.
     """
     require_file(path, what, do)
     flags = [getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY", "O_NOINHERIT")]
@@ -82,16 +82,18 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
         file = os.fdopen(os.open(path, os.O_RDONLY | sum(flags)), "rb")
     except OSError as error:
         raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    state = os.fstat(file.fileno())
-    fault = "not a regular file" if not is_regular(state) else "nearly all hole" if _is_hole(file, state) else ""
-    if fault:
+    if not is_regular(os.fstat(file.fileno())):
         file.close()
-        raise UserError(f"{what} {fault}", path, do)
+        raise UserError(f"{what} not a regular file", path, do)
     return file
 
 
-def _is_hole(file: BufferedReader, state: os.stat_result) -> bool:
-    """Whether a file declares a thousand times what it stores, as its file system says, which says where holes are."""
+def is_hole(file: BufferedReader) -> bool:
+    """Whether a file declares a thousand times what it stores, as its file system says, which says where holes are.
+
+    To read such a one from its beginning to its end would take for ever.
+    """
+    state = os.fstat(file.fileno())
     stored = 512 * getattr(state, "st_blocks", state.st_size)
     if state.st_size <= max(MOST_HOLE, HOLE_RATIO * stored) or not hasattr(os, "SEEK_HOLE"):
         return False

@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -56,7 +57,8 @@ def read_record(run: Path, cell: Cell) -> Record:
         record = read_json(run / LOGS / f"{cell.name}.json", "the record is", AGAIN)
     except UserError:
         return Record()
-    return Record() if misfit(record, RECORD) is not None else Record(**{key: record[key] for key in RECORD})
+    fits = misfit(record, {}, RECORD) is None
+    return Record(**{key: record[key] for key in RECORD if key in record}) if fits else Record()
 
 
 def write_record(run: Path, cell: Cell, record: Record) -> None:
@@ -181,10 +183,9 @@ def _is_cell(row: Any) -> bool:
     words, out = row["arguments"], row["out"]
     if words[0] in DERIVED:  # which read the run
         return (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing_cells(Path(RUN), ())]
-    rest = words[1:-2]
-    inner = [word for word in rest if word.startswith(RUN)]
-    free = not any(word.split("=")[0] in RESERVED for word in rest)
-    return words[0] in STAGES and words[-2:] == ["--out", out] and free and all(map(_is_place, inner))
+    reserved = [pair for pair in pairwise([*words, ""]) if pair[0].split("=")[0] in RESERVED]
+    inner = [word for word in words if word.startswith(RUN)]
+    return words[0] in STAGES and all(pair == ("--out", out) for pair in reserved) and all(map(_is_place, inner))
 
 
 # What is read of a record and of a plan.
