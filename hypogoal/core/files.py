@@ -142,24 +142,25 @@ def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> An
 
 
 def parse_json(text: str, where: object, what: str, do: str) -> Any:
-    """JSON of finite numbers, its integers exact in a float, ``MAX_JSON_DEPTH`` deep at most; else a ``UserError``."""
+    """JSON as of :func:`_parsed` whose numbers are finite and texts can be written; else a ``UserError``."""
     try:
-        return _parsed(text)
+        value = _parsed(text)
+        json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, NaN, 1e999
     except ValueError:
         raise UserError(f"{what} not valid JSON", where, do) from None
+    return value
 
 
 def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """The objects in lines of a log, as :func:`parse_json` takes them, though a number that was not there yet may be
-    NaN; what is only half written yet, damaged or none is left out."""
+    """The objects in lines of a log; what is only half written yet, damaged or none is left out."""
     for line in lines:
         with contextlib.suppress(ValueError):
-            if isinstance(value := _parsed(line, nan=True), dict):
+            if isinstance(value := _parsed(line), dict):
                 yield value
 
 
-def _parsed(text: str, *, nan: bool = False) -> Any:
-    """What JSON says; a ``ValueError`` where it says more than is read."""
+def _parsed(text: str) -> Any:
+    """JSON that is ``MAX_JSON_DEPTH`` deep at most, its integers exact in a float; else a ``ValueError``."""
     try:
         value = json.loads(text)
     except RecursionError:
@@ -171,11 +172,8 @@ def _parsed(text: str, *, nan: bool = False) -> Any:
         groups = (item for item in level if isinstance(item, (dict, list)))
         level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
         if not level:
-            break
-    else:
-        raise ValueError("too deep")
-    json.dumps(value, ensure_ascii=False, allow_nan=nan).encode()  # half a surrogate pair, NaN, 1e999
-    return value
+            return value
+    raise ValueError("too deep")
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:

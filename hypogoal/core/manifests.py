@@ -56,8 +56,10 @@ def _text(manifest: Mapping[str, Any]) -> bytes:
 def check_writable(manifest: dict[str, Any], out: Path) -> None:
     """Refuse (``UserError``), before anything is made, a manifest that :func:`read_manifest` could not read again."""
     do = "Choose another value, or a name in UTF-8."
+    text = json.dumps(manifest)
     try:
-        _checked(parse_json(json.dumps(manifest), out, "the manifest would be", do), out)
+        _checked(json.loads(text), out)
+        parse_json(text, out, "the manifest would be", do)
     except UserError as error:
         raise UserError(f"this could not be read again ({error.what})", out, do) from None
 
