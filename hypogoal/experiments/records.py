@@ -148,8 +148,11 @@ def read_plan(run: Path) -> tuple[Plan, float]:
     if isinstance(about, dict) and is_count(about.get("format")) and about["format"] > FORMAT_VERSION:
         raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
     key = misfit(about, PLAN_KEYS, PLAN_MAY)
+    if key is None:
+        faults = (f"{fault} of cell {n}" for n, row in enumerate(about["cells"]) if (fault := _fault(row)) is not None)
+        key = next(faults, None)
     if key is not None:
-        raise LostPlan(f"the sweep's plan is damaged{key and f' (its {key!r})'}", path, GIVE)
+        raise LostPlan(f"the sweep's plan is damaged ({key or 'no JSON object'})", path, GIVE)
     anew, cells = frozenset(about.get("anew", ())), [_cell(row, run) for row in about["cells"]]
     known: set[Path] = set()
     for cell in cells:
@@ -163,7 +166,7 @@ def read_plan(run: Path) -> tuple[Plan, float]:
 
 
 def _cell(row: dict[str, Any], run: Path) -> Cell:
-    """A cell of a plan that fits ``CELL``, in the run's folder."""
+    """A cell of a plan that has no :func:`_fault`, in the run's folder."""
     cost = Cost(*(row[name] for name in Cost._fields))
     needs = tuple(map(Path, row["needs"]))
     cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, cost, tuple(row["axes"].items()))
@@ -176,16 +179,19 @@ def _is_place(value: Any) -> bool:
     return len(parts) > 1 and parts[0] == RUN and all(map(path_part, parts))
 
 
-def _is_cell(row: Any) -> bool:
-    """Whether it is a cell whose command, of a stage, reads and writes what it says it does: nothing leads out."""
-    if misfit(row, CELL) is not None or not row["arguments"]:
-        return False
+def _fault(row: Any) -> str | None:
+    """Which key of a cell is malformed; its command must be of a stage and lead out of the run nowhere, or no key."""
+    key = misfit(row, CELL)
+    if key is not None:
+        return key
     words, out = row["arguments"], row["out"]
-    if words[0] in DERIVED:  # which read the run
-        return (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing_cells(Path(RUN), ())]
+    if words[:1] and words[0] in DERIVED:  # which read the run
+        closing = closing_cells(Path(RUN), ())
+        return None if (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing] else "arguments"
     reserved = [pair for pair in pairwise([*words, ""]) if pair[0].split("=")[0] in RESERVED]
     inner = [word for word in words if word.startswith(RUN)]
-    return words[0] in STAGES and all(pair == ("--out", out) for pair in reserved) and all(map(_is_place, inner))
+    fits = words[:1] and words[0] in STAGES and all(pair == ("--out", out) for pair in reserved)
+    return None if fits and all(map(_is_place, inner)) else "arguments"
 
 
 # What is read of a record and of a plan.
@@ -210,7 +216,7 @@ PLAN_KEYS: Schema = {
     "experiment": is_text,
     "workers": lambda value: is_count(value) and value > 0,
     "factor": lambda value: is_amount(value) and value > 0,
-    "cells": is_list(_is_cell),
+    "cells": is_list(lambda row: isinstance(row, dict)),
 }
 PLAN_MAY: Schema = {"anew": is_list(is_text), "presets": is_table(is_text)}
 
