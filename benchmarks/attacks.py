@@ -35,6 +35,7 @@ from benchmarks.kills import PACES, STAGES, Stage, differences, needed, unbroken
 from benchmarks.sweeps import TOY
 from hypogoal.core.checkpoints import FOLDER, PACE
 from hypogoal.core.drafts import draft_folder
+from hypogoal.core.workers import PYTHON
 
 SECONDS, WAIT = 60.0, 300.0  # of a core that a command may take; of the clock, on whatever machine
 MEMORY, SMALL = 2**30, 16 * 2**20  # bytes that a file below SMALL may cost
@@ -76,14 +77,20 @@ class Ended:
 class Command:
     """``hypogoal`` in a process of its own, the first of its group: forked from this one, or begun ``anew``."""
 
-    def __init__(self, *arguments: object, anew: bool = False, environment: Mapping[str, str] | None = None):
+    def __init__(
+        self,
+        *arguments: object,
+        anew: bool = False,
+        environment: Mapping[str, str] | None = None,
+        folder: Path | None = None,
+    ):
         words, environment = [str(argument) for argument in arguments], {**os.environ, **(environment or {})}
         self.arguments, self.began = words, time.monotonic()
         self.said, self.log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - as long as this is
         if anew:
-            command = [sys.executable, "-m", "hypogoal", *words]
+            command = [*PYTHON, "-m", "hypogoal", *words]
             self.process = subprocess.Popen(
-                command, stdout=self.said, stderr=self.log, env=environment, process_group=0
+                command, stdout=self.said, stderr=self.log, env=environment, cwd=folder, process_group=0
             ).pid
         else:
             self.process = os.fork() or self._run(words, environment)
@@ -431,6 +438,33 @@ def clock(box: Box, rng: Rng, case: int) -> bool:
     return True
 
 
+def surroundings(box: Box, rng: Rng, case: int) -> bool:
+    """Whatever lies in the current folder, which is the home folder too: the same bytes as without it."""
+    folder = box.fresh() / "around"
+    folder.mkdir()
+    environment = hostile.around(folder, rng) | {"XDG_CACHE_HOME": str(box.root / "cache"), PACE: "1e9"}
+    if case % 2:  # figures, or a stage that starts processes
+        kind = rng.choice(("svg", "png", "pdf"))
+        whole, out = box.whole / f"figures-{kind}", box.case / "made"
+        words: list[object] = ["report", box.ready(*TRAINED, evaluated=True), "--format", kind, "--figures"]
+        if not whole.exists() and not Command(*words, whole).wait().accepted():
+            raise RuntimeError("the figures cannot be drawn")
+        words.append(out)
+    else:
+        stage = STAGES[rng.choice(("rooms", "ensemble", "ppo"))]
+        whole, out = box.undisturbed(stage)[0], box.case / f"{stage.name}{stage.suffix}"
+        words = [*box.command(stage, box.case)[0]]
+    before = entries(folder)
+    ended = Command(*words, anew=True, environment=environment, folder=folder).wait()
+    if not ended.accepted() or (case % 2 == 0 and ended.words):
+        raise Bad(f"obeyed: {ended.words[-400:]}")
+    if differ := differences(whole, out):
+        raise Bad(f"{words[0]}: {differ} differ")
+    if changed := entries(folder) ^ before:
+        raise Bad(f"wrote {sorted(changed)[:3]}")
+    return True
+
+
 def entries(folder: Path) -> set[str]:
     """Everything that is in a folder."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
@@ -473,6 +507,7 @@ FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
     "disk": disk,
     "signals": signals,
     "clock": clock,
+    "surroundings": surroundings,
     "boards": files(hostile.boards),
     "minari": files(hostile.minari),
     "images": files(hostile.images),

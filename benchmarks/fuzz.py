@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
 import io
 import json
 import os
@@ -31,6 +32,7 @@ import h5py
 import numpy as np
 
 from benchmarks.mutations import (
+    ENDLESS,
     Rng,
     bytes_changed,
     hdf5_changed,
@@ -56,9 +58,11 @@ PRESET = {
     "train-baseline": {"agent": "ppo", "setting": "tuned"},
     "run": {"layout_seeds": [100, 101], "seeds": [0], "controls": ["random"]},
 }
+PLANNED = (0, -1, 10**400, 1e308, True, ["evaluate", "/"], ["report", "/"], ["evaluate", "{run}/.."], ["report"],
+           ["collect", "x", "--out", "/x"], ["collect", "{run}/../x"], ["/"], {"seed": 10**400})  # fmt: skip
 OWN = """
 format = 1
-evaluate = false
+evaluate = true
 workers = 2
 axes = { seed = [0, 1], layout = "210-211" }
 cells = [
@@ -241,6 +245,11 @@ def fuzz_manifest(box: Sandbox, rng: Rng, case: int) -> bool:
     kind = rng.choice(("ensemble", "meta", "options"))
     path = box.case / kind / "manifest.json"
     path.write_bytes(json_changed(path.read_bytes(), rng, box.odd))
+    if rng.random() < 0.2:
+        manifest, place = json.loads((box.seeds / kind / path.name).read_bytes()), rng.choice(ENDLESS)
+        for entry in manifest["inputs"]:
+            entry |= {"path": place, rng.choice(("relative", "kind")): rng.choice((place, "data"))}
+        path.write_bytes(json.dumps(manifest).encode())
     if rng.random() < 0.9:  # by somebody who seals it: the checksum betrays nothing
         with contextlib.suppress(ValueError, AttributeError, RecursionError):
             path.write_bytes(sealed(json.loads(path.read_bytes())))
@@ -324,25 +333,47 @@ def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
 
 
 def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
-    """An own experiment, and the plan and the records that a sweep leaves."""
+    """An own experiment; the plan, records and last words that a sweep leaves, and the log of what a cell made."""
     from hypogoal.experiments.format import make_plan, read_experiment
     from hypogoal.experiments.records import PLAN, write_plan
-    from hypogoal.experiments.status import lines, read_status
+    from hypogoal.experiments.status import lines as lines_of
+    from hypogoal.experiments.status import read_status
 
     own, run = box.case / "own.toml", box.out / "run"
     own.write_text(OWN, encoding="utf-8")
-    if rng.random() < 0.5:
+    if rng.random() < 0.3:
         text = toml_of(tree_changed(tomllib.loads(OWN), rng, box.odd), rng).encode(errors="surrogatepass")
         own.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
         return tolerated(lambda: make_plan(read_experiment(own), run, ["seed=0-2"] if case % 2 else []))
-    write_plan(run, make_plan(read_experiment(own), run), 1.0)
+    planned = make_plan(read_experiment(own), run)
+    write_plan(run, planned, 1.0)
     (run / "logs").mkdir(exist_ok=True)
-    (run / "logs" / "data.log").write_text("started\n", encoding="utf-8")
+    said = str(rng.choice(box.odd))[:9999]
+    (run / "logs" / "data.log").write_text(f"started\n{said}", encoding="utf-8", errors="replace")
     record = json.dumps({"attempts": 1, "seconds": 2.0, "code": 2, "started": 0.0, "host": "here"}).encode()
     (run / "logs" / "data.json").write_bytes(json_changed(record, rng, box.odd))
-    plan = (run / PLAN).read_bytes()
-    (run / PLAN).write_bytes(json_changed(plan, rng, box.odd) if rng.random() < 0.8 else plan)
-    return tolerated(lambda: lines(read_status(run)), partial(command, "sweep", "--out", run, "--gather"))
+    plan, kind = (run / PLAN).read_bytes(), rng.random()
+    if kind < 0.4:  # one value, which every reader meets
+        tree = json.loads(plan)
+        holder = rng.choice((tree, *tree["cells"]))
+        holder[rng.choice([*holder])] = rng.choice((*PLANNED, *box.odd))
+        (run / PLAN).write_text(json.dumps(tree), encoding="utf-8")
+    elif kind < 0.8:
+        (run / PLAN).write_bytes(json_changed(plan, rng, box.odd))
+    made = run / "ensemble" / "seed-0"
+    for cell in planned.cells if rng.random() < 0.5 else planned.cells[:2]:  # all that is evaluated, or not yet
+        copy = shutil.copyfile if cell.out.suffix else shutil.copytree
+        cell.out.parent.mkdir(exist_ok=True)
+        copy(box.seeds / ("data.h5" if cell.out.suffix else "ensemble"), cell.out)
+    lines = [json_changed(b'{"step": 1, "sub_goal": "go-to-goal", "loss": 0.5}', rng, box.odd) for _ in range(3)]
+    (made / "metrics.jsonl").write_bytes(b"\n".join(lines))
+    resigned(made, "metrics.jsonl")
+    commands = [("sweep", "--out", run, *words) for words in (("--status",), ("--status", "--json"), ("--gather",))]
+    with (run / "logs" / "data.log").open("ab") as log:
+        if rng.random() < 0.5:  # as one who runs the cell would
+            fcntl.flock(log, fcntl.LOCK_EX)
+        calls = [partial(command, *words) for words in (*commands, ("watch", run, "--once"))]
+        return tolerated(lambda: lines_of(read_status(run)), *calls)
 
 
 FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {

@@ -455,6 +455,39 @@ def minari(box: Any, rng: Rng, case: int) -> Made:
     return Made(name, size_of(folder), imported(box, folder, "--label", "one=numpy:any", "--key", ""))
 
 
+# What libraries would read in the current folder, in the home folder, or where the environment leads.
+
+SETTINGS = b"text.usetex: True\ntext.latex.preamble: \\input{/etc/passwd}\nfigure.dpi: 100000\nsavefig.bbox: tight\n"
+LYING: Makers = {
+    "settings": lambda f: f.write_bytes(SETTINGS),
+    "no text": lambda f: f.write_bytes(bytes(range(256)) * 99),
+    "nothing": lambda f: f.touch(),
+    "a pipe": os.mkfifo,
+    "a folder": Path.mkdir,
+    "a device": lambda f: f.symlink_to("/dev/zero"),
+    "a file of the kernel": lambda f: f.symlink_to("/proc/self/pagemap"),
+    "a link to itself": lambda f: f.symlink_to(f),
+}
+LIES = (
+    *(f"{place}matplotlibrc" for place in ("", ".matplotlib/", ".config/matplotlib/")),
+    ".config/matplotlib/stylelib/a.mplstyle", "libc.so.6", "libm.so.6", "libstdc++.so.6", "libgcc_s.so.1",
+    "libpython3.11.so.1.0", "numpy.py", "matplotlib.py", "sitecustomize.py", "usercustomize.py", "setup.cfg",
+    "pyproject.toml", "pydistutils.cfg", ".env", "ale.cfg", "fonts.conf", "arrays.h5", "terminations.h5", "visited.h5",
+    "manifest.json", "sweep.json", "hypogoal.toml", "demo.toml",
+)  # fmt: skip
+
+
+def around(folder: Path, rng: Rng) -> dict[str, str]:
+    """Fill a folder, from which a command is started, and which is its home; returns its environment."""
+    for name in rng.sample(LIES, rng.choice((3, 8, len(LIES)))):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        if not os.path.lexists(folder / name):
+            rng.choice([*LYING.values()])(folder / name)
+    places = {"MATPLOTLIBRC": str(folder), "MPLCONFIGDIR": str(folder / ".config/matplotlib")}
+    places |= {"MPLBACKEND": rng.choice(("nonsense", "module://no", "WebAgg", "TkAgg", "svg"))}
+    return {"HOME": str(folder), **{name: places[name] for name in rng.sample([*places], rng.randrange(4))}}
+
+
 # TensorBoard.
 
 

@@ -14,6 +14,12 @@ import numpy as np
 from hypogoal.core.hdf5 import fixed
 
 Rng = random.Random
+# Files that a system calls regular, and that never end, wait, or have another size than they say.
+ENDLESS = ("/proc/self/pagemap", "/proc/kmsg", "/proc/self/mem", "/proc/kcore", "/sys/kernel/notes", "/dev/zero")
+# Types of tensors, and how many bytes an element of each takes; those of four bits take half a one.
+TYPES = {"F32": 4, "I64": 8, "F16": 2, "BF16": 2, "F64": 8, "C64": 8, "BOOL": 1, "U8": 1, "I8": 1, "I16": 2, "U16": 2,
+         "I32": 4, "U32": 4, "U64": 8, "F8_E4M3": 1, "F8_E5M2": 1, "F8_E8M0": 1, "F8_E4M3FNUZ": 1, "F8_E5M2FNUZ": 1,
+         "F4": 1, "F6_E2M3": 1, "F6_E3M2": 1}  # fmt: skip
 
 
 def odd_values(outside: Path) -> list[Any]:
@@ -30,7 +36,9 @@ def odd_values(outside: Path) -> list[Any]:
         "a/../../outside/x",
         "a\\b",
         "~",
-        "/dev/zero",
+        *ENDLESS,
+        "{run}",
+        "{run}/../x",
         "a\0b",
     ]
     texts = [
@@ -47,8 +55,29 @@ def odd_values(outside: Path) -> list[Any]:
         "os:system",
         "true",
         "1,2,3",
+        "3/4 (2/s, 1.2.3 s left)",
+        f"3/4 (2/s, {'9' * 400} h left)",
+        "[" * 100_000,
     ]
-    numbers = [0, -1, 1, 2, 7, 2**16, 2**31, 2**53, 2**63, 2**64, 10**30, 0.5, 1e308, float("nan"), float("inf")]
+    numbers = [
+        10**400,
+        -(10**20),
+        0,
+        -1,
+        1,
+        2,
+        7,
+        2**16,
+        2**31,
+        2**53,
+        2**63,
+        2**64,
+        10**30,
+        0.5,
+        1e308,
+        float("nan"),
+        float("inf"),
+    ]
     return [*paths, *texts, *numbers, None, True, False, [], {}, [[]], {"a": {}}, [1, "a", None], deep, ["x"] * 300]
 
 
@@ -127,6 +156,14 @@ def safetensors_changed(data: bytes, rng: Rng, odd: list[Any]) -> bytes:
     if what < 0.3:
         return bytes_changed(data, rng)
     size = int.from_bytes(data[:8], "little")
+    if what > 0.95:  # of another type, as many bytes
+        tensors = json.loads(data[8 : 8 + size])
+        for name in rng.sample([*tensors], min(len(tensors), rng.choice((1, 1, 3)))):
+            tensor, kind = tensors[name], rng.choice([*TYPES])
+            begin, end = tensor.get("data_offsets", (0, 0))
+            tensor |= {"dtype": kind, "shape": [(end - begin) // TYPES[kind]]} if "dtype" in tensor else {}
+        text = json.dumps(tensors).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + size :]
     header = (
         json.dumps(tree_changed(json.loads(data[8 : 8 + size]), rng, odd)).encode()
         if what < 0.9

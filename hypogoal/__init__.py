@@ -4,10 +4,13 @@ Its environments are registered with Gymnasium. The heavy parts (torch, the envi
 first use, so that ``import hypogoal`` and the command line's ``--help`` stay fast.
 """
 
+import contextlib
 import importlib
 import sys
-from importlib.util import find_spec
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
+
+from hypogoal.core.surroundings import Around, plain_opencv
 
 __version__ = "0.14.0"
 
@@ -41,34 +44,19 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def _register(_imported: object = None) -> None:
-    """Have Gymnasium find the environments; their modules are loaded when one is made."""
+@contextlib.contextmanager
+def _registered(_gymnasium: object = None) -> Iterator[None]:
+    """Have Gymnasium, once it is loaded, find the environments; their modules are loaded when one is made."""
+    yield
     from gymnasium import register
 
     register(id="hypogoal/DoorKey-8x8-v0", entry_point="hypogoal.domains.doorkey_env:DoorKeyEnv")
     register(id="hypogoal/MontezumaLadder-v0", entry_point="hypogoal.domains.montezuma_env:MontezumaLadder")
 
 
-class _Registration:
-    """Waits until someone imports Gymnasium, which takes longer than all that is imported here, and few need it."""
-
-    asking = False  # the other finders
-
-    def find_spec(self, name: str, *_: object) -> Any:
-        if name != "gymnasium" or self.asking:
-            return None
-        self.asking = True
-        try:
-            spec: Any = find_spec(name)
-        finally:
-            self.asking = False
-        if loader := getattr(spec, "loader", None):
-            load = loader.exec_module
-            loader.exec_module = lambda module: _register(load(module))
-        return spec
-
-
 if "gymnasium" in sys.modules:
-    _register()
-else:
-    sys.meta_path.insert(0, _Registration())
+    with _registered():
+        pass
+else:  # when someone imports it: it takes longer than all that is imported here, and few need it
+    sys.meta_path.insert(0, Around("gymnasium", _registered))
+sys.meta_path.insert(0, Around("cv2", plain_opencv))

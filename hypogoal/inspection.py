@@ -186,8 +186,8 @@ def faults_of(path: Path) -> list[str]:
     faults: list[str] = []
     for part in parts:
         try:
-            found = _artefact_faults(open_artefact(part), path) if part.is_dir() else _data_faults(part)
-            faults += [f"{part}: {fault}" for fault in found]
+            for fault in _artefact_faults(open_artefact(part), path) if part.is_dir() else _data_faults(part):
+                faults.append(f"{part}: {fault}")
         except UserError as error:  # a manifest that is a folder or a device is a fault of its own
             faults.append(str(error))
     return faults
@@ -228,21 +228,20 @@ def _data_faults(path: Path) -> Iterator[str]:
 def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
     faults = file_faults(artefact)
     yield from (f"{name}: {fault}" for name, fault in faults.items())
+    bad = {*faults}
     for name in artefact.manifest["files"]:
-        if name not in faults and (check := CONTENTS.get(Path(name).suffix)) is not None:
-            yield from _fault(partial(check, artefact.path / name))
-    if artefact.kind == "ensemble":
-        whole = [name for name in artefact.config["sub_goals"] if f"{name}.safetensors" not in faults]
-        for sub_goal in whole:
-            yield from _fault(partial(_check_members, artefact, sub_goal))
+        if name not in bad and (check := CONTENTS.get(Path(name).suffix)) is not None:
+            for fault in _fault(partial(check, artefact.path / name)):
+                bad.add(name)
+                yield fault
     for entry in artefact.manifest["inputs"]:
-        fault = (
-            find_input(artefact.path, entry, beside=True)[1]
-            if lies_in(folder, artefact.path / entry["relative"])
-            else ""
-        )
-        if fault:
+        within = lies_in(folder, artefact.path / entry["relative"])
+        if within and (fault := find_input(artefact.path, entry, beside=True)[1]):
             yield f"its input {entry['path']} ({entry['kind']}) is {fault}"
+    if artefact.kind == "ensemble":  # last: what it needs may be missing
+        for sub_goal in artefact.config["sub_goals"]:
+            if f"{sub_goal}.safetensors" not in bad:
+                yield from _fault(partial(_check_members, artefact, sub_goal))
 
 
 def _check_members(artefact: Artefact, sub_goal: str) -> None:

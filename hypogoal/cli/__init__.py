@@ -19,6 +19,7 @@ from hypogoal.cli import stages, sweep, inspect, own_data, benchmark  # isort: s
 from hypogoal.cli.common import Interrupted, app
 from hypogoal.core import stopping
 from hypogoal.core.errors import Complete, NumericalError, UserError, one_line
+from hypogoal.core.surroundings import shield
 from hypogoal.core.terminal import Unprinted, give, open_streams, say
 from hypogoal.settings import CONFIGS, TABLES
 
@@ -51,6 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, stopping.stop)  # so that a cancelled job, too, leaves nothing half-written
         sys.unraisablehook = stopping.unraised
         open_streams()
+        shield()
     given = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]

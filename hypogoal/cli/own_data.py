@@ -123,7 +123,7 @@ def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
             raise UserError("--arg needs KEY=VALUE", assignment, "For example --arg layout_seed=3.")
         try:
             found[name] = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             found[name] = value
     return found
 

@@ -18,7 +18,7 @@ from typing import Any, Self
 from hypogoal.core import drafts
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MAX_NAME_BYTES, inside, open_file, read_json, visible
+from hypogoal.core.files import MAX_NAME_BYTES, inside, is_hole, open_file, read_json, visible
 from hypogoal.core.hdf5 import Busy, open_hdf5
 from hypogoal.core.manifests import (
     AGAIN,
@@ -35,6 +35,8 @@ from hypogoal.core.manifests import (
 DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
 DEPTH = 3  # of folders, in which a run's artefacts lie
+THE_FILE = "the file is"
+PIECE = 1 << 20  # bytes that are hashed at once
 FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
@@ -95,9 +97,16 @@ class Settings(dict[str, Any]):
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a regular file that can be read (else a ``UserError``), as hexadecimal digits."""
-    with open_file(path, "the file is", AGAIN) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """The sha256 of a regular file, as large as when it was opened, as hexadecimal digits; else a ``UserError``."""
+    digest = hashlib.sha256()
+    with open_file(path, THE_FILE, AGAIN) as file:
+        if is_hole(file):
+            raise UserError(f"{THE_FILE} nearly all hole", path, AGAIN)
+        left = os.fstat(file.fileno()).st_size
+        while piece := file.read(min(left, PIECE)):
+            digest.update(piece)
+            left -= len(piece)
+    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -306,7 +315,10 @@ def file_fault(folder: Path, name: str, digest: str) -> str:
         return "outside the artefact"
     if not path.is_file():
         return "missing"
-    return "" if sha256_of(path) == digest else "changed since it was written"
+    try:
+        return "" if sha256_of(path) == digest else "changed since it was written"
+    except UserError as error:
+        return _of_file(error)
 
 
 def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> tuple[Path | None, str]:
@@ -323,7 +335,14 @@ def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> 
                 continue
             if sha256_of(target) == entry["sha256"]:
                 return candidate.resolve(), ""
-        except (OSError, UserError):
+            fault = "changed since"
+        except UserError as error:
+            fault = _of_file(error)
+        except OSError:
             continue
-        fault = "changed since"
     return None, fault
+
+
+def _of_file(error: UserError) -> str:
+    """What is wrong with a file that :func:`sha256_of` does not read."""
+    return error.what.removeprefix(f"{THE_FILE} ")

@@ -6,6 +6,7 @@ all that is not read by a library of its own is opened with :func:`open_file`, w
 
 import contextlib
 import csv
+import functools
 import io
 import json
 import os
@@ -22,6 +23,12 @@ from hypogoal.core.errors import UserError, printable
 MAX_TEXT_BYTES = 64 * 2**20
 END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
 MAX_JSON_DEPTH = 32
+MOST_HOLE, HOLE_RATIO = 2**30, 1000  # a larger file that stores less than a thousandth of its bytes is no data
+# File systems on which the kernel makes up a file as it is read: its size is none, and some never end.
+KERNEL = frozenset([
+    "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "efivarfs", "fusectl", "mqueue", "nsfs", "proc",
+    "pstore", "rpc_pipefs", "securityfs", "selinuxfs", "sysfs", "tracefs",
+])  # fmt: skip
 MAX_NAME_BYTES = 200
 MOST_DOTS = 256  # in a line of TOML
 MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
@@ -35,12 +42,32 @@ def require_file(path: Path, what: str, do: str) -> int:
     ``what`` it is stands in the message with its verb ("the weights are"), ``do`` is what to do about it.
     """
     try:
-        if path.is_file():
-            return path.stat().st_size
-        there = path.exists()
-    except OSError as error:  # a name that is too long, a folder that may not be entered
-        raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    raise UserError(f"{what} not a regular file" if there else f"{what} missing", path, do)
+        state = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"{what} missing", path, do) from None
+    except (OSError, ValueError) as error:  # a name too long or with a zero, a folder that may not be entered
+        raise UserError(f"{what} not readable ({getattr(error, 'strerror', error)})", path, do) from None
+    if not is_regular(state):
+        raise UserError(f"{what} not a regular file", path, do)
+    return state.st_size
+
+
+def is_regular(state: os.stat_result) -> bool:
+    """Whether it is a file on a disk, of as many bytes as it says; one of the kernel's (``/proc``, ``/sys``) is not."""
+    return stat.S_ISREG(state.st_mode) and state.st_dev not in _kernel_devices()
+
+
+@functools.cache
+def _kernel_devices() -> frozenset[int]:
+    """The numbers of the file systems in ``KERNEL`` that are mounted; none where the system does not say."""
+    devices = set()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            place, _, kind = line.partition(" - ")
+            if kind.split(" ")[0] in KERNEL:
+                major, minor = place.split()[2].split(":")
+                devices.add(os.makedev(int(major), int(minor)))
+    return frozenset(devices)
 
 
 def open_file(path: Path, what: str, do: str) -> BufferedReader:
@@ -55,23 +82,37 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
         file = os.fdopen(os.open(path, os.O_RDONLY | sum(flags)), "rb")
     except OSError as error:
         raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+    if not is_regular(os.fstat(file.fileno())):
         file.close()
         raise UserError(f"{what} not a regular file", path, do)
     return file
 
 
+def is_hole(file: BufferedReader) -> bool:
+    """Whether a file declares a thousand times what it stores, as its file system says, which says where holes are.
+
+    To read such a one from its beginning to its end would take for ever.
+    """
+    state = os.fstat(file.fileno())
+    stored = 512 * getattr(state, "st_blocks", state.st_size)
+    if state.st_size <= max(MOST_HOLE, HOLE_RATIO * stored) or not hasattr(os, "SEEK_HOLE"):
+        return False
+    hole = os.lseek(file.fileno(), 0, os.SEEK_HOLE)
+    os.lseek(file.fileno(), 0, os.SEEK_SET)
+    return hole < state.st_size
+
+
 def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
-    """A regular file, see :func:`require_file`; of more than ``limit`` bytes, or not readable, a ``UserError``."""
+    """A regular file, as many bytes as it had when it was opened; of more than ``limit``, or not readable, a
+    ``UserError``."""
     with open_file(path, what, do) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise UserError(f"{what} too large ({size} bytes, at most {limit} are read)", path, do)
         try:
-            size = os.fstat(file.fileno()).st_size
-            data = b"" if size > limit else file.read(limit + 1)  # it may have grown since
+            return file.read(size)
         except OSError as error:
             raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    if max(size, len(data)) > limit:
-        raise UserError(f"{what} too large ({max(size, len(data))} bytes, at most {limit} are read)", path, do)
-    return data
 
 
 def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
@@ -101,12 +142,11 @@ def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> An
 
 
 def parse_json(text: str, where: object, what: str, do: str) -> Any:
-    """JSON whose numbers are finite, ``MAX_JSON_DEPTH`` deep at most, its texts printable; else a ``UserError``."""
+    """JSON as of :func:`_parsed` whose numbers are finite and texts can be written; else a ``UserError``."""
     try:
-        value = json.loads(text)
-        _check_depth(value)
+        value = _parsed(text)
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, NaN, 1e999
-    except (ValueError, RecursionError):
+    except ValueError:
         raise UserError(f"{what} not valid JSON", where, do) from None
     return value
 
@@ -114,9 +154,26 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
 def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
     """The objects in lines of a log; what is only half written yet, damaged or none is left out."""
     for line in lines:
-        with contextlib.suppress(ValueError, RecursionError):
-            if isinstance(value := json.loads(line), dict):
+        with contextlib.suppress(ValueError):
+            if isinstance(value := _parsed(line), dict):
                 yield value
+
+
+def _parsed(text: str) -> Any:
+    """JSON that is ``MAX_JSON_DEPTH`` deep at most, its integers exact in a float; else a ``ValueError``."""
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError("too deep") from None
+    level = [value]
+    for _ in range(MAX_JSON_DEPTH):
+        if any(isinstance(item, int) and abs(item) > MOST_INTEGER for item in level):
+            raise ValueError("an integer is too large")
+        groups = (item for item in level if isinstance(item, (dict, list)))
+        level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
+        if not level:
+            return value
+    raise ValueError("too deep")
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
@@ -130,16 +187,6 @@ def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
         return table
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
-
-
-def _check_depth(value: Any) -> None:
-    level = [value]
-    for _ in range(MAX_JSON_DEPTH):
-        groups = (item for item in level if isinstance(item, (dict, list)))
-        level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
-        if not level:
-            return
-    raise RecursionError
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -2,12 +2,13 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import MOST_INTEGER, parse_json, plain_name, plain_names, read_bytes
+from hypogoal.core.files import parse_json, plain_name, plain_names, read_bytes
+from hypogoal.core.schemas import Schema, is_count, is_list, is_object, is_table, is_text, misfit
 
 FORMAT_VERSION, UNSEALED = 2, 1  # the latter had no checksum
 CHECKSUM = "sha256"
@@ -55,49 +56,36 @@ def _text(manifest: Mapping[str, Any]) -> bytes:
 def check_writable(manifest: dict[str, Any], out: Path) -> None:
     """Refuse (``UserError``), before anything is made, a manifest that :func:`read_manifest` could not read again."""
     do = "Choose another value, or a name in UTF-8."
+    text = json.dumps(manifest)
     try:
-        _checked(parse_json(json.dumps(manifest), out, "the manifest would be", do), out)
+        _checked(json.loads(text), out)
+        parse_json(text, out, "the manifest would be", do)
     except UserError as error:
         raise UserError(f"this could not be read again ({error.what})", out, do) from None
 
 
 def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
-    for key, fits in WANTED.items():
-        if key not in manifest or not fits(manifest[key]):
-            raise UserError(f"the manifest's {key!r} is missing or malformed", path, AGAIN)
-    for key, fits in SETTINGS.items():
-        if key in manifest["config"] and not fits(manifest["config"][key]):
-            raise UserError(f"the manifest's setting {key!r} is malformed", path, AGAIN)
+    if key := misfit(manifest, WANTED):
+        raise UserError(f"the manifest's {key!r} is missing or malformed", path, AGAIN)
+    if key := misfit(manifest["config"], {}, SETTINGS):
+        raise UserError(f"the manifest's setting {key!r} is malformed", path, AGAIN)
     return manifest
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and "\0" not in value and len(value) < 4096
-
-
-def _count(value: Any) -> bool:
-    return type(value) is int and 0 <= value <= MOST_INTEGER
-
-
-def _texts(value: Any, *keys: str) -> bool:
-    """Whether it is an object with texts under these keys, where none is given under all that it has."""
-    return isinstance(value, dict) and all(_is_text(value.get(key)) for key in keys or value)
-
-
 def _size(value: Any) -> bool:
-    return _count(value) and 0 < value < 1 << 16
+    return is_count(value) and 0 < value < 1 << 16
 
 
 # What must be in a manifest, and what settings that other stages read must look like where they are there.
-WANTED: dict[str, Callable[[Any], bool]] = {
+WANTED: Schema = {
     "kind": plain_name,
     "format": lambda value: type(value) is int,
     "config": lambda value: isinstance(value, dict),
-    "seed": _count,
-    "inputs": lambda value: isinstance(value, list) and all(_texts(each, *INPUT) for each in value),
-    "files": lambda value: _texts(value) and all(map(_is_text, value)),
+    "seed": is_count,
+    "inputs": is_list(is_object(dict.fromkeys(INPUT, is_text))),
+    "files": is_table(is_text),
 }
-SETTINGS: dict[str, Callable[[Any], bool]] = {
+SETTINGS: Schema = {
     "sub_goals": plain_names,
     "members": _size,
     "observation_shape": lambda value: isinstance(value, list) and bool(value) and all(map(_size, value)),
@@ -105,10 +93,10 @@ SETTINGS: dict[str, Callable[[Any], bool]] = {
     "domain_config": lambda value: isinstance(value, dict),
     "mask_reached": lambda value: isinstance(value, bool),
     **dict.fromkeys(("crop_height", "crop_width"), _size),
-    **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), _count),
-    **dict.fromkeys(("ended_at", "options_ended_at", "hidden_width"), _count),
-    **dict.fromkeys(("domain", "network", "setting", "agent", "termination", "chooser", "start"), _is_text),
-    **dict.fromkeys(("view", "localiser", "diversity", "encoder", "layouts"), _is_text),
+    **dict.fromkeys(("steps", "options_steps", "layout_seed", "option_timeout", "max_episode_steps"), is_count),
+    **dict.fromkeys(("ended_at", "options_ended_at", "hidden_width"), is_count),
+    **dict.fromkeys(("domain", "network", "setting", "agent", "termination", "chooser", "start"), is_text),
+    **dict.fromkeys(("view", "localiser", "diversity", "encoder", "layouts"), is_text),
 }
 
 

@@ -133,8 +133,8 @@ def duration(seconds: float) -> str:
 
 def said_left(text: str) -> float | None:
     """Seconds that a line of :class:`Progress` says are left; None where it says none."""
-    told = re.search(rf", ([\d.]+) ({'|'.join(UNITS)}) left\)", text)
-    return float(told[1]) * UNITS[told[2]] if told else None
+    found = re.search(rf", ([0-9]{{1,9}}(?:\.[0-9]+)?) ({'|'.join(UNITS)}) left\)", text)
+    return float(found[1]) * UNITS[found[2]] if found else None
 
 
 class MetricsLog:

@@ -16,14 +16,19 @@ if TYPE_CHECKING:
     M = TypeVar("M", bound=nn.Module)
 
 AGAIN = "Make the artefact again."
+KEPT = frozenset(f"torch.{name}" for name in ("float32", "float64", "int64", "int32", "uint8", "bool"))
 MAX_HEADER_BYTES = 16 * 2**20  # names and shapes: 100 bytes a tensor
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write tensors by name; a ``NumericalError``, and nothing is written, where a number is NaN or Inf (Spec G3)."""
+    """Write tensors by name; a ``NumericalError``, and nothing is written, where a number is NaN or Inf (Spec G3).
+
+    One of another type than ``KEPT`` is a ``UserError``.
+    """
     import torch
     from safetensors.torch import save
 
+    check_types(tensors, path.stem, "Have the network keep its weights as float32.")
     for name, tensor in tensors.items():
         if tensor.dtype.is_floating_point and not torch.isfinite(tensor).all():
             raise NumericalError(f"the weight {name} of {path.stem} is NaN or Inf at the end of training")
@@ -33,7 +38,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
 def load_tensors(path: Path) -> dict[str, Tensor]:
     """Read tensors by name: as many bytes as the file has, whatever its header declares.
 
-    Missing, truncated, not safetensors, NaN or Inf is a ``UserError``.
+    Missing, truncated, not safetensors, of another type than ``KEPT``, NaN or Inf is a ``UserError``.
     """
     import torch
     from safetensors import SafetensorError
@@ -47,10 +52,18 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
         tensors: dict[str, Tensor] = load_file(path)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"the weights are damaged ({error})", path, AGAIN) from None
+    check_types(tensors, path, AGAIN)
     for name, tensor in tensors.items():
         if tensor.dtype.is_floating_point and not torch.isfinite(tensor).all():
             raise UserError(f"the weights hold NaN or Inf (at {name})", path, AGAIN)
     return tensors
+
+
+def check_types(tensors: Mapping[str, Tensor], where: object, do: str) -> None:
+    """Refuse (``UserError``) tensors of another type than ``KEPT``: not all can be computed with, or compared."""
+    for name, tensor in tensors.items():
+        if str(tensor.dtype) not in KEPT:
+            raise UserError(f"weights of type {tensor.dtype} are not kept (at {name})", where, do)
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

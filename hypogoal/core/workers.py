@@ -1,12 +1,11 @@
 """Tasks on several cores: each in a process of its own, none of which outlives the one that asked for it."""
 
-import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
@@ -14,9 +13,10 @@ from typing import TypeVar
 from hypogoal.core import own_code
 from hypogoal.core.errors import Killed
 from hypogoal.core.own_code import users_own
+from hypogoal.core.surroundings import environment, shield
 
 T = TypeVar("T")
-SAFE_PATH = "PYTHONSAFEPATH"
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # a Python started with it is as ``PYTHON`` is
 CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
 RESEND_SECONDS = 1.0
 KILLED = 9  # SIGKILL, which Windows has no name for
@@ -52,11 +52,11 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     before = set(multiprocessing.active_children())
     # Started anew rather than forked: a fork takes along whatever threads and locks the caller has.
     spawn = multiprocessing.get_context("spawn")
-    with _safe_path():
+    with environment(**SAFE_PATH):
         pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
         own = own_code.allowed()
-        with _safe_path():
+        with environment(**SAFE_PATH):
             futures = {pool.submit(_guarded, task, own): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
@@ -75,20 +75,9 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
         pool.shutdown(cancel_futures=True)
 
 
-@contextlib.contextmanager
-def _safe_path() -> Iterator[None]:
-    """Have Pythons that others start within the block be as ``PYTHON`` is."""
-    before = os.environ.get(SAFE_PATH)
-    os.environ[SAFE_PATH] = "1"
-    try:
-        yield
-    finally:
-        del os.environ[SAFE_PATH]
-        os.environ.update({} if before is None else {SAFE_PATH: before})
-
-
 def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone, which sends SIGTERM on
+    shield()
     die_with_parent()
     if os.getppid() != parent:
         os._exit(128 + KILLED)

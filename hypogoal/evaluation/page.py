@@ -6,7 +6,6 @@ A table is said once, as columns, and drawn here for the page and for the termin
 from __future__ import annotations
 
 import base64
-import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +20,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
+from hypogoal.core.files import parse_json
+from hypogoal.core.manifests import AGAIN
 from hypogoal.evaluation.numbers import STUDENT
 from hypogoal.evaluation.pictures import image_png, reduced
 from hypogoal.evaluation.plots import COLOURS, slug, to_svg
@@ -244,7 +245,7 @@ def encoded(png: bytes) -> str:
 def texts(packed: Any) -> list[str]:
     """A JSON list of texts out of the arrays."""
     raw = packed.item() if isinstance(packed, np.ndarray) else packed
-    return list(json.loads(raw.decode() if isinstance(raw, bytes) else raw))
+    return list(parse_json(raw.decode() if isinstance(raw, bytes) else raw, None, "a list of texts is", AGAIN))
 
 
 def method_of(entries: Sequence[Entry]) -> Callable[[Entry], str]:

@@ -57,12 +57,14 @@ STYLE: dict[str, Any] = {
     "savefig.facecolor": "none",
     "svg.fonttype": "none",
 }
+# matplotlib's own, whatever a notebook or a ``matplotlibrc`` has set; which windows it opens is not ours to say.
+DEFAULTS = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
 PICTURE_TITLE = 0.34  # inches above a picture
 
 
 def styled(more: Mapping[str, Any] | None = None) -> AbstractContextManager[None]:
     """What all figures have in common, and ``more`` of matplotlib's settings, for the time of a ``with``."""
-    settings: Any = {**STYLE, **(more or {})}
+    settings: Any = {**DEFAULTS, **STYLE, **(more or {})}
     return matplotlib.rc_context(settings)
 
 

@@ -11,6 +11,7 @@ from hypogoal.core.files import path_part
 from hypogoal.settings import CONFIGS, options_of
 
 DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
+RESERVED = ("--out", "--force", "--resume")  # which a sweep gives, and no experiment
 SHORT = frozenset(option for stage in CONFIGS for option in options_of(stage))  # settings, which --set goes before
 COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # of ``results.csv``, behind those of the cell
 Axes = tuple[tuple[str, str | int | float], ...]

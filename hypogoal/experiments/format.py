@@ -20,7 +20,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_toml, path_part, plain_name, read_text
 from hypogoal.core.workers import cores
 from hypogoal.domains.base import load_domain
-from hypogoal.experiments.cells import COLUMNS, Cell, Cost, Plan, closing_cells, stage_cell
+from hypogoal.experiments.cells import COLUMNS, RESERVED, Cell, Cost, Plan, closing_cells, stage_cell
 from hypogoal.experiments.costs import Estimates
 from hypogoal.settings import CONFIGS, STAGES, TABLES, configuration
 
@@ -38,7 +38,6 @@ CELL_KEYS = {
     "name": str, "command": str, "axes": (list, dict), "for": list, "first": list, "if": str, "out": str,
     "columns": dict, "evaluated": bool, "minutes": NUMBER, "memory_gb": NUMBER,
 }  # fmt: skip
-RESERVED = ("--out", "--force", "--resume")
 TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *COLUMNS)  # axes become columns
 TAKEN_NAMES = ("evaluation", "report", "logs", "slurm")  # what else is in a run's folder
 MAX_CELLS = 20_000

@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,13 +18,13 @@ from hypogoal.core.config import parse_assignments, preset_digest
 from hypogoal.core.drafts import PATIENCE_SECONDS, try_lock
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
-from hypogoal.experiments.cells import DERIVED, SHORT, Cell, Cost, Plan, moved
+from hypogoal.core.schemas import LARGEST, Schema, is_amount, is_count, is_list, is_table, is_text, is_word, misfit
+from hypogoal.experiments.cells import DERIVED, RESERVED, SHORT, Cell, Cost, Plan, closing_cells, moved
 from hypogoal.settings import STAGES
 
 FORMAT_VERSION = 1
 PLAN, LOGS, RESULTS, FINISHED = "sweep.json", "logs", "results.csv", "run.json"
 RUN = "{run}"
-COMMANDS = (*STAGES, *DERIVED)
 AGAIN = "Start the sweep again."
 GIVE = "Give the command that began it, of 'run' with --resume and without --force: what is complete is kept."
 
@@ -53,11 +54,11 @@ def last_line(log: Path) -> str:
 def read_record(run: Path, cell: Cell) -> Record:
     """How a cell went; an empty record where it was never started, or where what is there cannot be read."""
     try:
-        record = Record(**read_json(run / LOGS / f"{cell.name}.json", "the record is", AGAIN))
-        numbers = (record.attempts, record.seconds, record.started, record.code or 0)
-        return record if all(isinstance(number, int | float) for number in numbers) else Record()
-    except (UserError, TypeError):
+        record = read_json(run / LOGS / f"{cell.name}.json", "the record is", AGAIN)
+    except UserError:
         return Record()
+    fits = misfit(record, {}, RECORD) is None
+    return Record(**{key: record[key] for key in RECORD if key in record}) if fits else Record()
 
 
 def write_record(run: Path, cell: Cell, record: Record) -> None:
@@ -144,34 +145,80 @@ def read_plan(run: Path) -> tuple[Plan, float]:
         about = read_json(path, "the sweep's plan is", GIVE)
     except UserError as error:
         raise LostPlan(error.what, path, GIVE) from None
-    try:
-        if about["format"] > FORMAT_VERSION:
-            raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
-        cells, anew = [_cell(row, run) for row in about["cells"]], frozenset(about.get("anew", ()))
-        presets = {str(path): str(digest) for path, digest in about.get("presets", {}).items()}
-        plan = Plan(str(about["experiment"]), cells, int(about["workers"]), anew, presets)
-        if not anew <= {cell.name for cell in cells}:
-            raise ValueError
-        seen: set[Path] = set()
-        for cell in plan.cells:
-            if not seen.issuperset(cell.needs) or cell.out in seen:
-                raise ValueError
-            seen.add(cell.out)
-        return plan, float(about["factor"])
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise LostPlan("the sweep's plan is damaged", path, GIVE) from None
+    if isinstance(about, dict) and is_count(about.get("format")) and about["format"] > FORMAT_VERSION:
+        raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
+    key = misfit(about, PLAN_KEYS, PLAN_MAY)
+    if key is None:
+        faults = (f"{fault} of cell {n}" for n, row in enumerate(about["cells"]) if (fault := _fault(row)) is not None)
+        key = next(faults, None)
+    if key is not None:
+        raise LostPlan(f"the sweep's plan is damaged ({key or 'no JSON object'})", path, GIVE)
+    anew, cells = frozenset(about.get("anew", ())), [_cell(row, run) for row in about["cells"]]
+    known: set[Path] = set()
+    for cell in cells:
+        if not known.issuperset(cell.needs) or cell.out in known:
+            raise LostPlan(f"the sweep's plan is damaged (what {cell.name} needs or writes)", path, GIVE)
+        known.add(cell.out)
+    names = {cell.name for cell in cells}
+    if len(names) < len(cells) or not anew <= names:
+        raise LostPlan("the sweep's plan is damaged (the names of cells)", path, GIVE)
+    return Plan(about["experiment"], cells, about["workers"], anew, about.get("presets", {})), float(about["factor"])
 
 
 def _cell(row: dict[str, Any], run: Path) -> Cell:
-    arguments = tuple(map(str, row["arguments"]))
-    places = [Path(place).relative_to(RUN) for place in (row["out"], *row["needs"])]
-    fits = arguments[:1] and arguments[0] in COMMANDS and path_part(row["name"])
-    if not fits or not all(path_part(part) for place in places for part in place.parts):
-        raise ValueError
-    cost = Cost(float(row["seconds"]), float(row["memory"]), float(row["disk"]), int(row["cores"]))
-    needs = tuple(Path(need) for need in row["needs"])
-    axes = tuple((str(name), value) for name, value in row["axes"].items())
-    return moved(Cell(row["name"], arguments, Path(row["out"]), needs, cost, axes), RUN, str(run))
+    """A cell of a plan that has no :func:`_fault`, in the run's folder."""
+    cost = Cost(*(row[name] for name in Cost._fields))
+    needs = tuple(map(Path, row["needs"]))
+    cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, cost, tuple(row["axes"].items()))
+    return moved(cell, RUN, str(run))
+
+
+def _is_place(value: Any) -> bool:
+    """Whether a text is a place within the run."""
+    parts = Path(value).parts if is_text(value) else ()
+    return len(parts) > 1 and parts[0] == RUN and all(map(path_part, parts))
+
+
+def _fault(row: Any) -> str | None:
+    """Which key of a cell is malformed; its command must be of a stage and lead out of the run nowhere, or no key."""
+    key = misfit(row, CELL)
+    if key is not None:
+        return key
+    words, out = row["arguments"], row["out"]
+    if words[:1] and words[0] in DERIVED:  # which read the run
+        closing = closing_cells(Path(RUN), ())
+        return None if (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing] else "arguments"
+    reserved = [pair for pair in pairwise([*words, ""]) if pair[0].split("=")[0] in RESERVED]
+    inner = [word for word in words if word.startswith(RUN)]
+    fits = words[:1] and words[0] in STAGES and all(pair == ("--out", out) for pair in reserved)
+    return None if fits and all(map(_is_place, inner)) else "arguments"
+
+
+# What is read of a record and of a plan.
+RECORD: Schema = {
+    "attempts": is_count,
+    "seconds": is_amount,
+    "code": lambda value: value is None or (type(value) is int and abs(value) < 1 << 16),
+    "started": lambda value: type(value) in (int, float) and abs(value) <= LARGEST,  # of a clock that may be wrong
+    "host": is_text,
+}
+CELL: Schema = {
+    "name": path_part,
+    "arguments": is_list(is_word),
+    "out": _is_place,
+    "needs": is_list(_is_place),
+    "axes": is_table(lambda value: is_text(value) or isinstance(value, int | float)),
+    **dict.fromkeys(("seconds", "memory", "disk"), is_amount),
+    "cores": lambda value: is_count(value) and value > 0,
+}
+PLAN_KEYS: Schema = {
+    "format": is_count,
+    "experiment": is_text,
+    "workers": lambda value: is_count(value) and value > 0,
+    "factor": lambda value: is_amount(value) and value > 0,
+    "cells": is_list(lambda row: isinstance(row, dict)),
+}
+PLAN_MAY: Schema = {"anew": is_list(is_text), "presets": is_table(is_text)}
 
 
 def made_anew(run: Path, cell: Cell) -> None:

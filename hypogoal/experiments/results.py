@@ -4,7 +4,6 @@ Made from the sweep's evaluation, and from the cells' own artefacts where that h
 between two runs of the same commands is in it: no time, no machine, no path.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ from typing import Any
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import read_json, read_text, write_table
-from hypogoal.core.manifests import AGAIN
+from hypogoal.core.files import json_lines, read_json, read_text, write_table
+from hypogoal.core.manifests import AGAIN, LOG
 from hypogoal.dataset import open_dataset
 from hypogoal.evaluation import curves, distance, hypotheses
 from hypogoal.evaluation.numbers import Row, rows_of
@@ -29,7 +28,7 @@ def write_results(plan: Plan, run: Path) -> Path:
     path = run / RESULTS
     try:
         write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"an artefact is damaged ({type(error).__name__} {error})"
         raise UserError(what, run, advice("Which one", "verify", run)) from None
     return path
@@ -93,8 +92,7 @@ def _states(path: Path) -> Iterator[Row]:
 
 def _losses(artefact: Artefact) -> Iterator[Row]:
     last: dict[str, dict[str, Any]] = {}
-    for line in read_text(artefact.path / "metrics.jsonl", "the log is", AGAIN).splitlines():
-        row = json.loads(line)
+    for row in json_lines(read_text(artefact.path / LOG, "the log is", AGAIN).splitlines()):
         last[row["sub_goal"]] = row
     for sub_goal, row in last.items():
         yield from rows_of(row, sub_goal=sub_goal)

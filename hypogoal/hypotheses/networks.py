@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import inspect
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -26,6 +26,7 @@ from torch.nn.utils import fuse_conv_bn_eval
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, as_number, load_own
+from hypogoal.core.tensors import KEPT
 from hypogoal.dataset import NUMBERS, PICTURE
 
 CLASSES = 2
@@ -125,12 +126,18 @@ def _checked(name: str, made_for: Callable[..., Parts | nn.Module]) -> Callable[
                 kind, size = getattr(features, "dtype", type(features)), tuple(getattr(features, "shape", ()))
                 if kind != torch.float32 or size[:-1] != (1,) or not all(size):
                     code.refuse(f"is an encoder that makes {kind} {size} of a state", "Make features, float32 (N, F).")
-                return [made], ()
+                return keeping([made], code), ()
             layers, hidden = made
             widths = bool(hidden) and all((as_number(width) or 0) > 0 for width in hidden)
             if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
                 code.refuse(f"gave layers {layers} and widths {hidden}", "Give (modules, hidden widths above 0).")
-            return list(layers), tuple(hidden)
+            return keeping(layers, code), tuple(hidden)
+
+    def keeping(layers: Iterable[nn.Module], code: UsersCode) -> list[nn.Module]:
+        parts = nn.ModuleList(layers)
+        for kind in {str(tensor.dtype) for tensor in parts.state_dict().values()} - KEPT:
+            code.refuse(f"keeps weights of type {kind}", "Keep them as float32.")
+        return [*parts]
 
     return checked
 

@@ -162,7 +162,7 @@ def submit(
     confirm: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Have Slurm run what is not finished; arguments and errors as of :func:`sweep`, returns the jobs."""
-    at_once = options.cap or len(planned.cells)  # at the most: who else is in the queue is not known
+    at_once = options.cap or len(planned.cells) or 1  # at the most: who else is in the queue is not known
     planned = replace(planned, workers=at_once)
     slurm.check(out, options)
     _check_folder(out)

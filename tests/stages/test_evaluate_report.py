@@ -4,6 +4,8 @@ import io
 import json
 import re
 import shutil
+import subprocess
+import sys
 from html.parser import HTMLParser
 
 import h5py
@@ -386,6 +388,12 @@ def test_figures_on_request_from_the_command_line(run, metrics, tmp_path, capsys
     told = capsys.readouterr()
     assert "Figure 4: not drawn. It needs options artefacts with executions.csv" in told.err
     assert str(tmp_path / "a" / "figure6.svg") in told.out.splitlines()
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nfigure.dpi: 100000\nsavefig.bbox: tight\n")
+    command = [sys.executable, "-P", "-m", "hypogoal", "report", str(run), "--figures", "b"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    drawn = [{file.name: file.read_bytes() for file in (tmp_path / name).iterdir()} for name in "ab"]
+    assert drawn[0] == drawn[1]  # a figure is the same whatever the folder would have matplotlib do
 
 
 def test_arrays_say_what_the_report_draws(run, metrics):

@@ -21,6 +21,7 @@ from typing import Any
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text
 from hypogoal.core.own_code import TRUST, environment_of_children
+from hypogoal.core.schemas import is_list, is_object, is_text
 from hypogoal.core.workers import PYTHON
 from hypogoal.experiments.cells import Cell, Plan, depths
 
@@ -191,11 +192,9 @@ def jobs_of(run: Path) -> list[str]:
         return []
     do = "Check with squeue that no job of the sweep waits or runs, then remove this file."
     jobs = read_json(path, "the list of jobs is", do)
-    try:
-        numbers = [str(job["id"]) for job in jobs]
-    except (KeyError, TypeError):
-        raise UserError("the list of jobs is damaged", path, do) from None
-    return [number for number in numbers if number.isdigit()]
+    if not is_list(is_object({"id": is_text}))(jobs):
+        raise UserError("the list of jobs is damaged", path, do)
+    return [job["id"] for job in jobs if re.fullmatch(r"[0-9]+", job["id"])]
 
 
 def queued(run: Path) -> list[str]:

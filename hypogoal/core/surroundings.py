@@ -1,0 +1,89 @@
+"""What lies around configures nothing: libraries load the same in whichever folder and home a command is started.
+
+matplotlib obeys a ``matplotlibrc`` in the current folder, which may have it start LaTeX; OpenCV puts the current folder
+on the path where the system looks for the libraries of child processes, whose code would run.
+"""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+LIBRARIES = "LD_LIBRARY_PATH"
+Context = Callable[[ModuleType], contextlib.AbstractContextManager[object]]
+
+
+class Around:
+    """A finder, for ``sys.meta_path``, that has a module load within a context, whoever imports it first."""
+
+    asking = False  # the other finders
+
+    def __init__(self, name: str, context: Context):
+        self.name, self.context = name, context
+
+    def find_spec(self, name: str, *_: object) -> Any:
+        """The module's spec; None for every other module."""
+        if name != self.name or self.asking:
+            return None
+        self.asking = True
+        try:
+            spec: Any = find_spec(name)
+        finally:
+            self.asking = False
+        if loader := getattr(spec, "loader", None):
+            load = loader.exec_module
+
+            def load_within(module: ModuleType) -> None:
+                with self.context(module):
+                    load(module)
+
+            loader.exec_module = load_within
+        return spec
+
+
+def shield() -> None:
+    """In a process of our own, before it loads libraries: have them load as if nothing were around.
+
+    Not where hypogoal is a library: there matplotlib is also the user's, with the user's settings.
+    """
+    _drop_current_folder()
+    if not any(isinstance(finder, Around) and finder.name == "matplotlib" for finder in sys.meta_path):
+        sys.meta_path.insert(0, Around("matplotlib", _plain_matplotlib))
+
+
+@contextlib.contextmanager
+def environment(**values: str) -> Iterator[None]:
+    """Within the block the environment has these values."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
+
+
+@contextlib.contextmanager
+def _plain_matplotlib(module: ModuleType) -> Iterator[None]:
+    """It looks for settings in the current folder first, so it loads in its own, and for styles beside them."""
+    folder = os.path.dirname(str(module.__file__))
+    with contextlib.chdir(folder), environment(MATPLOTLIBRC=os.devnull, MPLBACKEND="agg"):
+        yield
+    module.get_configdir = lambda: folder  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def plain_opencv(_module: ModuleType) -> Iterator[None]:
+    """What it adds to the path of libraries ends with an empty part."""
+    yield
+    _drop_current_folder()
+
+
+def _drop_current_folder() -> None:
+    """An empty part of the path of libraries is the current folder to the system."""
+    if parts := [part for part in os.environ.pop(LIBRARIES, "").split(":") if part]:
+        os.environ[LIBRARIES] = ":".join(parts)
