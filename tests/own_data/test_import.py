@@ -186,7 +186,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"observations": np.full((40, 9), np.nan)}, "have numbers that are not finite"),
     ({"features": np.array(["a"])}, "number of feature names is wrong: 1 for uint8"),
     ({"observations": pictures(40)[0].astype(int) * 9}, "could be pictures or numbers.*Of pictures give x.astype"),
-    ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"channels, or stacked frames, first.*transpose\(0, 2, 3, 1\)"),
+    ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"frames, first.*transpose\(0, 2, 3, 1\)"),
     ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"frames, first: uint8 \(60, 12, 48, 48\)"),
     ({"observations": np.zeros((40, 0), np.uint8)}, "are not observations"),
     ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "differ in shape or type from the labelled ones"),
