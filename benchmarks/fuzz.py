@@ -13,7 +13,6 @@ import io
 import json
 import os
 import random
-import re
 import resource
 import selectors
 import shutil
@@ -346,68 +345,10 @@ def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
     return tolerated(lambda: lines(read_status(run)), partial(command, "sweep", "--out", run, "--gather"))
 
 
-OBSERVATION_DTYPES = ("uint8", "int64", "uint16", "bool", "float16", "float32", "float64")
-
-
-def drawn_observation(rng: Rng) -> tuple[tuple[int, ...], str]:
-    """A shape, of few or many channels and frames in any place, and a type of an observation."""
-    shape = tuple(rng.choice((1, 3, 4, 7, 16, 17, 24, 64)) for _ in range(rng.choice((1, 2, 2, 3, 3, 3, 4, 4))))
-    return (shape if np.prod(shape) < 200_000 else shape[:2]), rng.choice(("uint8", *OBSERVATION_DTYPES))
-
-
-def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
-    """What such observations of an environment are taken for; an array's must be the same, and what refusals propose
-    must work: ``picture``, ``numbers``, ``doubtful`` or ``refused``, otherwise an ``AssertionError``.
-    """
-    import gymnasium
-    from gymnasium import spaces
-
-    from hypogoal.dataset import NUMBERS, PICTURE
-    from hypogoal.domains.gymnasium_engine import look_of
-    from hypogoal.own_data.parts import as_observations
-
-    class Constant(gymnasium.Env[Any, int]):
-        observation_space = spaces.Box(0, 1, shape, np.dtype(dtype).type)
-        action_space = spaces.Discrete(2)
-
-        def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
-            return np.ones(shape, dtype), {}
-
-    env, states = Constant(), np.ones((2, *shape), dtype)
-    long_sides = any(min(pair) > 16 for pair in zip(shape, shape[1:], strict=False))
-    try:
-        look = look_of(env)
-    except UserError as error:
-        assert dtype == "uint8" or (long_sides and "float" not in dtype), error
-        lines = re.fullmatch(r".*?(?:Of pictures: env = (.*)|C\)); of numbers: env = (.*)", str(error))
-        assert lines, error
-        for line, kind in zip(lines.groups(), (PICTURE, NUMBERS), strict=True):
-            wrapped = eval(line, {"gymnasium": gymnasium, "env": env}) if line else None
-            if wrapped:
-                assert look_of(wrapped).dtype == kind and not look_of(wrapped).doubt, line
-                look_of(wrapped).read(wrapped, wrapped.reset()[0])
-        try:
-            as_observations(states, "the states")
-        except UserError as refusal:
-            lines = re.fullmatch(r".*?(?:give ([^;]*?)(?:, as '.*)?); of numbers (.*)\.", str(refusal))
-            assert lines, refusal
-            for line, kind in zip(lines.groups(), (PICTURE, NUMBERS), strict=True):
-                if not line.startswith("uint8"):
-                    assert as_observations(eval(line, {"x": states}), "the states").dtype == kind, line
-            return "refused"
-        raise AssertionError(f"an array of {dtype} {shape} was accepted: {error}") from None
-    taken = as_observations(states, "the states")[0]
-    assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
-    np.testing.assert_array_equal(look.read(env, env.reset()[0]), taken)
-    if look.dtype == PICTURE:
-        assert dtype == "uint8" and len(shape) in (2, 3)
-        return "picture"
-    assert bool(look.doubt) == long_sides and ("float" in dtype or not long_sides)
-    return "doubtful" if look.doubt else "numbers"
-
-
 def fuzz_observations(box: Sandbox, rng: Rng, case: int) -> bool:
     """An observation of any shape and type."""
+    from benchmarks.observations import drawn_observation, outcome_of
+
     return outcome_of(*drawn_observation(rng)) != "refused"
 
 

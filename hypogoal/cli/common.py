@@ -221,7 +221,7 @@ def print_next(quiet: bool, *words: object) -> None:
 
 def command_again(context: typer.Context, **changes: object) -> str:
     """The command that runs, as one would type it, with other values of some options."""
-    words = ["hypogoal", context.info_name]
+    words: list[object] = ["hypogoal", context.info_name]
     for option in context.command.params:
         value = changes.get(str(option.name), context.params.get(str(option.name)))
         if option.param_type_name == "argument":

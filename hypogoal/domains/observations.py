@@ -110,10 +110,11 @@ def _arrangement(shape: tuple[int, ...], cast: str) -> Arrangement | None:
     return None if channels_first(target) else Arrangement(cast, (height, height + 1, *others), target)
 
 
-def smaller_size(height: int, width: int, longest: int) -> tuple[int, int]:
-    """Height and width in the same proportion, the longer one at most ``longest``; never larger than they are."""
+def shrunk_picture(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """A picture uint8 (H, W, C) in the same proportion, its longer side ``longest`` pixels; one no larger as it is."""
+    height, width = picture.shape[:2]
     scale = min(1.0, longest / max(height, width))
-    return max(1, round(height * scale)), max(1, round(width * scale))
+    return resized_picture(picture, max(1, round(height * scale)), max(1, round(width * scale)))
 
 
 def resized_picture(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

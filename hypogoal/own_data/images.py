@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, require_file
 from hypogoal.dataset import PICTURE
-from hypogoal.domains.observations import reading_of, resized_picture, smaller_size
+from hypogoal.domains.observations import reading_of, shrunk_picture
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.parts import Parts, require_memory
 
@@ -54,7 +54,8 @@ def read_images(folder: Path, *, resize: int = 0, stack: bool = False) -> Parts:
         file = [file for kind in kinds for file in files[kind]][row]
         return file.relative_to(folder).as_posix()
 
-    return Parts(*_labelled(*read[:2]), read[2], *(_labelled(*read[3:]) if read[3:] else ()), name=name)
+    heldout, known = _labelled(*read[3:]) if read[3:] else (None, None)
+    return Parts(*_labelled(*read[:2]), read[2], heldout, known, name=name)
 
 
 def _labelled(positive: NDArray[np.uint8], negative: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -146,8 +147,7 @@ def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArr
     images: list[NDArray[np.uint8]] = []
     for file in files:
         image = read_image(file, stack=stack)
-        size = smaller_size(*image.shape[:2], resize) if resize else image.shape[:2]
-        images.append(resized_picture(image, *size))
+        images.append(shrunk_picture(image, resize) if resize else image)
         if len(images) == 1:
             require_memory(count * images[0].nbytes, file)
         if _size(images[-1]) != _size(images[0]):

@@ -23,7 +23,7 @@ from hypogoal.dataset import (
     require_classes,
     require_names,
 )
-from hypogoal.domains.observations import Reading, reading_of, resized_picture, smaller_size
+from hypogoal.domains.observations import Reading, reading_of, shrunk_picture
 from hypogoal.own_data.supervision import contradictions, looks_of, near_duplicates, require_own_pictures
 
 COPIES = 4  # of the states, all held in memory at once while they are compared and written
@@ -64,7 +64,7 @@ def collected_of(
     goals = named(sub_goals or parts.sub_goals, labelled.labels.shape[1])
     unlabelled = as_observations(parts.unlabelled, "the unlabelled observations", images, resize=resize, stack=stack)
     bare = States(unlabelled, np.zeros((len(unlabelled), len(goals)), np.bool_), _rows(unlabelled))
-    looks = looks_of(images)
+    looks, kind = looks_of(images), "picture" if images.dtype == PICTURE else "observation"
     names = partial(parts.name, "observations"), partial(parts.name, "heldout_observations")
     if parts.heldout_observations is not None and parts.heldout_labels is not None:
         what = "the held-out observations"
@@ -72,11 +72,11 @@ def collected_of(
         told = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
         test = States(heldout, told, _rows(heldout))
         every = np.concatenate([looks, looks_of(heldout)]), np.concatenate([labelled.labels, told])
-        warned += contradictions(*every, goals, _one_after_another(len(images), *names))
+        warned += contradictions(*every, goals, _one_after_another(len(images), *names), kind=kind)
         do = "Hold out others, of other contexts."
         test = _apart(test, (images, unlabelled), "held-out", "to learn from", do, warned)
     else:
-        warned += contradictions(looks, labelled.labels, goals, names[0])
+        warned += contradictions(looks, labelled.labels, goals, names[0], kind=kind)
         _, first, picture = np.unique(looks, return_index=True, return_inverse=True)
         ordered = np.sort(first)  # each picture once, in the order given
         chosen = np.zeros(len(images), np.bool_)
@@ -96,7 +96,7 @@ def collected_of(
     warned += near_duplicates(labelled, test, goals, (of_labelled, of_test))
     warned += hard_to_learn(labelled.labels, goals) + hard_to_judge(test.labels, goals)
     numbered = [replace(states, origins=_rows(states.labels)) for states in (labelled, bare, test)]
-    return Collected(tuple(shape), goals, *numbered, parts.features), warned
+    return Collected(tuple(shape), goals, numbered[0], numbered[1], numbered[2], parts.features), warned
 
 
 def _rows(states: NDArray[Any]) -> dict[str, NDArray[np.int64]]:
@@ -156,9 +156,8 @@ def as_observations(
         raise UserError(f"{what} {reading.fault}", found, f"{do}.")
     if reading.dtype == PICTURE:
         values = reading.picture.arrange(values) if reading.picture else values
-        height, width = smaller_size(*values.shape[1:3], resize) if resize else values.shape[1:3]
-        if (height, width) != values.shape[1:3]:
-            values = np.stack([resized_picture(picture, height, width) for picture in values])
+        if resize and max(values.shape[1:3]) > resize:
+            values = np.stack([shrunk_picture(picture, resize) for picture in values])
     elif resize:
         raise UserError("only pictures can be resized", found, "Leave out --resize.")
     else:

@@ -27,13 +27,15 @@ def looks_of(observations: Observations) -> Looks:
     return np.array([digest(each) for each in observations])
 
 
-def contradictions(looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name) -> list[str]:
+def contradictions(
+    looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name, *, kind: str = "picture"
+) -> list[str]:
     """A line for each sub-goal of whose states, labels (N, G), some look the same but differ in their labels."""
     lines = []
     for goal, column in zip(goals, labels.T, strict=True):
         both = np.intersect1d(looks[column], looks[~column])
         if len(both):
-            count = "1 picture carries" if len(both) == 1 else f"{len(both)} pictures carry"
+            count = f"1 {kind} carries" if len(both) == 1 else f"{len(both)} {kind}s carry"
             pair = _pair(looks, column, both[0], name)
             lines.append(f"{count} both labels of {goal}, such as {pair}: no member can be right about both")
     return lines

@@ -60,8 +60,8 @@ def import_data(
     warned += _too_small(domain, collected)
     for line in warned:
         say(f"hypogoal: {line}", err=True)
-    config = {"source": printable(source.name), **({"labels": dict(labels)} if labels else {})}
-    config |= {"resize": resize} if resize else {}
+    config: dict[str, Any] = {"source": printable(source.name)}
+    config |= ({"labels": dict(labels)} if labels else {}) | ({"resize": resize} if resize else {})
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()
 

@@ -13,7 +13,7 @@ import pytest
 from gymnasium import spaces
 from test_numbers import Says
 
-from benchmarks.fuzz import OBSERVATION_DTYPES, drawn_observation, outcome_of
+from benchmarks.observations import DTYPES, drawn_observation, outcome_of
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import NUMBERS, PICTURE, open_dataset
@@ -30,6 +30,7 @@ CASES = [
     for dtype, shape in re.findall(r"`(\w+) \(([\d, ]+)\)`", examples)
 ]
 
+
 @pytest.mark.parametrize(("dtype", "shape", "outcome"), CASES)
 def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outcome: str) -> None:
     """Spec B6: each of its examples, in an environment and in an array."""
@@ -41,7 +42,7 @@ def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outco
 
 
 def test_the_table_has_all_types_and_every_outcome() -> None:
-    assert {case.values[0] for case in CASES} >= set(OBSERVATION_DTYPES)
+    assert {case.values[0] for case in CASES} >= set(DTYPES)
     assert {case.values[2] for case in CASES} == {
         "a picture", "a picture, `(H, W, 1)`", "numbers", "numbers, with a warning", "refused",
     }  # fmt: skip

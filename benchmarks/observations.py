@@ -1,0 +1,96 @@
+"""Spec B6: observations of any shape and type, in an environment and in an array (``benchmarks.fuzz``)."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable
+from itertools import pairwise
+from math import prod
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import NUMBERS, PICTURE
+from hypogoal.domains.gymnasium_engine import look_of
+from hypogoal.own_data.parts import as_observations
+
+DTYPES = ("uint8", "int64", "uint16", "bool", "float16", "float32", "float64")
+LENGTHS = (1, 3, 4, 7, 16, 17, 24, 64)  # of axes: of colours, frames and pictures
+MOST = 200_000  # numbers in an observation
+
+
+class Constant(gymnasium.Env[Any, Any]):
+    """Shows the same observation, of ones, all the time."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, shape: tuple[int, ...], dtype: str):
+        self.observation_space = spaces.Box(0, 1, shape, np.dtype(dtype).type)
+        self.observation = np.ones(shape, dtype)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.observation, {}
+
+
+def drawn_observation(rng: random.Random) -> tuple[tuple[int, ...], str]:
+    """A shape and a type; bytes are drawn more often."""
+    shape = tuple(rng.choice(LENGTHS) for _ in range(rng.choice((1, 2, 2, 3, 3, 3, 4, 4))))
+    return (shape if prod(shape) < MOST else shape[:2]), rng.choice(("uint8", *DTYPES))
+
+
+def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
+    """What such an observation is taken for: ``picture``, ``numbers``, ``doubtful`` numbers, or ``refused``.
+
+    An ``AssertionError`` where environment and array differ, it was guessed, or what a refusal proposes does not work.
+    """
+    env, states = Constant(shape, dtype), np.ones((2, *shape), dtype)
+    wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
+    of_env, of_array = _refusal(lambda: look_of(env)), _refusal(lambda: as_observations(states, "the states"))
+    assert bool(of_env) == bool(of_array), (of_env, of_array)
+    if of_env:
+        assert dtype == "uint8" or (wide and "float" not in dtype), of_env
+        _check_lines_of_env(of_env, env)
+        _check_lines_of_array(of_array, states)
+        return "refused"
+    look, taken = look_of(env), as_observations(states, "the states")[0]
+    assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
+    np.testing.assert_array_equal(look.read(env, env.reset()[0]), taken)
+    if look.dtype == PICTURE:
+        assert dtype == "uint8" and len(shape) in (2, 3)
+        return "picture"
+    assert bool(look.doubt) == wide and ("float" in dtype or not wide)
+    return "doubtful" if look.doubt else "numbers"
+
+
+def _refusal(call: Callable[[], object]) -> str:
+    """The line with which a call refuses; empty where it does not."""
+    try:
+        call()
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+def _check_lines_of_env(refusal: str, env: gymnasium.Env[Any, Any]) -> None:
+    """The wrappers proposed, as they stand, make pictures and numbers that nobody doubts."""
+    lines = re.fullmatch(r".*?(?:Of pictures: env = (.*)|C\)); of numbers: env = (.*)", refusal)
+    assert lines, refusal
+    for line, dtype in zip(lines.groups(), (PICTURE, NUMBERS), strict=True):
+        if line:
+            wrapped = eval(line, {"gymnasium": gymnasium, "env": env})
+            look = look_of(wrapped)
+            assert look.dtype == dtype and not look.doubt, line
+            look.read(wrapped, wrapped.reset()[0])
+
+
+def _check_lines_of_array(refusal: str, states: np.ndarray) -> None:
+    """So do the expressions."""
+    lines = re.fullmatch(r".*?(?:give ([^;]*?)(?:, as '.*)?); of numbers (.*)\.", refusal)
+    assert lines, refusal
+    for line, dtype in zip(lines.groups(), (PICTURE, NUMBERS), strict=True):
+        if not line.startswith("uint8"):
+            assert as_observations(eval(line, {"x": states}), "the states").dtype == dtype, line
