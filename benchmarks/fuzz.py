@@ -346,10 +346,12 @@ def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
 
 
 def fuzz_observations(box: Sandbox, rng: Rng, case: int) -> bool:
-    """An observation of any shape and type."""
-    from benchmarks.observations import drawn_observation, outcome_of
+    """What people import: an observation of any shape and type, a turned picture, labels that contradict each other."""
+    from benchmarks.observations import check_labels, check_upright, drawn_observation, outcome_of
 
-    return outcome_of(*drawn_observation(rng)) != "refused"
+    check_upright(box.out, rng)
+    outcomes = check_labels(rng), outcome_of(*drawn_observation(rng)) != "refused"
+    return all(outcomes)
 
 
 FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {
