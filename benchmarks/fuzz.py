@@ -376,6 +376,15 @@ def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
         return tolerated(lambda: lines_of(read_status(run)), *calls)
 
 
+def fuzz_observations(box: Sandbox, rng: Rng, case: int) -> bool:
+    """What people import: an observation of any shape and type, a turned picture, labels that contradict each other."""
+    from benchmarks.observations import check_labels, check_upright, drawn_observation, outcome_of
+
+    check_upright(box.out, rng)
+    outcomes = check_labels(rng), outcome_of(*drawn_observation(rng)) != "refused"
+    return all(outcomes)
+
+
 FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {
     "manifest": fuzz_manifest,
     "hdf5": fuzz_hdf5,
@@ -383,6 +392,7 @@ FORMATS: dict[str, Callable[[Sandbox, Rng, int], bool]] = {
     "tables": fuzz_tables,
     "toml": fuzz_toml,
     "sweep": fuzz_sweep,
+    "observations": fuzz_observations,
 }
 DEBUG = False
 

@@ -17,6 +17,7 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import give, say
 from hypogoal.settings import configuration
 
+LARGE = 160  # pixels of a picture's side, above which smaller ones are proposed: such train within 2 GB
 PLAYED = "a domain, a Gymnasium environment's id, or module:object."
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 @cli.command(cli.OWN, "import states.npz --sub-goal door-open --out data/own.h5", "import")
 def import_(
+    context: typer.Context,
     source: Annotated[Path, Argument(help="A .npz file, or a folder of .npy files, of images or of a Minari dataset.")],
     out: cli.Out,
     sub_goal: Annotated[
@@ -35,6 +37,8 @@ def import_(
     ] = None,
     key: Annotated[str, Option(help="Which part to take, if a Minari dataset has dictionaries.")] = "",
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
+    resize: Annotated[int, Option(min=0, help="Longer side of pictures, in pixels, at most; 0: as it is.")] = 0,
+    stack: Annotated[bool, Option("--stack", help="Frames and colours in other places become channels.")] = False,
     domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
     seed: cli.Seed = 0,
     force: cli.Force = False,
@@ -50,12 +54,27 @@ def import_(
         raise UserError("--label needs name=module:function", " ".join(label or ()), do)
     with own_code.given(*labels.values()):
         counts = stage(
-            source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, domain=domain, seed=seed,
-            force=force,
+            source, out, sub_goals=sub_goal or (), labels=labels, key=key, share=heldout, resize=resize, stack=stack,
+            domain=domain, seed=seed, force=force,
         )  # fmt: skip
+    _print_observations(context, out, resize, quiet)
     cli.print_counts(counts, quiet)
     cli.print_next(quiet, "train-ensemble", out, "--out", cli.run_of(out) / "ensemble")
     give(out)
+
+
+def _print_observations(context: typer.Context, data: Path, resize: int, quiet: bool) -> None:
+    """What the states of a data file were taken for; of large pictures the command that imports them smaller."""
+    from hypogoal.dataset import PICTURE, open_dataset
+
+    dataset = open_dataset(data)
+    sizes = " x ".join(map(str, dataset.observation_shape))
+    pictures = dataset.observation_dtype == PICTURE
+    if not quiet:
+        say(f"taken for {'pictures' if pictures else 'numbers'}, {sizes} {dataset.observation_dtype}")
+    if pictures and max(dataset.observation_shape[:2]) > LARGE and not resize:
+        smaller = cli.command_again(context, resize=LARGE, force=True)
+        say(f"hypogoal: pictures of {sizes} need much memory and time; for smaller ones: {smaller}", err=True)
 
 
 @cli.command(cli.OWN, "export data/doorkey.h5 --out states.npz")

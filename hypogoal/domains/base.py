@@ -18,6 +18,7 @@ from hypogoal.core.config import from_values
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import PICTURE, Collected, Observations, Standard
+from hypogoal.domains.observations import reading_of
 
 if TYPE_CHECKING:
     import gymnasium
@@ -300,6 +301,11 @@ class Domain(ABC):
     def observation_dtype(self) -> np.dtype[Any]:
         """uint8 for pictures, float32 for other observations."""
         return PICTURE
+
+    @property
+    def doubt(self) -> str:
+        """A warning that its observations may be meant as pictures but are numbers; empty where they are not."""
+        return reading_of(tuple(self.observation_shape), self.observation_dtype).doubt
 
     @property
     def observation_bytes(self) -> int:

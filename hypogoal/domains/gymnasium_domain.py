@@ -137,6 +137,10 @@ class GymnasiumDomain(Domain):
         return self.look.dtype
 
     @property
+    def doubt(self) -> str:
+        return self.look.doubt
+
+    @property
     def has_env(self) -> bool:
         return True
 

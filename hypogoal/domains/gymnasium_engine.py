@@ -10,18 +10,17 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
-from PIL import Image
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, layers
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
 from hypogoal.domains.base import Layouts, Step, TurnEngine
+from hypogoal.domains.observations import Reading, reading_of, resized_picture
 
 MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
-MOST_CHANNELS = 16  # of an image whose first axis could be colours or frames too
 RESETS = 5  # which a wrapper that drops the seed hardly passes by chance
 MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
 
@@ -48,19 +47,11 @@ def make_checked(make: MakeEnv) -> gymnasium.Env:
     return env
 
 
-def channels_first(shape: tuple[int, ...]) -> bool:
-    """Whether a shape is (C, H, W) rather than (H, W, C): few "rows", and more columns and "channels" than that.
-
-    Small grids with many planes, (7, 7, 20), are what they say.
-    """
-    return len(shape) == 3 and shape[0] <= MOST_CHANNELS < min(shape[1:])
-
-
 class Look(NamedTuple):
     """How observations of a space are read: as arrays of one shape and type, see ``dataset.Observations``.
 
     ``features`` are the names of the numbers in one that is no picture; ``key`` is that of the picture in a dictionary
-    with nothing else in it.
+    with nothing else in it. ``doubt`` is a warning, where numbers may be meant as a picture.
     """
 
     space: spaces.Space[Any]
@@ -68,6 +59,7 @@ class Look(NamedTuple):
     dtype: np.dtype[Any]
     features: tuple[str, ...] = ()
     key: str = ""
+    doubt: str = ""
 
     def read(self, env: gymnasium.Env, observation: Any, method: str = "step") -> Any:
         """An observation (*shape) that ``method`` gave, in memory of its own; ``UserError`` if its space says other."""
@@ -92,22 +84,25 @@ class Look(NamedTuple):
 def look_of(env: gymnasium.Env) -> Look:
     """How to read an environment's observations; of spaces that are no numbers, or mix pictures in, a ``UserError``.
 
-    Pictures are a ``Box`` of uint8 (H, W, C) or (H, W), or a ``Dict`` of just that. Any other ``Box`` is float32; what
-    else Gymnasium's ``flatten`` makes numbers of, dictionaries for one, is float32 (D,), in that order.
+    Pictures are a ``Box`` of uint8 (H, W, C) or (H, W), or a ``Dict`` of just that. Any other ``Box`` is float32, see
+    ``hypogoal.domains.observations``; what else Gymnasium's ``flatten`` makes numbers of, dictionaries for one, is
+    float32 (D,), in that order.
     """
     with UsersCode("the environment", env, failed="has no spaces:"):
         whole = space = env.observation_space
-    parts, key = list(_parts(space)), ""
-    boxes = [part for _, part in parts if isinstance(part, spaces.Box)]
-    if any(box.dtype == np.uint8 and len(box.shape) in (2, 3) for box in boxes):
-        if len(parts) > 1 or not isinstance(space, spaces.Box | spaces.Dict):
-            do = "Wrap it in gymnasium.wrappers.FilterObservation, and keep the picture alone, or all but pictures."
-            raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
-        [(key, space)] = parts
-        if channels_first(space.shape):
-            do = "Wrap it in gymnasium.wrappers.TransformObservation with x.transpose(1, 2, 0)."
-            raise UserError("observations have their channels, or stacked frames, first", space.shape, do)
-        return Look(space, space.shape if len(space.shape) == 3 else (*space.shape, 1), PICTURE, key=key)
+    parts, doubt = list(_parts(space)), ""
+    for name, part in parts:
+        if not isinstance(part, spaces.Box):
+            continue
+        reading = reading_of(part.shape, part.dtype, float(np.max(part.high, initial=0)))
+        if reading.dtype == PICTURE or reading.fault:
+            if len(parts) > 1 or not isinstance(space, spaces.Box | spaces.Dict):
+                do = "Wrap it in gymnasium.wrappers.FilterObservation, and keep the picture alone, or all but pictures."
+                raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
+            if reading.fault:
+                raise UserError(f"observations {reading.fault}", f"{part.dtype} {part.shape}", _wrapped(reading, name))
+            return Look(part, reading.shape, PICTURE, key=name)
+        doubt = doubt or reading.doubt
     try:
         sizes = [(name, spaces.flatdim(part)) for name, part in parts]
     except (NotImplementedError, ValueError):
@@ -117,7 +112,19 @@ def look_of(env: gymnasium.Env) -> Look:
     names = [(name, size, place) for name, size in sizes for place in range(size)]
     features = [(name if size == 1 else f"{name}[{place}]") if name else f"x{place}" for name, size, place in names]
     shape = (isinstance(space, spaces.Box) and space.shape) or (len(features),)
-    return Look(space, shape, NUMBERS, tuple(features))
+    return Look(space, shape, NUMBERS, tuple(features), doubt=doubt)
+
+
+def _wrapped(reading: Reading, key: str) -> str:
+    """The wrappers that make observations, or the part of a dictionary with this key, what they may be meant to be."""
+    numbers = "of numbers: env = gymnasium.wrappers.FlattenObservation(env)"
+    if reading.picture is None:
+        return f"Give pictures, uint8 (H, W, C); {numbers}"
+    function = reading.picture.expression()
+    if key:
+        function = function.replace("x", f"x[{key!r}]", 1)
+    box = f'gymnasium.spaces.Box(0, 255, {reading.picture.shape}, "uint8")'
+    return f"Of pictures: env = gymnasium.wrappers.TransformObservation(env, lambda x: {function}, {box}); {numbers}"
 
 
 def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
@@ -127,8 +134,7 @@ def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
         raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
 
     def small(observation: Any) -> NDArray[np.uint8]:
-        channels = map(Image.fromarray, np.moveaxis(look.read(env, observation), -1, 0))
-        return np.stack([np.asarray(one.resize((side, side), Image.Resampling.BOX)) for one in channels], -1)
+        return resized_picture(look.read(env, observation), side, side)
 
     space = spaces.Box(0, 255, (side, side, look.shape[-1]), np.uint8)
     return gymnasium.wrappers.TransformObservation(env, small, space)

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, require_file
+from hypogoal.dataset import PICTURE
+from hypogoal.domains.observations import reading_of, shrunk_picture
 from hypogoal.own_data.arrays import DAMAGED
 from hypogoal.own_data.parts import Parts, require_memory
 
@@ -23,29 +25,37 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP")  # whatever a file is called: for PostScript a program would be run
 MOST_PIXELS = 4096 * 4096  # of a state; a kilobyte can stand for a thousand times as many
 ARRAY = ".npy"  # a state that no image file holds, such as a stack of four frames
+ORIENTATION = 0x0112  # the tag in EXIF
 DO = "Remove it, or write it again."
 GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", "PA", "RGBA")  # of 8 bits a channel
 
 
-def read_images(folder: Path) -> Parts:
+def read_images(folder: Path, *, resize: int = 0, stack: bool = False) -> Parts:
     """The images of one sub-goal, in the order of their names; grey where all are, else red, green and blue.
 
-    A folder that is missing (but for ``heldout``) or empty, an image that cannot be read, or different sizes are a
-    ``UserError``.
+    ``resize`` and ``stack``: see :func:`as_observations`; what was of several sizes may be of one then. A folder that
+    is missing (but for ``heldout``) or empty, an image that cannot be read, or different sizes are a ``UserError``.
     """
     names = ["positive", "negative", "unlabelled"]
     if (folder / "heldout").is_dir():
         names += ["heldout/positive", "heldout/negative"]
-    wanted = {name: _files(folder / name) for name in names}
-    count = sum(map(len, wanted.values()))
-    images = {name: _read(files, count) for name, files in wanted.items()}
+    files = {name: _files(folder / name) for name in names}
+    count = sum(map(len, files.values()))
+    images = {name: _read(of_kind, count, resize, stack) for name, of_kind in files.items()}
     sizes = {_size(some[0]): name for name, some in images.items()}
     if len(sizes) > 1:
         text = ", ".join(f"{name} {size}" for size, name in sizes.items())
         raise UserError("the images differ in size", text, "Make them all one size.")
     channels = max(image.shape[2] for some in images.values() for image in some)
     read = [np.stack([image.repeat(channels // image.shape[2], axis=2) for image in some]) for some in images.values()]
-    return Parts(*_labelled(*read[:2]), read[2], *(_labelled(*read[3:]) if read[3:] else ()))
+
+    def name(field: str, row: int) -> str:
+        kinds = {"observations": names[:2], "unlabelled": names[2:3], "heldout_observations": names[3:]}[field]
+        file = [file for kind in kinds for file in files[kind]][row]
+        return file.relative_to(folder).as_posix()
+
+    heldout, known = _labelled(*read[3:]) if read[3:] else (None, None)
+    return Parts(*_labelled(*read[:2]), read[2], heldout, known, name=name)
 
 
 def _labelled(positive: NDArray[np.uint8], negative: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -67,8 +77,8 @@ def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Pa
     return files
 
 
-def read_image(file: Path) -> NDArray[np.uint8]:
-    """One state, uint8 (H, W, C): of an image its grey or its three colours, of a ``.npy`` file the array in it.
+def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
+    """One state, uint8 (H, W, C): of an image, upright, its grey or its three colours, of a ``.npy`` file its array.
 
     Too large, more than 8 bits a channel, several pictures, transparent in places, or not readable: a ``UserError``.
     """
@@ -78,19 +88,46 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     try:
         if file.suffix == ARRAY:
             values = np.load(file, mmap_mode="r", allow_pickle=False)
-            if values.ndim != 3 or values.dtype != np.uint8 or 0 in values.shape:
+            if values.ndim < 3 or values.dtype != PICTURE or 0 in values.shape:
                 raise UserError(f"a state is uint8 (H, W, C), not {values.dtype} {values.shape}", file, DO)
-            return np.array(values)
+            reading = reading_of(values.shape, values.dtype)
+            if reading.picture is None or (reading.fault and not stack):
+                expression = reading.picture.expression() if reading.picture else "uint8 (H, W, C)"
+                do = f"Give {expression}, as 'import --stack' does." if reading.picture else f"Give {expression}."
+                raise UserError(f"states {reading.fault}", f"{file}, {values.dtype} {values.shape}", do)
+            return np.array(reading.picture.arrange(values[None])[0])
         quiet = warnings.catch_warnings(action="ignore")
         with quiet, open_file(file, "the image is", DO) as raw, PIL.Image.open(raw, formats=FORMATS) as image:
             if (pixels := image.width * image.height) > MOST_PIXELS:
                 raise UserError(f"the image has {pixels:,} pixels, at most {MOST_PIXELS:,} are read", file, DO)
             if getattr(image, "is_animated", False):
                 raise UserError("one file holds several pictures", file, "Write each as a file of its own.")
-            values = np.asarray(_opaque(image, file).convert("L" if image.mode in GREY else "RGB"), dtype=np.uint8)
+            image.load()  # of a PNG the orientation may stand behind the pixels
+            opaque = _opaque(image, file).convert("L" if image.mode in GREY else "RGB")
+            values = np.asarray(_upright(opaque, image), dtype=np.uint8)
     except (*DAMAGED, LookupError, struct.error, PIL.Image.DecompressionBombError):
         raise UserError("this is not an image, or it is damaged", file, DO) from None
     return values.reshape(*values.shape[:2], -1)
+
+
+def _upright(image: Image, source: Image) -> Image:
+    """The image as viewers show it, turned or mirrored as the EXIF orientation of its ``source`` says."""
+    from PIL.Image import Transpose
+
+    turns = {
+        2: Transpose.FLIP_LEFT_RIGHT,
+        3: Transpose.ROTATE_180,
+        4: Transpose.FLIP_TOP_BOTTOM,
+        5: Transpose.TRANSPOSE,
+        6: Transpose.ROTATE_270,
+        7: Transpose.TRANSVERSE,
+        8: Transpose.ROTATE_90,
+    }
+    try:
+        turn = turns.get(source.getexif().get(ORIENTATION, 1))
+    except (*DAMAGED, LookupError, AttributeError, struct.error):  # damaged metadata, which viewers ignore
+        turn = None
+    return image if turn is None else image.transpose(turn)
 
 
 def _opaque(image: Image, file: Path) -> Image:
@@ -105,11 +142,12 @@ def _opaque(image: Image, file: Path) -> Image:
     return image
 
 
-def _read(files: list[Path], count: int) -> list[NDArray[np.uint8]]:
+def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArray[np.uint8]]:
     """The images of one size in some files, of ``count`` that there are in all."""
     images: list[NDArray[np.uint8]] = []
     for file in files:
-        images.append(read_image(file))
+        image = read_image(file, stack=stack)
+        images.append(shrunk_picture(image, resize) if resize else image)
         if len(images) == 1:
             require_memory(count * images[0].nbytes, file)
         if _size(images[-1]) != _size(images[0]):

@@ -39,19 +39,29 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
     stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
-    episodes = _episodes(folder / MINARI, key, _picture_shape(about.get("observation_space"), key))
+    names, episodes = _episodes(folder / MINARI, key, _picture_shape(about.get("observation_space"), key))
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
     order = rng_for(seed, "minari").permutation(len(episodes))
     ends = np.round(np.cumsum(SHARES)[:2] / sum(SHARES) * len(episodes)).astype(int)
     ends = np.clip(ends, (1, 2), (len(episodes) - 2, len(episodes) - 1))
-    labelled, unlabelled, heldout = (np.concatenate([episodes[i] for i in part]) for part in np.split(order, ends))
-    return Parts(labelled, _told(labels, labelled), unlabelled, heldout, _told(labels, heldout))
+    parts = np.split(order, ends)
+    labelled, unlabelled, heldout = (np.concatenate([episodes[i] for i in part]) for part in parts)
+
+    def name(field: str, row: int) -> str:
+        part = parts[("observations", "unlabelled", "heldout_observations").index(field)]
+        ends_of_episodes = np.cumsum([len(episodes[i]) for i in part])
+        place = int(np.searchsorted(ends_of_episodes, row, side="right"))
+        step = row - int(ends_of_episodes[place]) + len(episodes[part[place]])
+        return f"{names[part[place]]}, step {step}"
+
+    return Parts(labelled, _told(labels, labelled), unlabelled, heldout, _told(labels, heldout), name=name)
 
 
-def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
+def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list[str], list[NDArray[Any]]]:
+    """The names of the episodes, and the observations of each."""
     with open_hdf5(path, "the dataset", DO) as file:
-        names = [name for name in members(file) if name.startswith("episode_")]
+        names = sorted((name for name in members(file) if name.startswith("episode_")), key=_number)
         place = f"observations/{key}" if key else "observations"
         if names and not key and hasattr(find(file, f"{names[0]}/observations"), "keys"):
             keys = ", ".join(members(find(file, f"{names[0]}/observations")))
@@ -60,12 +70,12 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> list[NDArr
         if stored is not None and stored[1:] != shape:
             what = "its images are stored as JPEG, not as they were seen"
             raise UserError(what, path, "Make it with jpeg_encoding=False.")
-        places = [f"{name}/{place}" for name in sorted(names, key=_number)]
+        places = [f"{name}/{place}" for name in names]
         require_memory(sum(size_of(file, name, "uif") for name in places), path)
         episodes = [read_array(file, name, "uif") for name in places]
     if len({episode.shape[1:] for episode in episodes}) > 1 or not all(episode.ndim for episode in episodes):
         raise UserError("its episodes have observations of different shapes", path, "Give those of one shape.")
-    return episodes
+    return names, episodes
 
 
 def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:

@@ -1,7 +1,8 @@
 """What users bring, checked, as the sets of states that a data file holds."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,18 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.preflight import free_memory, human
 from hypogoal.core.seeding import rng_for
 from hypogoal.dataset import (
+    NUMBERS,
+    PICTURE,
     Collected,
     States,
-    digest,
     hard_to_judge,
     hard_to_learn,
     leave_out,
     require_classes,
     require_names,
 )
-from hypogoal.domains.gymnasium_engine import channels_first
+from hypogoal.domains.observations import Reading, reading_of, shrunk_picture
+from hypogoal.own_data.supervision import contradictions, looks_of, near_duplicates, require_own_pictures
 
 COPIES = 4  # of the states, all held in memory at once while they are compared and written
 
@@ -37,54 +40,77 @@ class Parts:
     heldout_labels: NDArray[Any] | None = None
     sub_goals: tuple[str, ...] = ()  # their names, where they were found with them
     features: tuple[str, ...] = ()  # those of the numbers, where they are no pictures
+    name: Callable[[str, int], str] = "{}[{}]".format  # of a state, by its field and row, for messages
 
 
 def collected_of(
-    parts: Parts, sub_goals: Sequence[str], *, share: float = 0.2, seed: int = 0
+    parts: Parts, sub_goals: Sequence[str], *, share: float = 0.2, seed: int = 0, resize: int = 0, stack: bool = False
 ) -> tuple[Collected, list[str]]:
     """The states in the form of a data file, and what is allowed but may surprise, a line each.
 
     Of one sub-goal the name may be left out. Where there are no held-out states, a ``share`` of the labelled ones of
-    each class is, by ``seed``. What cannot be used, or a missing class, is a ``UserError``.
+    each class is, by ``seed``. ``resize`` and ``stack``: see :func:`as_observations`. What cannot be used, or a class
+    that is missing or has no picture of its own, is a ``UserError``.
     """
     warned: list[str] = []
-    images = as_observations(parts.observations, "the labelled observations")
-    if images.dtype == np.float32 and images.ndim == 4:
-        do = "of pictures in 0..1 give (255 * x).round().astype('uint8')"
-        warned.append(f"float32 {images.shape[1:]} are taken for numbers, not for a picture: {do}")
+    images = as_observations(parts.observations, "the labelled observations", resize=resize, stack=stack)
+    if doubt := _reading(parts.observations).doubt:
+        warned.append(doubt)
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
         given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
         raise UserError("the number of feature names is wrong", given, "Give one for each.")
     shape = images.shape[1:]
-    labels = as_labels(parts.labels, len(images), "the labels")
-    goals = named(sub_goals or parts.sub_goals, labels.shape[1])
-    unlabelled = as_observations(parts.unlabelled, "the unlabelled observations", images)
+    labelled = States(images, as_labels(parts.labels, len(images), "the labels"), _rows(images))
+    goals = named(sub_goals or parts.sub_goals, labelled.labels.shape[1])
+    unlabelled = as_observations(parts.unlabelled, "the unlabelled observations", images, resize=resize, stack=stack)
+    bare = States(unlabelled, np.zeros((len(unlabelled), len(goals)), np.bool_), _rows(unlabelled))
+    looks, kind = looks_of(images), "picture" if images.dtype == PICTURE else "observation"
+    names = partial(parts.name, "observations"), partial(parts.name, "heldout_observations")
     if parts.heldout_observations is not None and parts.heldout_labels is not None:
-        heldout = as_observations(parts.heldout_observations, "the held-out observations", images)
+        what = "the held-out observations"
+        heldout = as_observations(parts.heldout_observations, what, images, resize=resize, stack=stack)
         told = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
+        test = States(heldout, told, _rows(heldout))
+        every = np.concatenate([looks, looks_of(heldout)]), np.concatenate([labelled.labels, told])
+        warned += contradictions(*every, goals, _one_after_another(len(images), *names), kind=kind)
         do = "Hold out others, of other contexts."
-        test = _apart(States(heldout, told), (images, unlabelled), "held-out", "to learn from", do, warned)
+        test = _apart(test, (images, unlabelled), "held-out", "to learn from", do, warned)
     else:
-        _, first, picture = np.unique([digest(image) for image in images], return_index=True, return_inverse=True)
+        warned += contradictions(looks, labelled.labels, goals, names[0], kind=kind)
+        _, first, picture = np.unique(looks, return_index=True, return_inverse=True)
         ordered = np.sort(first)  # each picture once, in the order given
         chosen = np.zeros(len(images), np.bool_)
-        chosen[ordered[held_out(labels[ordered], share, seed)]] = True
+        chosen[ordered[held_out(labelled.labels[ordered], share, seed)]] = True
         chosen = chosen[first][picture]  # and all states that look like one held out
-        test = States(images[chosen], labels[chosen])
-        images, labels = images[~chosen], labels[~chosen]
-        bare = States(unlabelled, np.zeros((len(unlabelled), 0), np.bool_))
+        test, labelled, looks = labelled.where(chosen), labelled.where(~chosen), looks[~chosen]
+        names = names[0], names[0]
         do = "Give some of other contexts."
-        unlabelled = _apart(bare, (test.observations,), "unlabelled", "held out", do, warned).observations
+        bare = _apart(bare, (test.observations,), "unlabelled", "held out", do, warned)
         warned.append(
             f"no held-out states were given: {int(chosen.sum())} of the labelled ones are held out, which says nothing "
             "of other contexts"
         )
-    require_classes(labels, goals, None, "Give states of both kinds.")
-    warned += hard_to_learn(labels, goals) + hard_to_judge(test.labels, goals)
-    unknown = np.zeros((len(unlabelled), len(goals)), np.bool_)
-    sets = [States(images, labels), States(unlabelled, unknown), test]
-    numbered = [replace(states, origins={"row": np.arange(len(states.labels), dtype=np.int64)}) for states in sets]
+    require_classes(labelled.labels, goals, None, "Give states of both kinds.")
+    of_labelled, of_test = _of_rows(labelled, names[0]), _of_rows(test, names[1])
+    require_own_pictures(looks, labelled.labels, goals, of_labelled)
+    warned += near_duplicates(labelled, test, goals, (of_labelled, of_test))
+    warned += hard_to_learn(labelled.labels, goals) + hard_to_judge(test.labels, goals)
+    numbered = [replace(states, origins=_rows(states.labels)) for states in (labelled, bare, test)]
     return Collected(tuple(shape), goals, numbered[0], numbered[1], numbered[2], parts.features), warned
+
+
+def _rows(states: NDArray[Any]) -> dict[str, NDArray[np.int64]]:
+    return {"row": np.arange(len(states), dtype=np.int64)}
+
+
+def _of_rows(states: States, name: Callable[[int], str]) -> Callable[[int], str]:
+    """The names of states, some of those that were found."""
+    return lambda index: name(int(states.origins["row"][index]))
+
+
+def _one_after_another(count: int, first: Callable[[int], str], second: Callable[[int], str]) -> Callable[[int], str]:
+    """The names of ``count`` states, then of others."""
+    return lambda index: first(index) if index < count else second(index - count)
 
 
 def require_memory(size: int, where: Path) -> None:
@@ -107,34 +133,47 @@ def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, of: str, d
     return kept
 
 
-def as_observations(values: NDArray[Any], what: str, like: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Pictures uint8 (N, H, W, C), of whole numbers (N, H, W, C) or (N, H, W); else numbers, float32 (N, *shape).
+def as_observations(
+    values: NDArray[Any], what: str, like: NDArray[Any] | None = None, *, resize: int = 0, stack: bool = False
+) -> NDArray[Any]:
+    """Pictures uint8 (N, H, W, C), or else numbers, float32 (N, *shape), as ``hypogoal.domains.observations`` says.
 
-    What is neither, none at all, or of another kind than those that they are to be ``like`` is a ``UserError``.
+    ``stack``: frames and colours in other places become channels. ``resize``: the longer side of pictures in pixels, at
+    most. What is neither, none at all, or of another kind than those that they are to be ``like`` is a ``UserError``.
     """
     found = f"{values.dtype} {values.shape}"
     if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
         do = "Give images (N, height, width, channels), or numbers (N, ...)."
         raise UserError(f"{what} are not observations", found, do)
-    if values.dtype.kind in "iu" and values.ndim in (3, 4):
-        low, high = (int(values.min()), int(values.max())) if len(values) else (0, 0)
-        if low < 0 or high > 255:
-            do = "Scale them to 0..255, uint8; if they are not images, give float32."
-            raise UserError(f"{what} do not fit bytes ({low} to {high})", found, do)
-        values = values.astype(np.uint8, copy=False)
-        values = values[..., None] if values.ndim == 3 else values
-        if channels_first(values.shape[1:]):
-            raise UserError(f"{what} have their channels first", found, "Give x.transpose(0, 2, 3, 1).")
-    else:
-        values = values.astype(np.float32, copy=False)
-        if not np.isfinite(values).all():
-            raise UserError(f"{what} have numbers that are not finite", found, "Give finite ones.")
     if not len(values):
         raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")
+    reading = _reading(values)
+    stackable = reading.dtype == PICTURE and reading.picture is not None and len(reading.picture.axes) > 2
+    if reading.fault and not (stack and stackable):
+        pictures = reading.picture.expression(batch=True) if reading.picture else "uint8 (N, H, W, C)"
+        stacks = ", as 'import --stack' does" if stackable else ""
+        do = f"Of pictures give {pictures}{stacks}; of numbers x.reshape(len(x), -1)"
+        raise UserError(f"{what} {reading.fault}", found, f"{do}.")
+    if reading.dtype == PICTURE:
+        values = reading.picture.arrange(values) if reading.picture else values
+        if resize and max(values.shape[1:3]) > resize:
+            values = np.stack([shrunk_picture(picture, resize) for picture in values])
+    elif resize:
+        raise UserError("only pictures can be resized", found, "Leave out --resize.")
+    else:
+        values = values.astype(NUMBERS, copy=False)
+        if not np.isfinite(values).all():
+            raise UserError(f"{what} have numbers that are not finite", found, "Give finite ones.")
     if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
         given = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
         raise UserError(f"{what} differ in shape or type from the labelled ones", given)
     return np.ascontiguousarray(values)
+
+
+def _reading(values: NDArray[Any]) -> Reading:
+    """How observations (N, ...) are read."""
+    top = float(values.max()) if values.dtype.kind == "f" and values.size else 0.0
+    return reading_of(values.shape[1:], values.dtype, top)
 
 
 def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = None) -> NDArray[np.bool_]:

@@ -44,6 +44,8 @@ def collect(
         found = open_dataset(out)
         before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
         raise check_complete({**before, "inputs": found.inputs}, about, given)
+    if domain.doubt:
+        say(f"hypogoal: {domain.doubt}", err=True)
     size = domain.collected_bytes(config)
     preflight("collect", out, (COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:

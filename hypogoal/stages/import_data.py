@@ -29,6 +29,8 @@ def import_data(
     labels: Mapping[str, str] | None = None,
     key: str = "",
     share: float = 0.2,
+    resize: int = 0,
+    stack: bool = False,
     domain: str = IMPORTED,
     seed: int = 0,
     force: bool = False,
@@ -39,8 +41,9 @@ def import_data(
     ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
     ``sub_goals`` are names in the order of the labels' columns; of a Minari dataset ``labels`` has by sub-goal
     ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is meant.
-    ``share`` of the labelled states, by ``seed``, is held out where no held-out ones are given. ``domain`` is what they
-    are of, for later stages. Errors: see ``hypogoal.own_data``.
+    ``share`` of the labelled states, by ``seed``, is held out where no held-out ones are given. ``resize`` is the
+    longer side of pictures in pixels, at most; 0: as it is. ``stack``: axes of frames and colours become channels.
+    ``domain`` is what they are of, for later stages. Errors: see ``hypogoal.own_data``.
     """
     claim(out, kind=DATA, inputs=[source], force=force)
     if (source / MINARI).exists():
@@ -49,15 +52,16 @@ def import_data(
     elif labels or key:
         raise UserError("not a Minari dataset", source, "--label and --key are for the folder of one.")
     elif (source / "positive").is_dir() or (source / "negative").is_dir():
-        parts = read_images(source)
+        parts = read_images(source, resize=resize, stack=stack)
         sub_goals = sub_goals or (source.resolve().name,)
     else:
         parts = read_arrays(source)
-    collected, warned = collected_of(parts, sub_goals, share=share, seed=seed)
+    collected, warned = collected_of(parts, sub_goals, share=share, seed=seed, resize=resize, stack=stack)
     warned += _too_small(domain, collected)
     for line in warned:
         say(f"hypogoal: {line}", err=True)
-    config = {"source": printable(source.name), **({"labels": dict(labels)} if labels else {})}
+    config: dict[str, Any] = {"source": printable(source.name)}
+    config |= ({"labels": dict(labels)} if labels else {}) | ({"resize": resize} if resize else {})
     write_dataset(out, collected, domain=domain, config=config, seed=seed, force=force)
     return open_dataset(out).counts()
 

@@ -190,8 +190,8 @@ class _Contract:
         promise(dtype == self.domain.observation_dtype and dtype in (PICTURE, NUMBERS), text, "Give uint8 or float32.")
         given = f"observation_shape is {shape}"
         promise(len(shape) == 3 or dtype == NUMBERS, given, "Pictures are (height, width, channels).")
-        if len(shape) == 3 and dtype == NUMBERS:
-            warnings.warn(f"{given} of float32: taken for numbers; pictures are uint8", stacklevel=2)
+        if self.domain.doubt:
+            warnings.warn(self.domain.doubt, stacklevel=2)
         _array(engine.reset(), np.int64, (COUNT,), "what reset() returns")
         _array(engine.ids, np.int64, (COUNT,), "ids")
         known = bool((engine.ids >= 0).all() and (engine.ids < engine.n_states).all())

@@ -17,7 +17,8 @@ from hypogoal.core.progress import Progress
 from hypogoal.dataset import Collected
 from hypogoal.domains.base import Domain
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
-from hypogoal.domains.gymnasium_engine import GymnasiumEngine, channels_first
+from hypogoal.domains.gymnasium_engine import GymnasiumEngine
+from hypogoal.domains.observations import channels_first
 from hypogoal.stages.collect import collect
 
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
@@ -275,7 +276,8 @@ def test_a_module_of_the_current_folder_is_found(tmp_path: Path, monkeypatch: py
         ((16, 84, 84), True),
         ((48, 48, 12), False),
         ((16, 64, 16), False),
-        ((20, 84, 84), False),
+        ((20, 84, 84), True),
+        ((24, 32, 30), False),  # ten frames in colour of a small picture
         ((7, 7, 20), False),  # MiniGrid's one-hot view
         ((3, 48), False),
     ],

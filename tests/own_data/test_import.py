@@ -185,9 +185,9 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"observations": pictures(40)[0] / 255}, "differ in shape or type from the labelled ones: uint8"),
     ({"observations": np.full((40, 9), np.nan)}, "have numbers that are not finite"),
     ({"features": np.array(["a"])}, "number of feature names is wrong: 1 for uint8"),
-    ({"observations": pictures(40)[0].astype(int) * 9}, "do not fit bytes"),
-    ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"channels first.*transpose\(0, 2, 3, 1\)"),
-    ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"channels first: uint8 \(60, 12, 48, 48\)"),
+    ({"observations": pictures(40)[0].astype(int) * 9}, "could be pictures or numbers.*Of pictures give x.astype"),
+    ({"observations": pictures(40)[0].transpose(0, 3, 1, 2)}, r"frames, first.*transpose\(0, 2, 3, 1\)"),
+    ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"frames, first: uint8 \(60, 12, 48, 48\)"),
     ({"observations": np.zeros((40, 0), np.uint8)}, "are not observations"),
     ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "differ in shape or type from the labelled ones"),
     ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
@@ -394,7 +394,9 @@ def test_what_is_no_picture_of_a_state_is_not_even_decoded(
         read_image(file)
 
 
-def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, stored: str = "hdf5") -> Path:
+def save_minari(
+    folder: Path, episodes: int = 10, *, nested: bool = False, stored: str = "hdf5", side: int = SIDE
+) -> Path:
     """A dataset in Minari's own layout (0.5): data/metadata.json, and a group per episode in data/main_data.hdf5."""
     (folder / "data").mkdir(parents=True)
     about = {"data_format": stored, "total_episodes": episodes}
@@ -402,7 +404,7 @@ def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, store
     with h5py.File(folder / "data" / "main_data.hdf5", "w", track_order=True) as file:
         for number in range(episodes):
             group = file.create_group(f"episode_{number}")
-            images = pictures(6, number)[0]
+            images = pictures(6, number)[0].repeat(side // SIDE, 1).repeat(side // SIDE, 2)
             if nested:
                 group.create_dataset("observations/image", data=images, chunks=True, maxshape=(None, *images.shape[1:]))
             else:
@@ -412,7 +414,8 @@ def save_minari(folder: Path, episodes: int = 10, *, nested: bool = False, store
 
 
 def at_right(observation: np.ndarray) -> bool:
-    return bool(observation[20, 35, 0] == 255)
+    scale = len(observation) // SIDE
+    return bool(observation[20 * scale, 35 * scale, 0] == 255)
 
 
 def is_unsure(observation: np.ndarray) -> Any:

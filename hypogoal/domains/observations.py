@@ -1,0 +1,125 @@
+"""What an observation is taken for, by its shape and type (the table in docs/own-domain.md); pictures made smaller.
+
+Environments and imported arrays share these rules. What could be several things is refused, or warned of, with the
+expression that makes it a picture.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import prod
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hypogoal.dataset import NUMBERS, PICTURE
+
+MOST_CHANNELS = 16  # an axis as short as this may hold channels or frames; the sides of a picture are longer
+
+
+class Arrangement(NamedTuple):
+    """How an observation becomes a picture (H, W, C) of ``shape``: ``cast`` to bytes, its axes in another order.
+
+    ``axes`` are those of height and width, then those that become channels: frames, and last colours.
+    """
+
+    cast: str
+    axes: tuple[int, ...]
+    shape: tuple[int, ...]
+
+    def expression(self, *, batch: bool = False) -> str:
+        """Of x, one observation or, with ``batch``, several (N, ...)."""
+        if self.axes == (0, 1):
+            return f"{self.cast}[..., None]"
+        if self.axes == (0, 1, 2):
+            return self.cast
+        axes = (0, *(axis + 1 for axis in self.axes)) if batch else self.axes
+        moved = f"{self.cast}.transpose{axes}"
+        return moved if len(self.axes) == 3 else f"{moved}.reshape{(-1, *self.shape) if batch else self.shape}"
+
+    def arrange(self, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Observations (N, ...), bytes already, as pictures (N, H, W, C)."""
+        moved = values.transpose(0, *(axis + 1 for axis in self.axes))
+        return moved.reshape(len(values), *self.shape)
+
+
+class Reading(NamedTuple):
+    """What an observation is taken for: ``dtype``, PICTURE or NUMBERS, of ``shape``; refused if there is a ``fault``.
+
+    ``doubt`` is a warning. Of both, ``picture`` is how it becomes a picture; None if nobody can say.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    fault: str = ""
+    doubt: str = ""
+    picture: Arrangement | None = None
+
+
+def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any], top: float = 1.0) -> Reading:
+    """What an observation of this shape and type, a number or a truth value per entry, up to ``top``, is taken for."""
+    if len(shape) < 2:
+        return Reading(NUMBERS, shape or (1,))
+    casts = {"f": "x.round()" if 1 < top < np.inf else "(255 * x).round()", "b": "(255 * x)"}
+    cast = "x" if dtype == PICTURE else f"{casts.get(dtype.kind, 'x')}.astype('uint8')"
+    picture = _arrangement(shape, cast)
+    if dtype == PICTURE:
+        return Reading(PICTURE, picture.shape if picture else shape, _byte_fault(shape), picture=picture)
+    if not any(min(pair) > MOST_CHANNELS for pair in pairwise(shape)):  # it has not the shape of a picture
+        return Reading(NUMBERS, shape)
+    if dtype.kind == "f":
+        remedy = f": of pictures give {picture.expression()}" if picture else ""
+        return Reading(NUMBERS, shape, doubt=f"{dtype} {shape} is taken for numbers{remedy}", picture=picture)
+    return Reading(NUMBERS, shape, "could be pictures or numbers", picture=picture)
+
+
+def _byte_fault(shape: tuple[int, ...]) -> str:
+    """Why uint8 of this shape is refused; empty where it is a picture."""
+    if len(shape) > 3:
+        return "are stacks of pictures"
+    if channels_first(shape):
+        return "have their channels, or stacked frames, first"
+    if len(shape) == 2 and min(shape) <= MOST_CHANNELS < max(shape):
+        return "could be rows of numbers or low pictures"
+    return ""
+
+
+def channels_first(shape: tuple[int, ...]) -> bool:
+    """Whether a shape is (C, H, W) rather than (H, W, C): few "rows", and more columns and "channels" than that.
+
+    Small grids with many planes, (7, 7, 20), are what they say.
+    """
+    if len(shape) != 3 or min(shape[1:]) <= MOST_CHANNELS:
+        return False
+    return shape[0] <= MOST_CHANNELS or 2 * shape[0] <= min(shape[1:])
+
+
+def _arrangement(shape: tuple[int, ...], cast: str) -> Arrangement | None:
+    """How an observation of two axes or more becomes a picture; None where what came out would be refused again."""
+    if len(shape) == 2:
+        return Arrangement(cast, (0, 1), (*shape, 1))
+    if len(shape) == 3 and not channels_first(shape):
+        return Arrangement(cast, (0, 1, 2), shape)
+    pairs = list(pairwise(shape))
+    height = max(range(len(pairs)), key=lambda axis: (min(pairs[axis]), axis == 1))  # the longest two neighbours
+    others = sorted({*range(len(shape))} - {height, height + 1}, key=lambda axis: shape[axis] in (1, 3))
+    sides = shape[height], shape[height + 1]
+    target = (*sides, prod(shape) // prod(sides))
+    return None if channels_first(target) else Arrangement(cast, (height, height + 1, *others), target)
+
+
+def shrunk_picture(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """A picture uint8 (H, W, C) in the same proportion, its longer side ``longest`` pixels; one no larger as it is."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, longest / max(height, width))
+    return resized_picture(picture, max(1, round(height * scale)), max(1, round(width * scale)))
+
+
+def resized_picture(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """A picture uint8 (H, W, C) in ``height`` x ``width`` pixels, each the mean of the area that it covers."""
+    if picture.shape[:2] == (height, width):
+        return picture
+    channels = map(Image.fromarray, np.moveaxis(picture, -1, 0))
+    return np.stack([np.asarray(each.resize((width, height), Image.Resampling.BOX)) for each in channels], -1)

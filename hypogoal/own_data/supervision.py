@@ -1,0 +1,111 @@
+"""What the labels of equal and of nearly equal states say: contradictions, and test pictures that are hardly new."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.errors import UserError
+from hypogoal.dataset import PICTURE, Observations, States, digest
+from hypogoal.domains.observations import resized_picture
+
+GRID = 16  # areas along each side of a picture, whose mean brightness is compared
+LEVELS = 8  # of 255: by at most so much the means of nearly equal pictures differ, once both are equally bright ...
+BRIGHTNESS = 32  # ... which they are not to begin with, by at most so much
+RULE = f"in {GRID} x {GRID} areas their brightness differs by at most {LEVELS} of 255 levels"
+MOST_COMPARED = 2_000  # pictures of a set, spread evenly over it
+
+Looks: TypeAlias = NDArray[np.bytes_]
+Name: TypeAlias = Callable[[int], str]  # of a state, by its row
+
+
+def looks_of(observations: Observations) -> Looks:
+    """What tells observations (N, ...) apart, (N,)."""
+    return np.array([digest(each) for each in observations])
+
+
+def contradictions(
+    looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name, *, kind: str = "picture"
+) -> list[str]:
+    """A line for each sub-goal of whose states, labels (N, G), some look the same but differ in their labels."""
+    lines = []
+    for goal, column in zip(goals, labels.T, strict=True):
+        both = np.intersect1d(looks[column], looks[~column])
+        if len(both):
+            count = f"1 {kind} carries" if len(both) == 1 else f"{len(both)} {kind}s carry"
+            pair = _pair(looks, column, both[0], name)
+            lines.append(f"{count} both labels of {goal}, such as {pair}: no member can be right about both")
+    return lines
+
+
+def require_own_pictures(looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name) -> None:
+    """Refuse (``UserError``) labelled states, labels (N, G), of which all of a class look like one of the other."""
+    for goal, column in zip(goals, labels.T, strict=True):
+        for kind, other, of_kind in (("positive", "negative", column), ("negative", "positive", ~column)):
+            if np.isin(looks[of_kind], looks[~of_kind]).all():
+                pair = _pair(looks, column, looks[of_kind][0], name)
+                do = "Remove the copies whose label is wrong."
+                raise UserError(f"every {kind} of {goal} is a {other} too", f"for example {pair}", do)
+
+
+def near_duplicates(labelled: States, heldout: States, goals: Sequence[str], names: tuple[Name, Name]) -> list[str]:
+    """A line where held-out pictures nearly equal labelled ones, and one where a sub-goal's classes have such a pair.
+
+    Equal pictures are not meant, nor numbers. ``names``: of labelled and of held-out states.
+    """
+    if labelled.observations.dtype != PICTURE:
+        return []
+    lines = []
+    rows, test_rows = (_spread(len(states.labels)) for states in (labelled, heldout))
+    sketches, tests = _sketches(labelled.observations[rows]), _sketches(heldout.observations[test_rows])
+    nearest = _nearest(tests, sketches)
+    near = np.flatnonzero(nearest >= 0)
+    if len(near):
+        pair = f"{names[1](test_rows[near[0]])} and {names[0](rows[nearest[near[0]]])}"
+        text = f"{len(near)} of {len(test_rows)} held-out pictures nearly equal a labelled one, such as {pair} ({RULE})"
+        lines.append(f"{text}: scores on them say little about new ones")
+    looks = looks_of(labelled.observations[rows])
+    for goal, column in zip(goals, labelled.labels[rows].T, strict=True):
+        equal = np.isin(looks, np.intersect1d(looks[column], looks[~column]))
+        positives, negatives = np.flatnonzero(column & ~equal), np.flatnonzero(~column & ~equal)
+        nearest = _nearest(sketches[positives], sketches[negatives])
+        near = np.flatnonzero(nearest >= 0)
+        if len(near):
+            pair = f"{names[0](rows[positives[near[0]]])} and {names[0](rows[negatives[nearest[near[0]]]])}"
+            text = f"{len(near)} of {len(positives)} positives of {goal} nearly equal a negative, such as {pair}"
+            lines.append(f"{text} ({RULE}): are their labels right?")
+    return lines
+
+
+def _pair(looks: Looks, labels: NDArray[np.bool_], look: Any, name: Name) -> str:
+    """The first positive and the first negative that look like this."""
+    positive, negative = (int(np.flatnonzero((looks == look) & kind)[0]) for kind in (labels, ~labels))
+    return f"{name(positive)} and {name(negative)}"
+
+
+def _spread(count: int) -> NDArray[np.int64]:
+    """Rows, all or ``MOST_COMPARED`` of so many."""
+    return np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(np.int64)
+
+
+def _sketches(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Pictures (N, H, W, C) in few numbers (N, D), none of which differs by over LEVELS where two are nearly equal."""
+    if pictures.shape[3] == 3:  # colours in the proportion in which eyes see them bright; else frames, as they are
+        pictures = (pictures @ np.array([0.299, 0.587, 0.114], np.float32)).round().astype(np.uint8)[..., None]
+    height, width = (min(GRID, side) for side in pictures.shape[1:3])
+    small = np.stack([resized_picture(picture, height, width).ravel() for picture in pictures]).astype(np.float32)
+    brightness = small.mean(1, keepdims=True)
+    return np.concatenate([small - brightness, brightness * (LEVELS / BRIGHTNESS)], axis=1)
+
+
+def _nearest(sketches: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.int64]:
+    """For each of the sketches (N, D) the row of the other (M, D) that is nearest, -1 where none nearly equals it."""
+    from scipy.spatial import KDTree
+
+    if not len(sketches) or not len(others):
+        return np.full(len(sketches), -1)
+    distances, rows = KDTree(others).query(sketches, p=np.inf, distance_upper_bound=LEVELS + 0.5)
+    return np.where(np.isfinite(distances), rows, -1)
