@@ -14,7 +14,7 @@ from hypogoal.core.progress import duration
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings
-from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, member_bytes, play_needs
+from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_process, play_needs
 from hypogoal.settings import configuration
 
 # CPU seconds of the piece of training below on the core that costs are of, idle (2.5 GHz, torch 2.13).
@@ -90,14 +90,15 @@ class Estimates:
             seconds = self._rate("member_step", config.network) * config.steps * count
             seconds += self._rate("localiser") * (config.view == "agent-crop" and config.localiser == "learned")
             cores = min(config.workers or goals, goals)
-            each = member_bytes(config.network, domain.observation_shape, domain.observation_dtype)
-            return Cost(seconds, ensemble_process(taught, count), ensemble_disk(goals, count, each), cores)
+            each = ensemble_process(taught, config, domain.observation_shape, domain.observation_dtype)
+            return Cost(seconds, each.memory, goals * each.disk, cores)
         if cell.stage == "train-baseline":
             chosen = HYPERPARAMETERS[config.agent, config.setting]
             kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
             members = len(source.sub_goals or domain.sub_goals) * source.members if source else 0
-            return Cost(seconds, *baseline_needs(domain.observation_bytes, kept, members))
+            needs = baseline_needs(domain.observation_bytes, kept, members)
+            return Cost(seconds, needs.memory, needs.disk)
         for start in config.start.split(","):
             domain.rooms_of(start)  # which says so where there is no such start
         about: dict[str, Any] = {"sub_goals": domain.sub_goals, "members": 1}
@@ -105,7 +106,7 @@ class Estimates:
             about = {"sub_goals": source.sub_goals or domain.sub_goals, "members": source.members}
         each = about["members"] if as_dict(config).get("steps_for") == "each" and config.termination != "oracle" else 1
         needs = play_needs(domain, about, config)
-        return Cost(each * config.steps * self._rate("step", config.network), *needs)
+        return Cost(each * config.steps * self._rate("step", config.network), needs.memory, needs.disk)
 
 
 def machine_factor() -> float:
