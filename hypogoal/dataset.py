@@ -296,9 +296,10 @@ class Dataset:
         """About ``count`` states from all over ``unlabelled`` or ``labelled/<sub-goal>``; the others are not read."""
         with self._file() as file:
             length = len(self._found(file, f"{part}/observations"))
-            starts = np.linspace(0, max(0, length - BLOCK), -(-count // BLOCK)).astype(np.int64)
-            blocks = [slice(start, start + min(count, BLOCK)) for start in starts]
-            return np.concatenate([self._observations(file, part, rows) for rows in blocks])
+            blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # none has a state of another
+            starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
+            rows = [slice(start, start + min(count, BLOCK)) for start in starts]
+            return np.concatenate([self._observations(file, part, block) for block in rows])
 
     def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
         """Where each unlabelled state comes from: int64 (M,) by name; empty where the file does not say."""

@@ -19,6 +19,7 @@ from hypogoal.core.preflight import Needs, available
 from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
+from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.recording import STOPS_KEPT
 
@@ -35,6 +36,9 @@ PER_TRANSITION = 50  # bytes in a replay, its sum tree included
 CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
 LOGS = 5e6
 DATA = 3  # times the states are in memory: as read, joined, and as the network sees them
+LEARNED = 10  # bytes inside the light networks for each number of a picture that they learn from
+PASSED = 20  # bytes inside a member for each number of a picture that is judged
+EXPLAINED = 8  # states whose attributions are computed at once
 SAMPLE_NUMBERS = 2**22  # of the states that are read for a trial, at most
 LARGE = 160  # pixels of a side, above which smaller pictures are proposed
 
@@ -130,33 +134,57 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
 
     oracle = config.termination == "oracle"
     options = len(about["sub_goals"]) * (1 if oracle else about["members"])
-    picture = domain.observation_bytes
+    picture, shape, dtype = domain.observation_bytes, domain.observation_shape, domain.observation_dtype
     paper = config.network == "paper"
     replays = options if paper else 1
-    own = 0.0 if config.embedding in ("auto", "grid") else MEMBER
+    own = 0.0 if config.embedding in ("auto", "grid") else member_bytes(config.embedding, shape, dtype)
     weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + own
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept
-    members = len(about["sub_goals"]) * about["members"] * (MEMBER + WINDOWS)
+    members = len(about["sub_goals"]) * about["members"] * judging_member(about.get("network", "auto"), shape, dtype)
+    batch = 2 * config.option_batch + (config.meta_batch if isinstance(config, TrainMetaConfig) else 0)
     packed = stops / domain.packed
     # A checkpoint is a copy of the state, in memory while it is written.
-    memory = BASE + 2 * (state + stops) + members
+    memory = BASE + 2 * (state + stops) + members + batch * LEARNED * np.prod(shape)
     return Needs(memory, weights + packed + CHECKPOINTS * (state + packed) + LOGS)
 
 
-def baseline_needs(observation: int, replay: int, members: int = 0) -> Needs:
-    """``train-baseline``: ``replay`` transitions of two observations of so many bytes; ``members`` who earn a bonus."""
-    state = 2.0 * observation * replay
-    return Needs(BASE + 100e6 + 2 * state + members * (MEMBER + WINDOWS), CHECKPOINTS * (state + 50e6) + LOGS)
+def judging_member(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
+    """Bytes of a member that judges states, its weights beside those of others (``hypotheses.stacked``) too."""
+    return 2 * member_bytes(network, shape, dtype) + WINDOWS
 
 
-def evaluation_needs(data: list[Path], workers: int = 1) -> Needs:
-    """``evaluate``: the held-out and unlabelled states of one data file at a time, twice, in each of its processes."""
-    largest = 0
+def baseline_needs(
+    observation: int, played: float, steps: int, chosen: PPOSettings | DQNSettings, members: float = 0.0
+) -> Needs:
+    """``train-baseline`` on observations of so many bytes, of which the engine keeps ``played`` bytes.
+
+    ``members`` is what those need who earn a bonus.
+    """
+    replays = isinstance(chosen, DQNSettings)
+    state = 2.0 * observation * min(chosen.replay if isinstance(chosen, DQNSettings) else chosen.rollout, steps)
+    learned = 2 * LEARNED * observation * chosen.batch * (1 + replays)  # of a replay what came next, too
+    memory = BASE + 100e6 + played + 2 * state + learned + members
+    return Needs(memory, CHECKPOINTS * (replays * state + 50e6) + LOGS)
+
+
+def evaluation_needs(data: Sequence[Path], workers: int = 1) -> Needs:
+    """``evaluate``: the held-out and unlabelled states of one data file at a time, in each of its processes."""
+    largest = 0.0
     for dataset in map(open_dataset, data):
         counts = dataset.counts()
         heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
-        largest = max(largest, (heldout + counts["unlabelled"]) * dataset.observation_bytes)
-    processes = workers + (workers > 1)  # the one that asks holds the states too
-    return Needs(300e6 + processes * (BASE + 2.0 * largest), 2 * LOGS)
+        states = (heldout + counts["unlabelled"]) * dataset.observation_bytes
+        largest = max(largest, judging(states, dataset.observation_shape, dataset.observation_dtype))
+    return Needs((workers + (workers > 1)) * (BASE + largest), 2 * LOGS)  # the one that asks holds the states too
+
+
+def judging(states: float, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
+    """Bytes for so many bytes of states, half as much again to read them, and what members make of some at once."""
+    from hypogoal.hypotheses.deep_lift import AT_ONCE, INSIDE
+    from hypogoal.hypotheses.networks import at_once
+
+    some, explained = at_once(AT_ONCE, shape), at_once(EXPLAINED, (INSIDE, *shape))
+    inside = np.prod(shape) * (some * PASSED + explained * PASSED * INSIDE) if dtype == PICTURE else 0.0
+    return 1.5 * states + float(inside)

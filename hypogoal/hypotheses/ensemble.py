@@ -19,7 +19,16 @@ from hypogoal.dataset import NUMBERS, Observations
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
-from hypogoal.hypotheses.networks import NETWORKS, another, as_input, at_once, build_network, folded, network_for, reordered
+from hypogoal.hypotheses.networks import (
+    NETWORKS,
+    another,
+    as_input,
+    at_once,
+    build_network,
+    folded,
+    network_for,
+    reordered,
+)
 from hypogoal.hypotheses.views import AgentView, FullView
 
 THRESHOLD = 0.5  # of the probability, where none was chosen

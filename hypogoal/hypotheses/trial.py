@@ -53,7 +53,9 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     separate, alone = config.encoder == "separate", config.schedule == "sequential"
     members = 1 if separate else config.members
     objective = config.diversity if config.diversity in OBJECTIVES else "dbat"
-    config = replace(config, diversity=objective, batch_kind="plain")
+    sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]
+    sizes += [config.batch_size] * (sizes[-1] < config.batch_size)
+    config = replace(config, diversity=objective, batch_kind="plain", steps=len(sizes) + 2)
     with torch.random.fork_rng(devices=[]):
         generator = torch_generator(0, "trial")
         ensemble = Ensemble(config.network, shape, members, generator, view, config.encoder, config.hidden_width)
@@ -70,8 +72,6 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
             frozen=ensemble.frozen,
         )
         training = Round(networks, [0] if alone else range(members), batches, config, 0, 0)
-        sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]
-        sizes += [config.batch_size] * (sizes[-1] < config.batch_size)
         _tried(training, sizes[0], ensemble)  # the first step makes ready
         end, rows = time.process_time() + seconds, []
         for size in sizes:
