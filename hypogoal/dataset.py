@@ -39,6 +39,7 @@ AGAIN = "Collect it again."
 GET_MORE = "Collect more steps or other layouts, or bring recorded play (--play FILE) or a policy that gets there."
 FEW = 10  # labelled states of a class, below which one is warned
 RARE = 0.05  # share of a class, below which one is warned
+BLOCK = 8  # states read together of a sample
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
 # What an observation is: a picture, bytes (H, W, C), or numbers of any shape, which networks see standardised.
@@ -298,6 +299,15 @@ class Dataset:
         with self._file() as file:
             return self._observations(file, "unlabelled")
 
+    def sample(self, part: str, count: int) -> Observations:
+        """About ``count`` states from all over ``unlabelled`` or ``labelled/<sub-goal>``; the others are not read."""
+        with self._file() as file:
+            length = len(self._found(file, f"{part}/observations"))
+            blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # none has a state of another
+            starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
+            rows = [slice(start, start + min(count, BLOCK)) for start in starts]
+            return np.concatenate([self._observations(file, part, block) for block in rows])
+
     def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
         """Where each unlabelled state comes from: int64 (M,) by name; empty where the file does not say."""
         with self._file() as file:
@@ -332,13 +342,13 @@ class Dataset:
             raise hdf5.Foreign(f"{base}: labels of shape {labels.shape}, not one for each state")
         return labels.astype(np.bool_)
 
-    def _observations(self, file: Any, base: str) -> Observations:
+    def _observations(self, file: Any, base: str, rows: slice | None = None) -> Observations:
         name = f"{base}/observations"
         found = self._found(file, name)
         dtype = self.observation_dtype
         if found.shape[1:] != self.observation_shape or found.dtype != dtype:
             raise hdf5.Foreign(f"{name!r} is {found.dtype} {found.shape}, not {dtype} (N, {self.observation_shape})")
-        values = hdf5.read_array(file, name, "uf")
+        values = hdf5.read_array(file, name, "uf", rows)
         if dtype == NUMBERS and not np.isfinite(values).all():
             raise hdf5.Foreign(f"{name!r} has numbers that are not finite")
         return values

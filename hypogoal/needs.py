@@ -1,24 +1,33 @@
-"""What each stage will need of memory and disk, in bytes, said before it starts (``core.preflight``).
+"""What each stage will need of memory, disk and time, said before it starts (``core.preflight``).
 
-Estimates on the high side, from what is kept: states, replays, networks with their optimiser. ``BASE`` is what a
-process with torch has before any of it (450 MB were measured while ``train-meta`` ran on DoorKey, light).
+``BASE`` is what a process with torch has before it does anything. The rest is counted from the true shapes; what a step
+of ensemble training takes is measured (``hypotheses.trial``).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from functools import cache
+from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hypogoal.core.errors import UserError
-from hypogoal.dataset import open_dataset
+from hypogoal.core.preflight import Needs, available
+from hypogoal.dataset import PICTURE, open_dataset
 from hypogoal.domains.base import Domain
-from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig
+from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.meta.config import TrainMetaConfig, TrainOptionsConfig
 from hypogoal.options.recording import STOPS_KEPT
 
-BASE = 450e6
-MEMBER = 8e6  # weights of a member network, the largest that come with hypogoal (the paper's for Montezuma)
+if TYPE_CHECKING:
+    from hypogoal.hypotheses.trial import StepCost
+
+BASE = 400e6
+MEMBER = 8e6  # weights of a member whose network is the user's own, where it is not run
 WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 LIGHT_POLICIES = 1e6  # weights of all light policies, which share most of them; 0.4 MB of 15 options, 0.7 with a grid
@@ -26,52 +35,97 @@ COPIES = 5  # of weights in training: those, a target or gradients beside them, 
 PER_TRANSITION = 50  # bytes in a replay, its sum tree included
 CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
 LOGS = 5e6
-
-
-class Needs(NamedTuple):
-    """Bytes of memory, of all processes of a stage together, and of disk."""
-
-    memory: float
-    disk: float
+DATA = 3  # times the states are in memory: as read, joined, and as the network sees them
+LEARNED = 10  # bytes inside the light networks for each number of a picture that they learn from
+PASSED = 20  # bytes inside a member for each number of a picture that is judged
+EXPLAINED = 8  # states whose attributions are computed at once
+SAMPLE_NUMBERS = 2**22  # of the states that are read for a trial, at most
+LARGE = 160  # pixels of a side, above which smaller pictures are proposed
 
 
 def ensemble_needs(
-    data: Path, unlabelled: Sequence[Path], config: EnsembleConfig, sub_goals: int, workers: int
+    data: Path, unlabelled: Sequence[Path], config: TrainEnsembleConfig, steps: int, workers: int, device: str
 ) -> Needs:
-    """``train-ensemble``: each process holds a sub-goal's states three times (read, as seen, prepared)."""
-    dataset = open_dataset(data)
-    labelled = max((row["states"] for row in dataset.counts()["labelled"].values()), default=0)
-    others = sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
-    states = (labelled + others) * dataset.observation_bytes
-    each = member_bytes(config.network, dataset.observation_shape, dataset.observation_dtype)
-    return Needs(workers * ensemble_process(states, config.members), ensemble_disk(sub_goals, config.members, each))
+    """``train-ensemble``: ``steps`` for each sub-goal, each in a process, ``workers`` at once.
 
-
-def ensemble_process(states: float, members: int) -> float:
-    """Memory of a process that trains a sub-goal's ensemble on so many bytes of states."""
-    return BASE + 3 * states + COPIES * members * MEMBER
-
-
-def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
-    """Bytes of a member network for observations of this shape and type.
-
-    ``MEMBER`` for a network of someone's own, which is not run here, or for one that does not take them.
+    What a step takes is measured; on a GPU it is not in memory, and how long it takes is not known.
     """
+    from hypogoal.hypotheses.trial import step_cost
+
+    dataset = open_dataset(data)
+    goals, counts = config.sub_goals or dataset.sub_goals, dataset.counts()
+    shape, dtype = dataset.observation_shape, dataset.observation_dtype
+    count = max(counts["labelled"][goal]["states"] for goal in goals)
+    count += sum(open_dataset(path).counts()["unlabelled"] for path in unlabelled)
+    states, free = DATA * count * dataset.observation_bytes, available() or inf
+    cost = weights_only(config.members * member_bytes(config.network, shape, dtype))
+    if device == "cpu" and count > 1 and workers * (BASE + states + cost.memory) < free:
+        some = min(config.batch_size, max(1, SAMPLE_NUMBERS // np.prod(shape, dtype=int)))
+        parts = [(data, f"labelled/{goals[0]}"), *((path, "unlabelled") for path in unlabelled)]
+        cost = step_cost(np.concatenate([open_dataset(path).sample(part, some) for path, part in parts]), config)
+
+    def memory(batch: int, processes: int = workers, area: float = 1.0) -> float:
+        return processes * (BASE + area * (states + cost.memory + batch * cost.memory_each))
+
+    batches = [config.batch_size // 2**halvings for halvings in range(1, config.batch_size.bit_length() - 1)]
+    ways = {"--set workers=1": memory(config.batch_size, 1)} if workers > 1 else {}
+    ways |= next(({f"--set batch_size={batch}": memory(batch)} for batch in batches if memory(batch) < free), {})
+    if dtype == PICTURE and max(shape[:2]) > LARGE:
+        area = (LARGE / max(shape[:2])) ** 2
+        ways[f"pictures of {LARGE} pixels (hypogoal import --resize {LARGE})"] = memory(config.batch_size, area=area)
+    fitting = [way for way, needed in ways.items() if needed < free]
+    smaller = f"It fits with {' or '.join(fitting)}." if fitting else "Give fewer or smaller states."
+    seconds = len(goals) * steps * (cost.seconds + config.batch_size * cost.seconds_each) / workers
+    return Needs(memory(config.batch_size), ensemble_disk(len(goals), cost.weights), seconds, smaller)
+
+
+def weights_only(weights: float) -> StepCost:
+    """The cost of a step of which only the members' weights, so many bytes, are known."""
+    from hypogoal.hypotheses.trial import LEARNING, StepCost
+
+    return StepCost(weights, (1 + LEARNING) * weights, 0.0, 0.0, 0.0)
+
+
+@cache
+def ensemble_process(states: float, config: EnsembleConfig, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Needs:
+    """A process of ``train-ensemble`` with so many bytes of states that are not there yet: noise is in their place.
+
+    A network of the user's own is not run.
+    """
+    from hypogoal.hypotheses.networks import NETWORKS, network_for
+    from hypogoal.hypotheses.trial import step_cost
+
+    cost = weights_only(config.members * member_bytes(config.network, shape, dtype))
+    if network_for(config.network, dtype) in NETWORKS:
+        noise = np.random.default_rng(0).integers(0, 256, (4, *shape)).astype(dtype)
+        cost = step_cost(noise, config, seconds=0.0)
+    memory = BASE + DATA * states + cost.memory + config.batch_size * cost.memory_each
+    return Needs(memory, ensemble_disk(1, cost.weights))
+
+
+@cache
+def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
+    """Bytes of a member network for observations of this shape and type, from its shapes alone.
+
+    ``MEMBER`` for a network of the user's own, which is not run here, or for one that does not take them.
+    """
+    import torch
+
     from hypogoal.core.seeding import torch_generator
     from hypogoal.hypotheses.networks import NETWORKS, build_network, network_for
 
     name = network_for(network, dtype)
     try:
-        made = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
+        with torch.device("meta"):
+            made = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
     except UserError:
         made = None
-    return 4.0 * sum(weights.numel() for weights in made.parameters()) if made else MEMBER
+    return float(sum(weights.nbytes for weights in made.parameters())) if made else MEMBER
 
 
-def ensemble_disk(sub_goals: int, members: int, each: float) -> float:
-    """What an ensemble of members of ``each`` bytes needs on the disk, its checkpoints included."""
-    training = (COPIES - 1) * members * each  # gradients are not kept
-    return sub_goals * (members * each + training) + LOGS
+def ensemble_disk(sub_goals: int, weights: float) -> float:
+    """What ensembles with so many bytes of ``weights`` need on the disk, their checkpoints included."""
+    return sub_goals * CHECKPOINTS * 3 * weights + LOGS  # those, and two numbers of Adam's for each
 
 
 def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
@@ -80,33 +134,57 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
 
     oracle = config.termination == "oracle"
     options = len(about["sub_goals"]) * (1 if oracle else about["members"])
-    picture = domain.observation_bytes
+    picture, shape, dtype = domain.observation_bytes, domain.observation_shape, domain.observation_dtype
     paper = config.network == "paper"
     replays = options if paper else 1
-    own = 0.0 if config.embedding in ("auto", "grid") else MEMBER
+    own = 0.0 if config.embedding in ("auto", "grid") else member_bytes(config.embedding, shape, dtype)
     weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + own
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept
-    members = len(about["sub_goals"]) * about["members"] * (MEMBER + WINDOWS)
+    members = len(about["sub_goals"]) * about["members"] * judging_member(about.get("network", "auto"), shape, dtype)
+    batch = 2 * config.option_batch + (config.meta_batch if isinstance(config, TrainMetaConfig) else 0)
     packed = stops / domain.packed
     # A checkpoint is a copy of the state, in memory while it is written.
-    memory = BASE + 2 * (state + stops) + members
+    memory = BASE + 2 * (state + stops) + members + batch * LEARNED * np.prod(shape)
     return Needs(memory, weights + packed + CHECKPOINTS * (state + packed) + LOGS)
 
 
-def baseline_needs(observation: int, replay: int, members: int = 0) -> Needs:
-    """``train-baseline``: ``replay`` transitions of two observations of so many bytes; ``members`` who earn a bonus."""
-    state = 2.0 * observation * replay
-    return Needs(BASE + 100e6 + 2 * state + members * (MEMBER + WINDOWS), CHECKPOINTS * (state + 50e6) + LOGS)
+def judging_member(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
+    """Bytes of a member that judges states, its weights beside those of others (``hypotheses.stacked``) too."""
+    return 2 * member_bytes(network, shape, dtype) + WINDOWS
 
 
-def evaluation_needs(data: list[Path], workers: int = 1) -> Needs:
-    """``evaluate``: the held-out and unlabelled states of one data file at a time, twice, in each of its processes."""
-    largest = 0
+def baseline_needs(
+    observation: int, played: float, steps: int, chosen: PPOSettings | DQNSettings, members: float = 0.0
+) -> Needs:
+    """``train-baseline`` on observations of so many bytes, of which the engine keeps ``played`` bytes.
+
+    ``members`` is what those need who earn a bonus.
+    """
+    replays = isinstance(chosen, DQNSettings)
+    state = 2.0 * observation * min(chosen.replay if isinstance(chosen, DQNSettings) else chosen.rollout, steps)
+    learned = 2 * LEARNED * observation * chosen.batch * (1 + replays)  # of a replay what came next, too
+    memory = BASE + 100e6 + played + 2 * state + learned + members
+    return Needs(memory, CHECKPOINTS * (replays * state + 50e6) + LOGS)
+
+
+def evaluation_needs(data: Sequence[Path], workers: int = 1) -> Needs:
+    """``evaluate``: the held-out and unlabelled states of one data file at a time, in each of its processes."""
+    largest = 0.0
     for dataset in map(open_dataset, data):
         counts = dataset.counts()
         heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
-        largest = max(largest, (heldout + counts["unlabelled"]) * dataset.observation_bytes)
-    processes = workers + (workers > 1)  # the one that asks holds the states too
-    return Needs(300e6 + processes * (BASE + 2.0 * largest), 2 * LOGS)
+        states = (heldout + counts["unlabelled"]) * dataset.observation_bytes
+        largest = max(largest, judging(states, dataset.observation_shape, dataset.observation_dtype))
+    return Needs((workers + (workers > 1)) * (BASE + largest), 2 * LOGS)  # the one that asks holds the states too
+
+
+def judging(states: float, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
+    """Bytes for so many bytes of states, half as much again to read them, and what members make of some at once."""
+    from hypogoal.hypotheses.deep_lift import AT_ONCE, INSIDE
+    from hypogoal.hypotheses.networks import at_once
+
+    some, explained = at_once(AT_ONCE, shape), at_once(EXPLAINED, (INSIDE, *shape))
+    inside = np.prod(shape) * (some * PASSED + explained * PASSED * INSIDE) if dtype == PICTURE else 0.0
+    return 1.5 * states + float(inside)

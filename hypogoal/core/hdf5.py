@@ -190,14 +190,15 @@ def size_of(file: Any, name: str, kinds: str) -> int:
     return check_dataset(dataset, kinds)
 
 
-def read_array(file: Any, name: str, kinds: str) -> NDArray[Any]:
-    """A dataset's values after :func:`check_dataset`; ``Foreign`` where it is damaged or larger than free memory."""
+def read_array(file: Any, name: str, kinds: str, rows: slice | None = None) -> NDArray[Any]:
+    """A dataset's values, or ``rows`` of them, after :func:`check_dataset`; ``Foreign`` where it is damaged, or is
+    read whole and larger than free memory."""
     size = size_of(file, name, kinds)
     free = free_memory()
-    if free is not None and size > free:
+    if rows is None and free is not None and size > free:
         raise Foreign(f"{name!r} needs {human(size)} of memory, {human(free)} are free")
     try:
-        return np.asarray(file[name][()])
+        return np.asarray(file[name][() if rows is None else rows])
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError):
         raise Foreign(f"{name!r} is damaged") from None
 

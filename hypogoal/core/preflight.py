@@ -2,36 +2,51 @@
 
 import shutil
 from pathlib import Path
+from typing import NamedTuple
 
 from hypogoal.core.drafts import unfinished
 from hypogoal.core.errors import UserError
+from hypogoal.core.progress import duration
 from hypogoal.core.terminal import say
 
 CGROUP = Path("/sys/fs/cgroup")
 
 
-def preflight(stage: str, out: Path, needs: tuple[float, float], *, resume: bool = False, quiet: bool = False) -> None:
+class Needs(NamedTuple):
+    """What a stage will need: bytes of memory, of all its processes together, and of disk, what it removes included."""
+
+    memory: float
+    disk: float
+    seconds: float = 0.0  # 0: not known
+    smaller: str = "See 'hypogoal config'."  # what to do where the memory is not there
+
+
+def preflight(stage: str, out: Path, needs: Needs, *, resume: bool = False, quiet: bool = False) -> None:
     """Say, unless ``quiet``, what a stage will need, and refuse (``UserError``) to start where that does not fit.
 
-    ``needs``: bytes of memory, of all its processes, and of disk, what it removes at the end included. With ``resume``
-    nothing is needed for what is complete. Nothing of ``out`` need be there yet.
+    With ``resume`` nothing is needed for what is complete. Nothing of ``out`` need be there yet.
     """
     if resume and out.exists() and not unfinished(out):
         return
-    memory, disk = needs
-    free, known = free_memory(), "unknown"
+    memory, disk, seconds, smaller = needs
+    free, known = available(), "unknown"
     space = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
     if free is not None:
-        free += own_memory()  # which is part of what is needed: nobody needs it twice
         known = human(free)
         if memory > free:
             what = f"not enough memory: about {human(memory)} needed, {known} free"
-            raise UserError(what, stage, "See 'hypogoal config'.")
+            raise UserError(what, stage, smaller)
     if disk > space:
         raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
     if not quiet:
-        needed = f"needs about {human(memory)} of memory ({known} free) and {human(disk)} of disk"
-        say(f"{stage}: {needed} ({human(space)} free)", err=True)
+        needed = f"needs about {human(memory)} of memory ({known} free), {human(disk)} of disk ({human(space)} free)"
+        say(f"{stage}: {needed}{f', {duration(seconds)}' if seconds else ''}", err=True)
+
+
+def available() -> int | None:
+    """Bytes that a stage can have: what is free, and what this process has, which is part of what the stage needs."""
+    free = free_memory()
+    return None if free is None else free + own_memory()
 
 
 def free_memory() -> int | None:

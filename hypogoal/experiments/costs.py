@@ -13,8 +13,8 @@ from hypogoal.core.preflight import human
 from hypogoal.core.progress import duration
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import SHORT, Cell, Cost
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, DQNSettings
-from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_disk, ensemble_process, member_bytes, play_needs
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from hypogoal.needs import BASE, LOGS, baseline_needs, ensemble_process, judging, judging_member, play_needs
 from hypogoal.settings import configuration
 
 # CPU seconds of the piece of training below on the core that costs are of, idle (2.5 GHz, torch 2.13).
@@ -54,9 +54,10 @@ class Estimates:
         """What their evaluation costs."""
         members = [self.settings(cell).members for cell in cells if cell.stage == "train-ensemble"]
         collected = (self.domain.collected_bytes(self.settings(cell)) for cell in cells if cell.stage == "collect")
+        states = judging(max(collected, default=0), self.domain.observation_shape, self.domain.observation_dtype)
         seconds = self._rate("evaluated_ensemble") * len(members) + self._rate("evaluated_member") * sum(members)
         cores = min(int(self._rate("evaluate_cores")) or 1, max(1, len(members)))
-        return Cost(seconds, BASE + 300e6 + 2 * max(collected, default=0), 2 * LOGS, cores)
+        return Cost(seconds, BASE + states, 2 * LOGS, cores)
 
     def settings(self, cell: Cell) -> Any:
         """The configuration that its command brings about."""
@@ -90,22 +91,27 @@ class Estimates:
             seconds = self._rate("member_step", config.network) * config.steps * count
             seconds += self._rate("localiser") * (config.view == "agent-crop" and config.localiser == "learned")
             cores = min(config.workers or goals, goals)
-            each = member_bytes(config.network, domain.observation_shape, domain.observation_dtype)
-            return Cost(seconds, ensemble_process(taught, count), ensemble_disk(goals, count, each), cores)
+            needs = ensemble_process(taught, config, domain.observation_shape, domain.observation_dtype)
+            return Cost(seconds, needs.memory, goals * needs.disk, cores)
         if cell.stage == "train-baseline":
             chosen = HYPERPARAMETERS[config.agent, config.setting]
-            kept = chosen.replay if isinstance(chosen, DQNSettings) else 0
             seconds = config.steps * self._rate("baseline_step", f"{config.agent}-{config.setting}")
-            members = len(source.sub_goals or domain.sub_goals) * source.members if source else 0
-            return Cost(seconds, *baseline_needs(domain.observation_bytes, kept, members))
+            shape, members = domain.observation_shape, 0.0
+            if source is not None:
+                each = judging_member(source.network, shape, domain.observation_dtype)
+                members = len(source.sub_goals or domain.sub_goals) * source.members * each
+            played = domain.played_bytes(config.steps, 0)
+            needs = baseline_needs(domain.observation_bytes, played, config.steps, chosen, members)
+            return Cost(seconds, needs.memory, needs.disk)
         for start in config.start.split(","):
             domain.rooms_of(start)  # which says so where there is no such start
         about: dict[str, Any] = {"sub_goals": domain.sub_goals, "members": 1}
         if source is not None:
             about = {"sub_goals": source.sub_goals or domain.sub_goals, "members": source.members}
+            about["network"] = source.network
         each = about["members"] if as_dict(config).get("steps_for") == "each" and config.termination != "oracle" else 1
         needs = play_needs(domain, about, config)
-        return Cost(each * config.steps * self._rate("step", config.network), *needs)
+        return Cost(each * config.steps * self._rate("step", config.network), needs.memory, needs.disk)
 
 
 def machine_factor() -> float:

@@ -19,7 +19,7 @@ from hypogoal.dataset import Observations, require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.networks import as_input
+from hypogoal.hypotheses.networks import as_input, at_once
 
 CHUNK = 256  # states at once where no gradient is kept
 LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
@@ -83,7 +83,8 @@ class TrainingStates:
         self._trunk, self._features = trunk, None
         self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # that all networks learn
         if trunk is not None and frozen and not (grey or jitter):
-            chunks = [np.arange(at, min(at + CHUNK, len(images))) for at in range(0, len(images), CHUNK)]
+            size = at_once(CHUNK, images.shape[1:])
+            chunks = [np.arange(at, min(at + size, len(images))) for at in range(0, len(images), size)]
             with torch.no_grad():
                 self._features = torch.cat([_forward(trunk, self._seen([chunk]), [len(chunk)]) for chunk in chunks])
             self._tables = self._images = None
@@ -173,7 +174,8 @@ class TrainingStates:
         for network in networks:
             network.eval()
         with torch.no_grad():
-            chunks = [self.forward(networks, every[at : at + CHUNK]).logits for at in range(0, len(every), CHUNK)]
+            size = at_once(CHUNK, self._labelled.shape[1:])
+            chunks = [self.forward(networks, every[at : at + size]).logits for at in range(0, len(every), size)]
         return torch.stack([torch.cat([chunk[member][0] for chunk in chunks]) for member in range(len(networks))])
 
     def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:

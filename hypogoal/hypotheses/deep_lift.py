@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.dataset import PICTURE, Observations
-from hypogoal.hypotheses.networks import as_input
+from hypogoal.hypotheses.networks import as_input, at_once
 
 DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
 STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together
+INSIDE = 64  # times as much as a plain pass DeepLift takes: both states, in double, and copies of what is pooled
 RULED = (nn.Conv2d, nn.Linear, nn.BatchNorm2d, nn.ReLU, nn.AvgPool2d, nn.AdaptiveAvgPool2d, nn.Flatten, nn.Dropout)
 
 if TYPE_CHECKING:
@@ -100,7 +101,8 @@ def attributed(ensemble: Ensemble, observations: Observations, baseline: Observa
     found = []
     for member in ensemble.members:
         network = nn.Sequential(member, _LogOdds(), nn.Flatten(0))
-        values = IntegratedGradients(network).attribute(inputs, reference, n_steps=STEPS, internal_batch_size=AT_ONCE)
+        size = at_once(AT_ONCE, inputs.shape[1:])
+        values = IntegratedGradients(network).attribute(inputs, reference, n_steps=STEPS, internal_batch_size=size)
         with torch.no_grad():
             found.append((_as_seen(values), network(inputs), network(reference)))
     values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*found, strict=True))
@@ -128,7 +130,9 @@ def _of_member(
         from captum.attr import DeepLift
 
         warnings.filterwarnings("ignore", message=r"\s*Setting forward, backward hooks", category=UserWarning)
-        values = DeepLift(network).attribute(inputs, reference, target=0)
+        size = at_once(AT_ONCE, (INSIDE, *inputs.shape[1:]))
+        parts = [part.detach().requires_grad_() for part in inputs.split(size)]
+        values = torch.cat([DeepLift(network).attribute(part, reference, target=0) for part in parts])
     with torch.no_grad():
         log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
     return _as_seen(values.detach()).numpy(), log_odds.numpy(), baseline.numpy()

@@ -19,7 +19,16 @@ from hypogoal.dataset import NUMBERS, Observations
 from hypogoal.domains.base import load_domain
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
-from hypogoal.hypotheses.networks import NETWORKS, another, as_input, build_network, folded, network_for, reordered
+from hypogoal.hypotheses.networks import (
+    NETWORKS,
+    another,
+    as_input,
+    at_once,
+    build_network,
+    folded,
+    network_for,
+    reordered,
+)
 from hypogoal.hypotheses.views import AgentView, FullView
 
 THRESHOLD = 0.5  # of the probability, where none was chosen
@@ -216,7 +225,7 @@ class Ensemble(nn.Module):
                 return _logits(trunk, heads, batch)
         if len(observations) >= FOLD_FROM:
             trunk, heads = trunk and folded(trunk), tuple(folded(head) for head in heads)
-        chunk = CHUNK if device.type == "cpu" else len(observations)
+        chunk = at_once(CHUNK, observations.shape[1:]) if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
             inputs = as_input(torch.from_numpy(observations[start : start + chunk]).to(device))

@@ -17,6 +17,7 @@ import inspect
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from itertools import pairwise
+from math import prod
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -32,6 +33,7 @@ from hypogoal.dataset import NUMBERS, PICTURE
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
+MOST_NUMBERS = 2**24  # of the states that a network is given at once where no gradient is kept: some 400 MB inside
 MOST_PIXELS = 1024  # of a side, up to which it is looked for how large an image must be
 ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
 
@@ -251,3 +253,8 @@ def as_input(observations: Tensor) -> Tensor:
     """
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
+
+
+def at_once(most: int, shape: tuple[int, ...]) -> int:
+    """How many states of this shape a network is given at once: ``most``, or fewer of large ones."""
+    return max(1, min(most, MOST_NUMBERS // prod(shape)))

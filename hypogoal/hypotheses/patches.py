@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 WORTHWHILE = 0.5  # share of the plain network's work in convolutions, above which gathering patches eats up the gain
-SAMPLE = 64  # images from which that is judged
+SAMPLE = 64  # images from which that is judged,
+SAMPLE_PIXELS = 2**19  # or as many as have so many pixels: each takes some 250 bytes
 LOOKUP_PER_VALUE = 4  # size of a table that ranks values; where it would be larger, sorting them is faster
 
 
@@ -87,7 +89,8 @@ def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | 
     windows = windows_of(network)
     if windows is None or len(observations) == 0 or observations.dtype != np.uint8:
         return None
-    spread = np.linspace(0, len(observations) - 1, min(SAMPLE, len(observations))).astype(np.int64)
+    judged = max(1, min(SAMPLE, len(observations), SAMPLE_PIXELS // prod(observations.shape[1:3])))
+    spread = np.linspace(0, len(observations) - 1, judged).astype(np.int64)
     sample = _tables(observations[spread], windows)
     spatial = [layer for layer in network if isinstance(layer, (nn.Conv2d, nn.MaxPool2d))]
     work = [  # of each at one place: multiplications, or comparisons

@@ -15,7 +15,7 @@ from torch.nn import functional
 from hypogoal.core.compute import tensor
 from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import as_input, folded
+from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.views import FullView
 from hypogoal.hypotheses.windows import KnownWindows, split_of
 
@@ -61,8 +61,9 @@ class StackedMembers:
         seen = self._see(observations, positions)
         rows = [np.empty((0, self.count), dtype=np.float32)]
         with torch.inference_mode():
-            for start in range(0, len(seen), CHUNK):
-                logits = self._logits(seen[start : start + CHUNK])
+            chunk = at_once(CHUNK, seen.shape[1:])
+            for start in range(0, len(seen), chunk):
+                logits = self._logits(seen[start : start + chunk])
                 rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
         return np.concatenate(rows)
 

@@ -119,7 +119,7 @@ def fit(
     )
     rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
 
-    def state(number: int, part: _Round | None) -> State:
+    def state(number: int, part: Round | None) -> State:
         told = {"told": report.snapshot()} if isinstance(report, Resumable) else {}
         return {"round": number, "part": part.snapshot() if part else {}, "ensemble": ensemble.state_dict(), **told}
 
@@ -127,7 +127,7 @@ def fit(
     drawing = [states.device] if states.device.type == "cuda" else []
     with checkpoints, torch.random.fork_rng(devices=drawing):  # Dropout and the like draw there
         for number, members in enumerate(rounds[first:], start=first):
-            part = _Round(networks, members, states, config, seed_for(seed, "batches", number), number * config.steps)
+            part = Round(networks, members, states, config, seed_for(seed, "batches", number), number * config.steps)
             if saved and number == first:
                 part.restore(saved["part"])
             for step in part.steps(on_step):
@@ -148,7 +148,7 @@ def _diverse(config: EnsembleConfig) -> bool:
     return config.diversity_weight > 0 and load_objective(config.diversity).acts(config.members)
 
 
-class _Round(Resumable):
+class Round(Resumable):
     """The training of ``members`` against each other and against those before them, which are frozen.
 
     It stops at the first loss or weight that is NaN or Inf, looking every ``REPORT_EVERY`` steps.

@@ -10,7 +10,7 @@ from hypogoal.core.artefacts import DATA, claim, sha256_of, versions
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.config import as_dict
 from hypogoal.core.drafts import check_complete, draft, put_in_place, unfinished
-from hypogoal.core.preflight import preflight
+from hypogoal.core.preflight import Needs, preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import say
 from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_dataset, require_names, write_dataset
@@ -47,7 +47,7 @@ def collect(
     if domain.doubt:
         say(f"hypogoal: {domain.doubt}", err=True)
     size = domain.collected_bytes(config)
-    preflight("collect", out, (COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
+    preflight("collect", out, Needs(COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
     with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
         kept = {"kept": partial(checkpoints_of, work.files)} if domain.resumes else {}
         with Progress(f"collect {about['domain']}", total=1, quiet=quiet) as progress:

@@ -15,9 +15,9 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig, DQNSettings
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.meta.training import cut, judged, played_world, write_layout
-from hypogoal.needs import baseline_needs
+from hypogoal.needs import baseline_needs, judging_member
 
 
 def train_baseline(
@@ -78,8 +78,11 @@ def train_baseline(
         bonus = Bonus(members.of, members.options, engine.count, config.bonus, members)
     env = EngineEnv(engine, bonus)
     size = env.observation_space.sample().nbytes
-    replay = chosen.replay if isinstance(chosen, DQNSettings) else 0
-    needs = baseline_needs(size, replay, bonus.members if bonus else 0)
+    judges = 0.0
+    if taught and bonus:
+        shape, network = engine.observation_shape, taught.config["network"]
+        judges = bonus.members * judging_member(network, shape, engine.observation_dtype)
+    needs = baseline_needs(size, played.played_bytes(config.steps, 0), config.steps, chosen, judges)
     preflight("train-baseline", out, needs, resume=resume, quiet=quiet)
     about = as_dict(config) | {"domain": domain, "domain_config": world}
     about |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}

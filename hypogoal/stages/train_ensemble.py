@@ -72,7 +72,7 @@ def train_ensemble(
     about |= {"observation_dtype": str(dataset.observation_dtype)}
     about |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
-    needs = ensemble_needs(data, others or (data,), config, len(sub_goals), workers)
+    needs = ensemble_needs(data, others or (data,), config, steps_of(config), workers, device)
     preflight("train-ensemble", out, needs, resume=resume, quiet=quiet)
     with create_artefact(
         out, kind="ensemble", config=about, seed=seed, inputs=[data, *others], force=force, resume=resume

@@ -1,0 +1,109 @@
+"""What a training step takes, measured: the real network gets a few of the real states, in small batches."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.graph import saved_tensors_hooks
+
+from hypogoal.core.seeding import torch_generator
+from hypogoal.dataset import NUMBERS, Observations, standard_of
+from hypogoal.diversity import OBJECTIVES
+from hypogoal.hypotheses.batches import TrainingStates
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.training import Round
+from hypogoal.hypotheses.views import FullView, windows
+
+SECONDS = 0.3  # after which no larger batch is tried
+LEARNING = 3  # numbers beside each weight that learns: its gradient and two of Adam's
+BACKWARD = 0.5  # of what a member keeps for its gradients: as much again is made on the way back
+
+
+class StepCost(NamedTuple):
+    """Bytes and seconds of a training step: a part that is always there, and one for each state of a batch."""
+
+    weights: float  # bytes of all members' weights
+    memory: float
+    memory_each: float
+    seconds: float
+    seconds_each: float
+
+
+def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SECONDS) -> StepCost:
+    """What a step on a CPU takes with states like these (N, *shape), N > 1, and as many unlabelled ones in a batch.
+
+    Batches grow from two states until ``seconds`` are over; a line through the last two is the answer. Of members that
+    share nothing one is tried, since all take the same. An objective of the user's own is not called: D-BAT is in its
+    place. States that the network does not take are a ``UserError``.
+    """
+    pictures = states.dtype != NUMBERS
+    cut, margin = pictures and config.view == "agent-crop", config.jitter
+    if cut:  # in the middle, wherever the agent is
+        size = config.crop_height + 2 * margin, config.crop_width + 2 * margin
+        states = windows(states, np.tile(np.divide(states.shape[1:3], 2), (len(states), 1)), *size)
+    shape = (config.crop_height, config.crop_width, *states.shape[3:]) if cut else states.shape[1:]
+    view = FullView(shape, None if pictures else standard_of(shape, states))
+    states = states if pictures else view.see(states)
+    separate, alone = config.encoder == "separate", config.schedule == "sequential"
+    members = 1 if separate else config.members
+    objective = config.diversity if config.diversity in OBJECTIVES else "dbat"
+    sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]
+    sizes += [config.batch_size] * (sizes[-1] < config.batch_size)
+    config = replace(config, diversity=objective, batch_kind="plain", steps=len(sizes) + 2)
+    with torch.random.fork_rng(devices=[]):
+        generator = torch_generator(0, "trial")
+        ensemble = Ensemble(config.network, shape, members, generator, view, config.encoder, config.hidden_width)
+        trunk, networks = ensemble.parts
+        batches = TrainingStates(
+            states,
+            np.arange(len(states)) % 2 == 0,
+            states,
+            networks[0],
+            torch.device("cpu"),
+            grey=pictures and config.augment != "none",
+            jitter=margin if cut else 0,
+            trunk=trunk,
+            frozen=ensemble.frozen,
+        )
+        training = Round(networks, [0] if alone else range(members), batches, config, 0, 0)
+        _tried(training, sizes[0], ensemble)  # the first step makes ready
+        end, rows = time.process_time() + seconds, []
+        for size in sizes:
+            rows.append((size, *_tried(training, size, ensemble)))
+            if len(rows) > 1 and time.process_time() > end:
+                break
+    (fewer, less, sooner), (more, most, later) = rows[-2:][0], rows[-1]
+    kept_each, seconds_each = (max(0.0, rise) / max(1, more - fewer) for rise in (most - less, later - sooner))
+    weights = sum(weight.nbytes for weight in ensemble.parameters())
+    learning = LEARNING * sum(weight.nbytes for weight in training.optimiser.param_groups[0]["params"])
+    times = config.members / members  # as many as were tried
+    at_once = 1.0 if alone else times
+    return StepCost(
+        weights=times * weights,
+        memory=times * weights + at_once * learning + (at_once + BACKWARD) * (most - more * kept_each),
+        memory_each=(at_once + BACKWARD) * kept_each,
+        seconds=at_once * max(0.0, later - more * seconds_each),
+        seconds_each=at_once * seconds_each,
+    )
+
+
+def _tried(training: Round, batch: int, ensemble: Ensemble) -> tuple[float, float]:
+    """Bytes that a step with such a batch keeps for its gradients, weights aside, and its seconds."""
+    kept = {weight.untyped_storage().data_ptr(): 0 for weight in ensemble.parameters()}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        kept.setdefault(storage.data_ptr(), storage.nbytes())
+        return tensor
+
+    training.config = replace(training.config, batch_size=batch)
+    begun = time.process_time()
+    with saved_tensors_hooks(keep, lambda tensor: tensor):
+        next(training.steps(None))
+    return float(sum(kept.values())), time.process_time() - begun
