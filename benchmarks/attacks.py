@@ -32,8 +32,9 @@ from typing import Any
 from benchmarks import hostile
 from benchmarks.hostile import TRAINED
 from benchmarks.kills import PACES, STAGES, Stage, differences, needed, unbroken
+from benchmarks.mutations import state_changed
 from benchmarks.sweeps import TOY
-from hypogoal.core.checkpoints import FOLDER, PACE
+from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
 from hypogoal.core.drafts import draft_folder
 
 SECONDS, WAIT = 60.0, 300.0  # of a core that a command may take; of the clock, on whatever machine
@@ -301,6 +302,54 @@ def disk(box: Box, rng: Rng, case: int) -> bool:
     return accepted
 
 
+STATEFUL = ("rooms", "ensemble", "sequential", "climbers", "options", "meta", "descent", "audit", "ppo", "dqn")
+GROWING = ("/numbers", "/told/numbers", "/agent/logged")  # dicts of numbers to log, which have no fixed names
+LONGER = ("rows", "items", "drop item", "number")  # what only a value may tell: a list may have any length
+
+
+def begun(box: Box, stage: Stage) -> Path:
+    """The draft of a stage that was stopped behind its first checkpoints."""
+    kept = box.whole / f"begun-{stage.name}"
+    _whole, seconds = box.undisturbed(stage)
+    while not kept.exists():
+        words, out = box.command(stage, box.fresh())
+        command, moment = Command(*words, environment={PACE: "0"}), time.monotonic() + seconds
+        while command.running() and not (command_has(out) and time.monotonic() > moment):
+            time.sleep(0.001)
+        command.send(signal.SIGTERM)
+        command.wait()
+        if command_has(out):
+            draft_folder(out).rename(kept)
+        seconds *= 0.8
+    return kept
+
+
+def command_has(out: Path) -> bool:
+    """Whether a checkpoint is kept."""
+    return any(draft_folder(out).glob(f"{FOLDER}/*.safetensors"))
+
+
+def checkpoints(box: Box, rng: Rng, case: int) -> bool:
+    """A checkpoint with a right checksum in which one thing is not what the stage keeps; then a resume."""
+    stage = STAGES[STATEFUL[case % len(STATEFUL)]]
+    kept = begun(box, stage)
+    words, out = box.command(stage, box.fresh())
+    shutil.copytree(kept, draft_folder(out))
+    path = rng.choice(sorted(draft_folder(out).glob(f"{FOLDER}/*.safetensors")))
+    state = Checkpoints(path).load() or {}
+    how, where = state_changed(state, rng)
+    Checkpoints(path).save(state)
+    try:
+        accepted = run(*words, "--resume").accepted()
+    except Bad as bad:
+        raise Bad(f"{stage.name}, {how} at {where}: {bad}") from None
+    if accepted and how not in LONGER and not where.startswith(GROWING):
+        raise Bad(f"{stage.name}, {how} at {where}: accepted")
+    if not accepted and not command_has(out):
+        raise Bad(f"{stage.name}, {how} at {where}: refused, and the checkpoint is gone")
+    return accepted
+
+
 ATTACKS = {
     "TERM": (signal.SIGTERM,),
     "INT INT": (signal.SIGINT, 0.0, signal.SIGINT),
@@ -471,6 +520,7 @@ def files(make: Callable[[Box, Rng, int], hostile.Made]) -> Callable[[Box, Rng, 
 
 FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
     "disk": disk,
+    "checkpoints": checkpoints,
     "signals": signals,
     "clock": clock,
     "boards": files(hostile.boards),
