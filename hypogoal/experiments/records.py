@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from hypogoal.core.config import parse_assignments, preset_digest
-from hypogoal.core.drafts import PATIENCE_SECONDS, try_lock
+from hypogoal.core.drafts import PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
+from hypogoal.core.locks import try_lock
 from hypogoal.experiments.cells import DERIVED, SHORT, Cell, Cost, Plan, moved
 from hypogoal.settings import STAGES
 
