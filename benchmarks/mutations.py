@@ -154,10 +154,13 @@ def state_changed(state: dict[str, Any], rng: Rng) -> tuple[str, str]:
     where = rng.choice(sorted(places))
     owner, key = rng.choice(places[where])
     value = owner[key]
-    ways: dict[str, Callable[[], Any]] = {"text": lambda: "odd", "none": lambda: None, "dict": lambda: {"odd": 1}}
+    ways: dict[str, Callable[[], Any]] = {"text": lambda: "odd", "dict": lambda: {"odd": 1}}
     if hasattr(value, "dtype"):
         values = np.asarray(value)
-        ways |= {"axis": lambda: values[None], "dtype": lambda: values.astype("i2" if values.dtype != "i2" else "i4")}
+        ways |= {
+            "axis": lambda: values[None],
+            "dtype": lambda: np.zeros(values.shape, "i2" if values.dtype != "i2" else "i4"),
+        }
         if values.ndim:
             ways |= {"rows": lambda: values[:-1] if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)}
         if values.ndim > 1:
@@ -166,6 +169,8 @@ def state_changed(state: dict[str, Any], rng: Rng) -> tuple[str, str]:
         ways |= {"items": lambda: value[:-1] if value else [0], "number": lambda: 3}
     elif isinstance(value, int | float):
         ways |= {"list": lambda: [value], "number": lambda: rng.choice((-1, 2**62, 10**30))}
+    if value is not None:
+        ways |= {"none": lambda: None}
     how = rng.choice(["drop", "add", *ways])
     if how == "drop":
         del owner[key]

@@ -246,7 +246,8 @@ def growing(values: Any, item: Any = None) -> Any:
 def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
     """Refuse (``Unlike``) a state with other keys, types, dtypes or shapes than that of what is to go on, ``fresh``.
 
-    Only what is marked as :func:`growing` may have another length; a number may stand where None does.
+    Only what is marked as :func:`growing` may have another length; a number may stand where None does. Texts, such as
+    the kind of a generator, never change.
     """
     fresh = fresh.item() if isinstance(fresh, np.generic) else fresh
     where = place or "/"
@@ -275,7 +276,7 @@ def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
         if str(getattr(saved, "dtype", "")) != kind or found[grows:] != shape[grows:]:
             raise Unlike(f"not {kind} {shape} at {where}")
     elif not (
-        type(saved) is type(fresh)
+        (saved == fresh if isinstance(fresh, str) else type(saved) is type(fresh))
         or (type(saved) is int and isinstance(fresh, float))
         or (type(saved) in (int, float) and fresh is None)
     ):
