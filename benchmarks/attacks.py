@@ -5,12 +5,14 @@ A case is bad when a command ends in a traceback, in more than one line, or not 
 output or takes more memory than a small file is worth; when an output is there and not whole, has other bytes after
 ``--resume`` than an undisturbed one, or when a process outlives its stage. ``--case 7`` runs one case again.
 
-``disk`` mounts a tmpfs, so it needs root on Linux; ``clock`` needs a C compiler. Without them these are left out.
+``disk`` mounts a tmpfs, so it needs root on Linux; ``clock`` and ``writes`` need a C compiler. Without them these are
+left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import random
@@ -32,8 +34,9 @@ from typing import Any
 from benchmarks import hostile
 from benchmarks.hostile import TRAINED
 from benchmarks.kills import PACES, STAGES, Stage, differences, needed, unbroken
+from benchmarks.mutations import state_changed
 from benchmarks.sweeps import TOY
-from hypogoal.core.checkpoints import FOLDER, PACE
+from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
 from hypogoal.core.drafts import draft_folder
 from hypogoal.core.workers import PYTHON
 
@@ -42,6 +45,7 @@ MEMORY, SMALL = 2**30, 16 * 2**20  # bytes that a file below SMALL may cost
 PATIENCE = 10.0  # seconds for processes to die with their stage
 EVALUATION = Stage("evaluation", ("evaluate", "{run}"))
 REPORT = Stage("report", ("report", "{out}"))
+COMPILER = shutil.which("cc")
 Rng = random.Random
 
 
@@ -308,6 +312,54 @@ def disk(box: Box, rng: Rng, case: int) -> bool:
     return accepted
 
 
+STATEFUL = ("rooms", "ensemble", "sequential", "climbers", "options", "meta", "descent", "audit", "ppo", "dqn")
+GROWING = ("/numbers", "/told/numbers", "/agent/logged")  # dicts of numbers to log, which have no fixed names
+LONGER = ("rows", "items", "drop item", "number")  # what only a value may tell: a list may have any length
+
+
+def begun(box: Box, stage: Stage) -> Path:
+    """The draft of a stage that was stopped behind its first checkpoints."""
+    kept = box.whole / f"begun-{stage.name}"
+    _whole, seconds = box.undisturbed(stage)
+    while not kept.exists():
+        words, out = box.command(stage, box.fresh())
+        command, moment = Command(*words, environment={PACE: "0"}), time.monotonic() + seconds
+        while command.running() and not (command_has(out) and time.monotonic() > moment):
+            time.sleep(0.001)
+        command.send(signal.SIGTERM)
+        command.wait()
+        if command_has(out):
+            draft_folder(out).rename(kept)
+        seconds *= 0.8
+    return kept
+
+
+def command_has(out: Path) -> bool:
+    """Whether a checkpoint is kept."""
+    return any(draft_folder(out).glob(f"{FOLDER}/*.safetensors"))
+
+
+def checkpoints(box: Box, rng: Rng, case: int) -> bool:
+    """A checkpoint with a right checksum in which one thing is not what the stage keeps; then a resume."""
+    stage = STAGES[STATEFUL[case % len(STATEFUL)]]
+    kept = begun(box, stage)
+    words, out = box.command(stage, box.fresh())
+    shutil.copytree(kept, draft_folder(out))
+    path = rng.choice(sorted(draft_folder(out).glob(f"{FOLDER}/*.safetensors")))
+    state = Checkpoints(path).load() or {}
+    how, where = state_changed(state, rng)
+    Checkpoints(path).save(state)
+    try:
+        accepted = run(*words, "--resume").accepted()
+    except Bad as bad:
+        raise Bad(f"{stage.name}, {how} at {where}: {bad}") from None
+    if accepted and how not in LONGER and not where.startswith(GROWING):
+        raise Bad(f"{stage.name}, {how} at {where}: accepted")
+    if not accepted and not command_has(out):
+        raise Bad(f"{stage.name}, {how} at {where}: refused, and the checkpoint is gone")
+    return accepted
+
+
 ATTACKS = {
     "TERM": (signal.SIGTERM,),
     "INT INT": (signal.SIGINT, 0.0, signal.SIGINT),
@@ -382,15 +434,62 @@ time_t time(time_t *now) {
 """  # what setting the clock changes: the time of day, not the monotonic one; libfaketime breaks time.sleep
 DAY = 86_400
 
+FULL = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <limits.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+static long count = 0;
+static int full(const char *path) {
+    const char *under = getenv("FULL_UNDER"), *log = getenv("FULL_LOG"), *once = getenv("FULL_ONCE");
+    if (!under || !path || strncmp(path, under, strlen(under))) return 0;
+    long at = atol(getenv("FULL_AT")), now = __sync_add_and_fetch(&count, 1);
+    int file = syscall(SYS_openat, AT_FDCWD, log, O_WRONLY | O_APPEND, 0);
+    syscall(SYS_write, file, ".", 1);
+    syscall(SYS_close, file);
+    if (once ? now != at : now < at) return 0;
+    errno = ENOSPC;
+    return 1;
+}
+static int full_at(int file) {
+    char link[64], path[PATH_MAX];
+    snprintf(link, sizeof link, "/proc/self/fd/%d", file);
+    ssize_t length = readlink(link, path, sizeof path - 1);
+    return length > 0 && (path[length] = 0, full(path));
+}
+#define NEXT(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
+ssize_t write(int file, const void *data, size_t size) { return full_at(file) ? -1 : NEXT(write)(file, data, size); }
+int mkdir(const char *path, mode_t mode) { return full(path) ? -1 : NEXT(mkdir)(path, mode); }
+int rename(const char *one, const char *other) { return full(other) ? -1 : NEXT(rename)(one, other); }
+int fsync(int file) { return full_at(file) ? -1 : NEXT(fsync)(file); }
+#define OPEN(name) int name(const char *path, int flags, ...) { \
+    va_list more; va_start(more, flags); mode_t mode = va_arg(more, int); va_end(more); \
+    return (flags & O_CREAT) && full(path) ? -1 : NEXT(name)(path, flags, mode); }
+OPEN(open) OPEN(open64)
+"""  # a disk that is full from some write on, or refuses just one of them, below a folder
+
+
+def preloaded(source: str, library: Path) -> Path:
+    """A C source as a library to load in front of others."""
+    if not library.exists():
+        compiler = ["cc", "-shared", "-fPIC", "-o", str(library), "-x", "c", "-", "-ldl"]
+        subprocess.run(compiler, input=source.encode(), check=True)
+    return library
+
 
 def clock(box: Box, rng: Rng, case: int) -> bool:
     """The clock set back and forward while a stage, each fifth time a sweep, runs."""
     folder, turned = box.fresh(), box.case / "clock"
     turned.write_text("0")
-    library = box.root / "turned.so"
-    if not library.exists():
-        compiler = ["cc", "-shared", "-fPIC", "-o", str(library), "-x", "c", "-"]
-        subprocess.run(compiler, input=TURNED.encode(), check=True)
+    library = preloaded(TURNED, box.root / "turned.so")
     faked = {"LD_PRELOAD": str(library), "TURNED": str(turned), PACE: "0.05"}
     sweeps = case % 5 == 4
     if sweeps:
@@ -465,6 +564,71 @@ def surroundings(box: Box, rng: Rng, case: int) -> bool:
     return True
 
 
+def writers(box: Box, name: str) -> tuple[list[str], Path]:
+    """The words of a command that writes, and where, in a fresh folder; what it reads lies elsewhere."""
+    folder = box.fresh()
+    if name in ("evaluation", "report", *STATEFUL, "data"):
+        return box.command({"evaluation": EVALUATION, "report": REPORT}.get(name) or STAGES[name], folder)
+    whole = box.ready(*TRAINED, evaluated=True)
+    arrays = box.whole / "arrays.npz"
+    if not arrays.exists() and not run("export", whole / "data.h5", "--out", arrays).accepted():
+        raise RuntimeError("the data cannot be exported")
+    commands: dict[str, tuple[list[Any], str]] = {
+        "import": (["import", arrays, "--out"], "made.h5"),
+        "arrays": (["export", whole / "data.h5", "--out"], "made.npz"),
+        "episodes": (["export", whole / "meta", "--out"], "made-v0"),
+        "compare": (["compare", whole, whole, "--out"], "made"),
+        "figures": (["report", whole, "--figures"], "made"),
+        "sheets": (["show", whole / "data.h5", "--pictures"], "made"),
+    }
+    words, made = commands[name]
+    return [*map(str, words), str(folder / made)], folder / made
+
+
+CHEAP = ("data", "import", "arrays", "evaluation", "report", "episodes", "compare", "figures", "sheets")
+COSTLY = ("ensemble", "options", "ppo", "rooms", "meta", "audit", "dqn", "sequential")
+
+
+def writes(box: Box, rng: Rng, case: int) -> bool:
+    """A disk that is full from one write of a command on, or refuses one alone; then there is room, and it is resumed.
+
+    Each fifth case is of a command that trains. Nothing hidden may stay but a checkpoint that the message names.
+    """
+    costly, cheap = COSTLY[case // 5 % len(COSTLY)], CHEAP[(case - case // 5) % len(CHEAP)]
+    name = costly if case % 5 == 4 else cheap
+    counts = box.root / f"{name}.writes"
+    words, out = writers(box, name)
+    log = box.root / "log"
+    log.write_bytes(b"")
+    faked = {PACE: "0.05", "FULL_UNDER": str(box.case), "FULL_LOG": str(log)}
+    if not counts.exists():
+        if not Command(*words, environment={**faked, "FULL_AT": str(10**9)}).wait().accepted():
+            raise RuntimeError(f"{name} does not end")
+        counts.write_text(str(log.stat().st_size))
+        words, out = writers(box, name)
+    at, once = 1 + rng.randrange(int(counts.read_text())), rng.random() < 0.3
+    ended = Command(*words, environment={**faked, "FULL_AT": str(at), **({"FULL_ONCE": "1"} if once else {})}).wait()
+    if name == "import":  # which says before what is odd about the data
+        ended = dataclasses.replace(ended, words=ended.words[ended.words.rstrip().rfind("\n") + 1 :])
+    where = f"{name}, {'only ' * once}write {at} of {counts.read_text()}"
+    try:
+        accepted = ended.accepted()
+        left = sorted(path for path in entries(box.case) if any(part.startswith(".") for part in Path(path).parts))
+        if command_has(out) and "--resume" not in ended.words:
+            raise Bad(f"a checkpoint is left, and not named: {ended.words}")
+        if left and not command_has(out):
+            raise Bad(f"left {left[:3]}: {ended.words}")
+        check_whole(out) if name not in ("arrays", "figures", "sheets", "episodes") else None
+        resumed = ["--resume"] if command_has(out) else ["--force"] if out.exists() and not accepted else []
+        if not accepted and not (again := run(*words, *resumed)).accepted():
+            raise Bad(f"cannot be made then: {again.words}")
+        if hidden := [path for path in entries(box.case) if Path(path).name.startswith(".")]:
+            raise Bad(f"at the end there are {hidden[:3]}")
+    except Bad as bad:
+        raise Bad(f"{where}: {bad}") from None
+    return accepted
+
+
 def entries(folder: Path) -> set[str]:
     """Everything that is in a folder."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
@@ -505,6 +669,8 @@ def files(make: Callable[[Box, Rng, int], hostile.Made]) -> Callable[[Box, Rng, 
 
 FAMILIES: dict[str, Callable[[Box, Rng, int], bool]] = {
     "disk": disk,
+    "checkpoints": checkpoints,
+    "writes": writes,
     "signals": signals,
     "clock": clock,
     "surroundings": surroundings,
@@ -571,12 +737,16 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the rows here too")
     parser.add_argument("--folder", type=Path, help="where to work; a temporary one where not given")
     given = parser.parse_args()
-    prepare()
     folder = (given.folder or Path(tempfile.mkdtemp(prefix="attacks-"))).resolve()
+    if "writes" in (given.family or FAMILIES) and "full.so" not in os.environ.get("LD_PRELOAD", "") and COMPILER:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ["LD_PRELOAD"] = str(preloaded(FULL, folder / "full.so"))  # for commands, which are forked from here
+        os.execv(sys.executable, [sys.executable, "-m", "benchmarks.attacks", *sys.argv[1:], "--folder", str(folder)])
+    prepare()
     box, rows = Box(folder), []
     print("| family | cases | refused in one line | accepted | bad | slowest | memory |\n" + "|---" * 7 + "|")
     for name in given.family or FAMILIES:
-        if (name == "disk" and os.geteuid()) or (name == "clock" and shutil.which("cc") is None):
+        if (name == "disk" and os.geteuid()) or (name in ("clock", "writes") and not COMPILER):
             continue
         cases = range(given.cases) if given.case is None else range(given.case, given.case + 1)
         rows.append(attack(box, name, cases, given.seed))

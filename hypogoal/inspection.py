@@ -16,7 +16,7 @@ from rich.table import Table
 from hypogoal.core.artefacts import MANIFEST, Artefact, extra_files, file_faults, find_input, open_artefact
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, visible
+from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
 from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
@@ -158,7 +158,8 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
                 file = place / f"{name}.png"
                 try:
                     place.mkdir(parents=True, exist_ok=True)
-                    Image.fromarray(sheet).save(file)
+                    with replacing(file) as fresh:
+                        Image.fromarray(sheet).save(fresh, format="png")
                 except OSError as error:
                     what = f"the picture cannot be written ({error.strerror or error})"
                     raise UserError(what, file, "Choose another folder.") from None

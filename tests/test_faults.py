@@ -3,6 +3,8 @@
 import errno
 import os
 import re
+import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +16,7 @@ import torch
 from corridor import Corridor
 
 import hypogoal
+from benchmarks.fuzz import make_seeds
 from hypogoal.cli import main
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.files import replace_text
@@ -171,6 +174,47 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(tmp_path: Path) -> Non
     out.write_text("old")
     assert limited("collect", "own_domain:DOMAIN", "--out", str(out), "--force", "-q").returncode == 2
     assert [path.name for path in tmp_path.iterdir()] == ["data.h5"] and out.read_text() == "old"
+
+
+def test_a_command_without_room_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Spec G2: one line, and neither a draft nor a hidden file; ``benchmarks.attacks`` tries each write of each."""
+    run, there = tmp_path / "run", tmp_path / "there"
+    run.mkdir()
+    there.mkdir()
+    make_seeds(run)
+    for agent in ("options", "meta"):  # made up: they cannot be played
+        shutil.rmtree(run / agent)
+    data, arrays = str(run / "data.h5"), str(run / "arrays.npz")
+    for command in (["export", data, "--out", arrays], ["evaluate", str(run)], ["report", str(run)]):
+        assert main([*command, *["-q"][: command[0] != "export"]]) == 0
+    shutil.copytree(run, tmp_path / "other")
+    commands = {
+        "collect": ["collect", "own_domain:DOMAIN", "--out", str(there / "data.h5")],
+        "import": ["import", arrays, "--out", str(there / "data.h5")],
+        "export": ["export", data, "--out", str(there / "arrays.npz")],
+        "train-ensemble": ["train-ensemble", data, "--set", "steps=2", "--out", str(there / "ensemble")],
+        "evaluate": ["evaluate", str(run), "--force"],
+        "report": ["report", str(run), "--force"],
+        "figures": ["report", str(run), "--figures", str(there / "figures")],
+        "compare": ["compare", str(run), str(tmp_path / "other"), "--out", str(there / "compared")],
+        "pictures": ["show", data, "--pictures", str(there / "pictures")],
+    }
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for name, command in commands.items():
+        for limit in (0, 700):
+            capsys.readouterr()
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+            try:
+                code = main(command)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            words = capsys.readouterr().err
+            assert code == 2 and "File too large" in words.splitlines()[-1], (name, limit, words)
+            left = {path for path in tmp_path.rglob("*") if path.is_file()} - before.keys()
+            assert [path for path in left if path.parent.name != "figures"] == [], (name, limit)
+            assert not list(tmp_path.rglob(".*")), (name, limit)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 def test_a_file_has_its_name_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

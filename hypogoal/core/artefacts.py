@@ -138,6 +138,7 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
     out = drafts.place_of(out)
     check_parent(out)
     drafts.check_free(out, force=force, resume=resume)
+    drafts.sweep_up(out.parent)
     return out
 
 

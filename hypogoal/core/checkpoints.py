@@ -2,11 +2,13 @@
 
 A state is nested dicts and lists of arrays, tensors and plain JSON values; what has a state gives it as ``snapshot()``
 and takes it back as ``restore(snapshot)``. One state is one safetensors file, its JSON part in it as bytes; no pickle.
-Such a file is private to its stage and to the version that wrote it.
+Such a file is private to its stage and to the version that wrote it: what is read must be built like the state of what
+is to go on (:func:`require_alike`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import os
@@ -15,7 +17,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -36,8 +38,9 @@ FEWEST_SECONDS = 10.0  # between two checkpoints
 WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART, SUM_PART = "json-4", "crc32"  # the number rises with what stages keep
+JSON_PART, SUM_PART = "json-5", "crc32"  # the number rises with what stages keep
 ARRAY, TENSOR = "$array", "$tensor"
+ANEW = "Give --force and no --resume to begin anew."
 
 
 def checkpoints_of(folder: Path, name: str = "stage") -> Checkpoints:
@@ -142,10 +145,26 @@ class Checkpoints:
             if not np.array_equal(arrays.pop(SUM_PART), _checksum(arrays)):
                 raise ValueError
             state: State = _put_together(json.loads(arrays.pop(JSON_PART).tobytes()), arrays)
-        except (SafetensorError, KeyError, ValueError, RecursionError):
+        except (SafetensorError, KeyError, TypeError, ValueError, RecursionError):
             what = "the checkpoint is damaged, or of an earlier version"
-            raise UserError(what, self.path, "Give --force to begin anew.") from None
+            raise UserError(what, self.path, ANEW) from None
         return state
+
+    @contextlib.contextmanager
+    def restoring(self) -> Iterator[None]:
+        """Take back a state in the block; one that does not fit is a ``UserError``, whatever it makes the block raise.
+
+        Its checksum was right, so that it is another stage's or version's, or was written by somebody else.
+        """
+        from hypogoal.core.own_code import users_own
+
+        try:
+            yield
+        except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
+            if users_own(error) is not None:
+                raise
+            fault = str(error).partition("\n")[0] if isinstance(error, Unlike) else "at its values"
+            raise UserError(f"the checkpoint does not fit what is to go on ({fault})", self.path, ANEW) from error
 
 
 def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
@@ -188,14 +207,96 @@ def _put_together(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     return {key: _put_together(item, arrays) for key, item in value.items()}
 
 
+class Unlike(ValueError):
+    """A state is not built like that of what is to go on from it."""
+
+
+class _Rows(np.ndarray[Any, Any]):
+    """An array of which a later snapshot may have more or fewer rows."""
+
+
+class _List(list[Any]):
+    """A list of which a later snapshot may have more or fewer items, each like ``item``."""
+
+    item: Any
+
+
+class _Dict(dict[str, Any]):
+    """A dict of which a later snapshot may have more or fewer keys, each value like ``item``."""
+
+    item: Any
+
+
+class Unknown(dict[str, Any]):
+    """A part of a state of which only its owner knows how it is built, such as that of an own domain's engine."""
+
+
+def growing(values: Any, item: Any = None) -> Any:
+    """The same array (n, ...), list or dict, marked for :func:`require_alike`: its length changes, its items do not.
+
+    ``item`` is like one of a list or dict, which may have none yet.
+    """
+    if isinstance(values, np.ndarray):
+        return values.view(_Rows)
+    marked = _Dict(values) if isinstance(values, dict) else _List(values)
+    marked.item = item
+    return marked
+
+
+def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
+    """Refuse (``Unlike``) a state with other keys, types, dtypes or shapes than that of what is to go on, ``fresh``.
+
+    Only what is marked as :func:`growing` may have another length; a number may stand where None does. Texts, such as
+    the kind of a generator, never change.
+    """
+    fresh = fresh.item() if isinstance(fresh, np.generic) else fresh
+    where = place or "/"
+    if isinstance(fresh, Unknown):
+        return
+    if isinstance(fresh, dict):
+        if not isinstance(saved, dict):
+            raise Unlike(f"no dict at {where}")
+        if isinstance(fresh, _Dict):
+            fresh = dict.fromkeys(saved, fresh.item)
+        if differ := sorted(fresh.keys() ^ saved.keys()):
+            raise Unlike(f"{'unknown' if differ[0] in saved else 'missing'}: {place}/{differ[0]}")
+        for key, value in saved.items():
+            require_alike(value, fresh[key], f"{place}/{key}")
+    elif isinstance(fresh, list | tuple):
+        if isinstance(fresh, _List) and isinstance(saved, list):
+            fresh = [fresh.item] * len(saved)
+        if not isinstance(saved, list) or len(saved) != len(fresh):
+            raise Unlike(f"no list of {len(fresh)} at {where}")
+        for number, (value, like) in enumerate(zip(saved, fresh, strict=True)):
+            require_alike(value, like, f"{place}/{number}")
+    elif hasattr(fresh, "dtype"):
+        kind, shape = str(fresh.dtype), tuple(fresh.shape)
+        found = tuple(getattr(saved, "shape", ()))
+        grows = isinstance(fresh, _Rows) and len(found) == len(shape)
+        if str(getattr(saved, "dtype", "")) != kind or found[grows:] != shape[grows:]:
+            raise Unlike(f"not {kind} {shape} at {where}")
+    elif not (
+        (saved == fresh if isinstance(fresh, str) else type(saved) is type(fresh))
+        or (type(saved) is int and isinstance(fresh, float))
+        or (type(saved) in (int, float) and fresh is None)
+    ):
+        raise Unlike(f"not {type(fresh).__name__} at {where}")
+
+
 def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:
-    """What an optimiser knows of each parameter, step counts included; its settings are the configuration's."""
-    return {str(number): known for number, known in optimiser.state_dict()["state"].items()}
+    """What Adam knows of each parameter that has moved, step counts included; its settings are the configuration's."""
+    import torch
+
+    state = optimiser.state
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    items = [{"step": torch.zeros(()), "exp_avg": each, "exp_avg_sq": each} for each in parameters]
+    pairs = enumerate(zip(parameters, items, strict=True))
+    return {str(number): growing([state[each]] if each in state else [], item) for number, (each, item) in pairs}
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None:
     """Continue from an ``optimiser_snapshot`` of one of the same parameters."""
-    state = {int(number): known for number, known in snapshot.items()}
+    state = {int(number): known[0] for number, known in snapshot.items() if known}
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
@@ -209,9 +310,17 @@ class Resumable:
 
     CHANGING: ClassVar[tuple[str, ...]] = ()
 
+    def items(self) -> Mapping[str, Any]:
+        """What an item is like of those in ``CHANGING`` whose length changes: a deque, a list, an array's rows.
+
+        Of a list of lists or deques, one for each option or environment, an item of each of these.
+        """
+        return {}
+
     def snapshot(self) -> State:
         """What a resumed run needs to go on exactly; valid until the next step."""
-        return {name: _taken(getattr(self, name)) for name in self.CHANGING}
+        items = self.items()
+        return {name: _taken(getattr(self, name), items.get(name)) for name in self.CHANGING}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of one made with the same arguments."""
@@ -219,13 +328,16 @@ class Resumable:
             setattr(self, name, _restored(getattr(self, name), snapshot[name]))
 
 
-def _taken(value: Any) -> Any:
+def _taken(value: Any, item: Any = None) -> Any:
     import torch
 
     if isinstance(value, Resumable):
         return value.snapshot()
     if isinstance(value, list | deque):
-        return [_taken(item) for item in value]
+        fixed = bool(value) and isinstance(value[0], Resumable | list | deque | np.random.Generator)
+        return [_taken(each, item) for each in value] if fixed else growing(list(map(_taken, value)), item)
+    if isinstance(value, np.ndarray) and item is not None:
+        return growing(value)
     if isinstance(value, torch.nn.Module):
         return value.state_dict()
     if isinstance(value, torch.optim.Optimizer):

@@ -6,7 +6,6 @@ when that process dies, however it does.
 """
 
 import contextlib
-import errno
 import json
 import os
 import shutil
@@ -18,23 +17,16 @@ from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import Any
 
 from hypogoal.core.checkpoints import FOLDER
-from hypogoal.core.errors import Complete, Killed, NumericalError, UserError
-from hypogoal.core.files import parse_json, read_json, replace_text, sync
-
-fcntl: Any  # on POSIX a module, elsewhere None
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from hypogoal.core.errors import Complete, UserError
+from hypogoal.core.files import FRESH, parse_json, read_json, replace_text, sync
+from hypogoal.core.locks import is_there, remove_left_over, try_lock
 
 PARTIAL = ".partial"
 FILES, BEGUN, LOCK, OLD = "files", "begun.json", "lock", ".old"
 PATIENCE_SECONDS = 2.0  # for whoever is just letting go
-LOCKED_BYTE = 1 << 30
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that cannot lock
 COMMAND: ContextVar[tuple[str, ...]] = ContextVar("COMMAND", default=())  # a program's call, where it was no command
 GO_ON = "give the same command with --resume to go on"
 
@@ -106,13 +98,16 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
             check_same(begun["identity"], fresh["identity"], out, "what is unfinished there was begun", do)
         else:
             begun = fresh
-            _begin(folder, begun)
         try:
+            if begun is fresh:
+                _begin(folder, begun)
+            for place, _, _ in os.walk(folder / FILES):
+                sweep_up(Path(place))
             yield Draft(folder / FILES, begun["command"])
         except BaseException as error:
             if not unfinished(out):
                 _clear(folder)
-            elif isinstance(error, KeyboardInterrupt | NumericalError | Killed | OSError):
+            elif "--resume" not in str(error):
                 error.add_note(f"the last checkpoint is kept: {GO_ON}")
             raise
         _clear(folder)
@@ -138,6 +133,34 @@ def _settle(out: Path) -> None:
     if old.exists() and not out.exists():
         old.rename(out)
     _remove(old)
+
+
+def sweep_up(folder: Path) -> None:
+    """Remove from a folder what processes left that were killed while they wrote: files that had no name yet, and
+    drafts without a checkpoint, behind which what was moved aside comes back. Whoever writes there next does so.
+
+    What a living process writes it has locked; where the system cannot lock, all of it stays.
+    """
+    with contextlib.suppress(OSError):  # it may not be there, or not be read
+        for name in filter(lambda name: name.startswith("."), os.listdir(folder)):
+            with contextlib.suppress(OSError):  # another process removes it, or only another user may
+                if FRESH.fullmatch(name):
+                    remove_left_over(folder / name)
+                elif name.endswith(PARTIAL) and not (out := folder / name[1 : -len(PARTIAL)]).is_symlink():
+                    _sweep_draft(folder / name, out)
+
+
+def _sweep_draft(folder: Path, out: Path) -> None:
+    known = {FILES, FOLDER, BEGUN, LOCK}
+    lock = folder / LOCK
+    if any(path.is_symlink() for path in (folder, lock)) or not lock.is_file():
+        return
+    if not all(name in known or FRESH.fullmatch(name) for name in os.listdir(folder)):
+        return  # it is no draft
+    with lock.open("r+b") as file:
+        if try_lock(file) and is_there(file, lock) and not unfinished(out):
+            _settle(out)
+            _clear(folder)
 
 
 def _clear(folder: Path) -> None:
@@ -241,23 +264,28 @@ def sole_writer(out: Path) -> Iterator[None]:
         _check_own(folder)
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            file = (folder / LOCK).open("a+", encoding="utf-8")
+            file = (folder / LOCK).open("a+b", buffering=0)
         except FileNotFoundError:
             continue  # its owner has just removed the folder
+        except OSError:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+            raise
         with file:
-            if try_lock(file) is not False and _is_there(file, folder / LOCK):
-                file.truncate(0)
-                file.write(f"process {os.getpid()} on {socket.gethostname()}")
-                file.flush()
+            if try_lock(file) is not False and is_there(file, folder / LOCK):
+                with contextlib.suppress(OSError):  # a full disk: it is for others to read, and stays empty
+                    file.truncate(0)
+                    file.write(f"process {os.getpid()} on {socket.gethostname()}".encode())
                 try:
+                    sweep_up(folder.parent)
                     yield
                 finally:
                     with contextlib.suppress(OSError):  # unless it is another's by now, who made it anew
-                        if _is_there(file, folder / LOCK) and os.listdir(folder) == [LOCK]:
+                        if is_there(file, folder / LOCK) and os.listdir(folder) == [LOCK]:
                             _clear(folder)
                 return
             file.seek(0)
-            owner = file.read(200) or "another process"
+            owner = file.read(200).decode(errors="replace") or "another process"
         if time.monotonic() >= until:
             raise UserError(f"{owner} is writing this", out, "Wait until it is done, or choose another --out.")
         time.sleep(0.05)
@@ -273,42 +301,3 @@ def _check_own(folder: Path) -> None:
                 raise UserError(
                     "the unfinished output holds a link, pipe or device, which no stage makes", path, "Remove it."
                 )
-
-
-def try_lock(file: TextIO | BinaryIO, *, shared: bool = False) -> bool | None:
-    """Take the kernel's lock on a file, which whoever inherits the file holds too, until the last of them closes it.
-
-    Whether it was free; None where the system cannot lock, and nobody is kept out.
-    """
-    if fcntl is None:
-        return None if shared else _try_lock_byte(file)
-    try:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError as error:
-        if error.errno not in NO_LOCKS:
-            raise
-        return None
-    return True
-
-
-def _try_lock_byte(file: TextIO | BinaryIO) -> bool | None:
-    """On Windows: a byte far behind the text, so that others can read who has the lock."""
-    try:
-        import msvcrt
-    except ImportError:
-        return None
-    os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
-    try:
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-    except OSError:
-        return False
-    return True
-
-
-def _is_there(file: TextIO, path: Path) -> bool:
-    """Whether ``path`` still is the file that was opened: its owner removes it at the end."""
-    with contextlib.suppress(FileNotFoundError):
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    return False

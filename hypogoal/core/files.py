@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeGuard
 
 from hypogoal.core.errors import UserError, printable
+from hypogoal.core.locks import fresh_file
 
 MAX_TEXT_BYTES = 64 * 2**20
 END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
@@ -32,6 +33,7 @@ KERNEL = frozenset([
 MAX_NAME_BYTES = 200
 MOST_DOTS = 256  # in a line of TOML
 MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
+FRESH = re.compile(r"\..+\.\d+\.new", re.DOTALL)  # the name of a file while :func:`replacing` writes it
 NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
 FORMULA = "=+-@＝＋－＠"  # signs with which a spreadsheet begins to compute, of full width too
 
@@ -197,13 +199,11 @@ def replace_text(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write, called ``path`` when the block ends; gone when it raises."""
+    """A file to write, called ``path`` when the block ends; gone when it raises, and left over when it is killed."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
+    with fresh_file(fresh):
         yield fresh
         replace_file(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 def replace_file(fresh: Path, path: Path) -> None:

@@ -157,4 +157,6 @@ class MetricsLog:
 
     def restore(self, snapshot: int) -> None:
         """Forget what was written after the ``snapshot``; 0, all of it."""
+        if not 0 <= snapshot <= self._path.stat().st_size:
+            raise ValueError(f"the log has fewer bytes than {snapshot}")
         os.truncate(self._path, snapshot)

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import ANEW, growing
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, layers
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
@@ -404,9 +405,9 @@ class GymnasiumEngine(TurnEngine):
         return {
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
-            "images": np.stack(self._ring),
-            "labels": np.frombuffer(self._labels, np.uint8).copy(),
-            "played": [list(actions) for actions in self._played],
+            "images": growing(np.stack(self._ring)),
+            "labels": growing(np.frombuffer(self._labels, np.uint8).copy()),
+            "played": [growing(actions, 0) for actions in self._played],
             **({"layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
@@ -434,6 +435,6 @@ class GymnasiumEngine(TurnEngine):
             here, was = self.look.read(env, observation), int(snapshot["ids"][number])
             if not np.array_equal(here, self._ring[was % size]):
                 what = "the environment does not repeat itself for the same seed, so this cannot be resumed"
-                raise UserError(what, f"layout_seed={seed}", "Begin anew with --force.")
+                raise UserError(what, f"layout_seed={seed}", ANEW)
         self._played = [list(actions) for actions in snapshot["played"]]
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()

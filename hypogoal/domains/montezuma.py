@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.checkpoints import Checkpoints, require_alike
 from hypogoal.core.config import setting
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Collected, States, joined
@@ -102,6 +102,23 @@ class _Task(NamedTuple):
     name: str
     gather: Callable[[], RoomStates]
     kept: Checkpoints
+    wanted: int
+
+    def load(self) -> RoomStates | None:
+        """What was gathered before."""
+        saved = self.kept.load()
+        if saved is None:
+            return None
+        with self.kept.restoring():
+            require_alike(
+                saved,
+                {
+                    "observations": np.empty((self.wanted, *OBSERVATION_SHAPE), np.uint8),
+                    "ram": np.empty((self.wanted, 128), np.uint8),
+                    "actions": np.empty((self.wanted, 2), np.int64),
+                },
+            )
+        return RoomStates(**saved)
 
 
 def labelled_rooms(groups: int) -> tuple[int, ...]:
@@ -189,10 +206,10 @@ class MontezumaDomain(Domain):
             draw = partial(gather, play=play, held_out=name == "heldout", runs_on=name == "unlabelled")
             for room in rooms:
                 job = partial(draw, room, wanted, seed, ("montezuma", name, *stream))
-                tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None)))
+                tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None), wanted))
             expected += wanted * len(rooms)
         progress.expect(expected)
-        there = {number: RoomStates(**states) for number, task in enumerate(tasks) if (states := task.kept.load())}
+        there = {number: states for number, task in enumerate(tasks) if (states := task.load())}
         for loaded in there.values():
             progress.advance(len(loaded.ram))
         left = [number for number in range(len(tasks)) if number not in there]

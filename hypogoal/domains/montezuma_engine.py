@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import growing
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
@@ -137,14 +138,14 @@ class MontezumaEngine(TurnEngine):
             frames.update((id(frame), frame) for frame in seen)
         row = {address: number for number, address in enumerate(frames)}
         return {
-            "rng": np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8),
+            "rng": growing(np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8)),
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
-            "positions": np.frombuffer(self._positions, np.uint8).copy(),
-            "alive": np.frombuffer(self._alive, np.uint8).copy(),
-            "frames": np.stack(list(frames.values())),
-            "stacks": np.array([[row[id(frame)] for frame in seen] for seen in stacks], np.int32),
-            "states": np.concatenate(states),
+            "positions": growing(np.frombuffer(self._positions, np.uint8).copy()),
+            "alive": growing(np.frombuffer(self._alive, np.uint8).copy()),
+            "frames": growing(np.stack(list(frames.values()))),
+            "stacks": growing(np.array([[row[id(frame)] for frame in seen] for seen in stacks], np.int32)),
+            "states": growing(np.concatenate(states)),
             "state_sizes": np.array([len(state) for state in states]),
             "screens": np.stack([each.screen for each in saved]),
         }

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from hypogoal.core.config import parse_assignments, preset_digest
-from hypogoal.core.drafts import PATIENCE_SECONDS, try_lock
+from hypogoal.core.drafts import PATIENCE_SECONDS
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import open_file, path_part, read_end, read_json, replace_text
+from hypogoal.core.locks import try_lock
 from hypogoal.core.schemas import LARGEST, Schema, is_amount, is_count, is_list, is_table, is_text, is_word, misfit
 from hypogoal.experiments.cells import DERIVED, RESERVED, SHORT, Cell, Cost, Plan, closing_cells, moved
 from hypogoal.settings import STAGES

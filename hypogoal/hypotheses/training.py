@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hypogoal.core.checkpoints import Checkpoints, Resumable, State
+from hypogoal.core.checkpoints import Checkpoints, Resumable, State, Unknown, Unlike, require_alike
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for, torch_generator
 from hypogoal.dataset import Observations
@@ -82,7 +82,7 @@ def fit(
         what = "members one after the other cannot share an encoder that learns"
         raise UserError(what, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")
     checkpoints = checkpoints or Checkpoints(None)
-    saved, report = checkpoints.load() or {}, cast(object, on_step)
+    saved, report = checkpoints.load(), cast(object, on_step)
     view = view_of(
         observations,
         unlabelled,
@@ -91,16 +91,26 @@ def fit(
         origins,
         unlabelled_origins,
         agent_pixels,
-        fitted=not saved,
+        fitted=saved is None,
     )
     generator = torch_generator(seed, "weights")
     ensemble = Ensemble(
         config.network, observations.shape[1:], config.members, generator, view, config.encoder, config.hidden_width
     ).to(device)
-    if saved:
-        ensemble.load_state_dict(saved["ensemble"])
-        if isinstance(report, Resumable):
-            report.restore(saved["told"])
+    rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
+
+    def state(number: int, part: Round | None) -> State:
+        told = {"told": report.snapshot()} if isinstance(report, Resumable) else {}
+        return {"round": number, "part": part.snapshot() if part else {}, "ensemble": ensemble.state_dict(), **told}
+
+    if saved is not None:
+        with checkpoints.restoring():
+            require_alike(saved, {**state(0, None), "part": Unknown()})
+            if not 0 <= saved["round"] <= len(rounds) or (saved["round"] == len(rounds) and saved["part"]):
+                raise Unlike("at /round")
+            ensemble.load_state_dict(saved["ensemble"])
+            if isinstance(report, Resumable):
+                report.restore(saved["told"])
     trunk, networks = ensemble.parts
     by_ladder = config.batch_kind == "per-ladder"
     ladders = needed(origins, ("ladder",), "batch_kind=per-ladder")["ladder"] if by_ladder else None
@@ -117,19 +127,15 @@ def fit(
         trunk=trunk,
         frozen=ensemble.frozen,
     )
-    rounds = [[m] for m in range(config.members)] if config.schedule == "sequential" else [[*range(config.members)]]
-
-    def state(number: int, part: Round | None) -> State:
-        told = {"told": report.snapshot()} if isinstance(report, Resumable) else {}
-        return {"round": number, "part": part.snapshot() if part else {}, "ensemble": ensemble.state_dict(), **told}
-
-    first = saved.get("round", 0)
+    first = saved["round"] if saved else 0
     drawing = [states.device] if states.device.type == "cuda" else []
     with checkpoints, torch.random.fork_rng(devices=drawing):  # Dropout and the like draw there
         for number, members in enumerate(rounds[first:], start=first):
             part = Round(networks, members, states, config, seed_for(seed, "batches", number), number * config.steps)
             if saved and number == first:
-                part.restore(saved["part"])
+                with checkpoints.restoring():
+                    require_alike(saved["part"], part.snapshot(), "/part")
+                    part.restore(saved["part"])
             for step in part.steps(on_step):
                 if look is not None and step in look_at:
                     look(step, ensemble)
@@ -182,6 +188,10 @@ class Round(Resumable):
         torch.manual_seed(seed_for(seed, "layers"))
         self.done = 0
         self.losses: list[Tensor] = []  # of the steps since the last look: each member's, and those of diversity
+
+    def items(self) -> dict[str, Any]:
+        terms = self.objective.terms(self.members, self.members[0]) if self.objective else []
+        return {"losses": torch.zeros(len(self.members) + len(terms))}
 
     def snapshot(self) -> State:
         """All that the next steps depend on."""

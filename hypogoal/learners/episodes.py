@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.checkpoints import Resumable, State
+from hypogoal.core.checkpoints import Resumable, State, growing
 from hypogoal.core.files import write_table
 from hypogoal.domains.base import Step
 
@@ -58,7 +58,7 @@ class Episodes(list[tuple[int, int, float, int, int]], Resumable):
         write_table(folder / "episodes.csv", EPISODE_COLUMNS, self)
 
     def snapshot(self) -> State:
-        return {**super().snapshot(), "rows": np.array(self, np.float64).reshape(-1, len(EPISODE_COLUMNS))}
+        return {**super().snapshot(), "rows": growing(np.array(self, np.float64).reshape(-1, len(EPISODE_COLUMNS)))}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)

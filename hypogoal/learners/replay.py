@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.checkpoints import Resumable, growing
 
 FAN = 64  # children of a node: 1e5 leaves are three levels, and NumPy's cost is by the call
 
@@ -101,17 +101,17 @@ class PrioritisedReplay(Resumable):
 
     def snapshot(self) -> dict[str, Any]:
         return {
-            "data": {name: values[: self.size].copy() for name, values in self.data.items()},
-            "priorities": self.tree.get(np.arange(self.size)),
+            "data": {name: growing(values[: self.size].copy()) for name, values in self.data.items()},
+            "priorities": growing(self.tree.get(np.arange(self.size))),
             "largest": self._largest,
             "next": self._next,
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue, on a fresh replay, from a ``snapshot`` of one of the same capacity and fields."""
-        for name, values in snapshot["data"].items():
-            self.data[name][: len(values)] = values
         self.size = len(snapshot["priorities"])
+        for name, values in snapshot["data"].items():
+            self.data[name][: self.size] = values
         if self.size:
             self.tree.set(np.arange(self.size), snapshot["priorities"])
         self._largest, self._next = snapshot["largest"], snapshot["next"]
@@ -128,6 +128,9 @@ class StepsAhead(Resumable):
     def __init__(self, sequences: int, n: int):
         self.n = n
         self._open: list[list[tuple[int, int]]] = [[] for _ in range(sequences)]
+
+    def items(self) -> dict[str, Any]:
+        return {"_open": (0, 0)}
 
     def add(
         self,

@@ -60,8 +60,10 @@ def _quiet_start(layer: nn.Linear) -> None:
 class Head(nn.Module):
     """How an option is drawn from the actor's scores (N, O) among those offered, bool (N, O)."""
 
+    remembered: int  # numbers of each draw, see :meth:`draw`
+
     def draw(self, scores: Tensor, offered: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Options int64 (N,) and what must be remembered of the draw, float32 (N, ...)."""
+        """Options int64 (N,) and what must be remembered of the draw, float32 (N, ``remembered``)."""
         raise NotImplementedError
 
     def log_prob(self, scores: Tensor, offered: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,7 +80,7 @@ class CategoricalHead(Head):
 
     def __init__(self, options: int):
         super().__init__()
-        self.options = options
+        self.options, self.remembered = options, 1
 
     def draw(self, scores: Tensor, offered: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         option = torch.multinomial(self._log(scores, offered).exp(), 1, generator=generator)
@@ -99,6 +101,7 @@ class GaussianHead(Head):
 
     def __init__(self, options: int):
         super().__init__()
+        self.remembered = options
         self.log_std = nn.Parameter(torch.zeros(options))
 
     def draw(self, scores: Tensor, offered: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hypogoal.core.checkpoints import State
+from hypogoal.core.checkpoints import State, growing
 from hypogoal.core.compute import tensor
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
@@ -47,7 +47,13 @@ class MetaPolicy(Chooser):
         self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.meta_learning_rate, eps=1e-5, fused=True)
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
-        self._open: Decisions = {}  # the last one of every environment
+        count = engine.count
+        self._open: Decisions = {  # the last one of every environment
+            "state": np.zeros(count, np.int64),
+            "offered": np.zeros((count, options), np.bool_),
+            "drawn": np.zeros((count, self.head.remembered), np.float32),
+            "log_prob": np.zeros(count, np.float32),
+        }
         self._finished: list[Decisions] = []  # as they ended
         self.updates = 0
 
@@ -59,8 +65,6 @@ class MetaPolicy(Chooser):
             log_prob = self.head.log_prob(scores, mask, drawn)[0]
         decided = {"state": ids, "offered": offered, "drawn": drawn.numpy(), "log_prob": log_prob.numpy()}
         for name, values in decided.items():
-            if name not in self._open:
-                self._open[name] = np.zeros((self.engine.count, *values.shape[1:]), values.dtype)
             self._open[name][environments] = values
         return options.numpy()
 
@@ -138,6 +142,19 @@ class MetaPolicy(Chooser):
         """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
         check_fit(self.state(), state, "meta.safetensors", AGAIN)
         self.policy.load_state_dict(state)
+
+    def items(self) -> dict[str, Any]:
+        ids, numbers, truths = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.bool_)
+        columns = {
+            **self._open,
+            "environment": ids,
+            "returned": numbers,
+            "discount": numbers,
+            "next_state": ids,
+            "terminated": truths,
+            "ended": truths,
+        }
+        return {"_finished": {name: growing(values) for name, values in columns.items()}}
 
     def snapshot(self) -> State:
         """As of :class:`Resumable`, in few arrays."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.artefacts import Artefact, sha256_of
-from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.checkpoints import Checkpoints, growing, require_alike
 from hypogoal.core.config import as_dict, parse_assignments
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode
@@ -240,14 +240,17 @@ def train(
         checkpoints = Checkpoints(None)
 
     def state() -> dict[str, Any]:
-        return {"loop": loop.snapshot(), "log": log.snapshot(), "logged": logged, "numbers": numbers}
+        return {"loop": loop.snapshot(), "log": log.snapshot(), "logged": logged, "numbers": growing(numbers, 0.0)}
 
     saved = checkpoints.load()
-    log.restore(saved["log"] if saved else 0)
-    if saved:
-        loop.restore(saved["loop"])
-        logged, numbers = saved["logged"], saved["numbers"]
-        progress.resume(recorder.steps - begin)
+    with checkpoints.restoring():
+        if saved is not None:
+            require_alike(saved, state())
+        log.restore(saved["log"] if saved else 0)
+        if saved:
+            loop.restore(saved["loop"])
+            logged, numbers = saved["logged"], saved["numbers"]
+            progress.resume(recorder.steps - begin)
     solved = recorder.episodes.solved(until)
     with checkpoints:
         while recorder.steps < end and not solved:

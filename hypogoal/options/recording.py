@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.checkpoints import Resumable, growing
 from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.dataset import Observations
@@ -31,7 +31,7 @@ class Execution(NamedTuple):
     inside_at_start: bool  # its own classifier said yes where it began
     terminated: bool  # it ended in a terminal state of the episode
     states: list[int]  # the ids of those that it came to, the last one that it ended in
-    began: int = -1  # the id of the one before them; -1 of a checkpoint from before it was kept
+    began: int = -1  # the id of the one before them
 
 
 EXECUTION_COLUMNS = (*Execution._fields[:-2], "room", "x", "y", "distance")
@@ -56,6 +56,12 @@ class Recorder(Resumable):
         self._states: list[list[int]] = [[] for _ in range(engine.count)]  # that running executions came to
         self._window_start = 0
         self._window = np.zeros((options, len(CHOICE_COLUMNS) - 2))  # but for step and option
+
+    def items(self) -> dict[str, Any]:
+        execution = Execution(0, 0, 0, False, False, False, growing([], 0), 0)
+        pictures = np.zeros(self.engine.observation_shape, self.engine.observation_dtype)
+        choice = (0, 0, 0, 0, 0.0, 0, 0)
+        return {"choices": choice, "stops": 0, "executions": execution, "_pictures": pictures, "_states": 0}
 
     @property
     def steps(self) -> int:

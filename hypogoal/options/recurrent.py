@@ -6,6 +6,7 @@ learning samples a step and replays the option's execution up to it. Every membe
 
 import copy
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,6 +68,9 @@ class RecurrentLearner(Learner):
         self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
         self.running: list[list[tuple[int, int, int, bool, bool, bool]]] = [[] for _ in range(self.engine.count)]
+
+    def items(self) -> dict[str, Any]:
+        return {"running": (0, 0, 0, False, False, False)}
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:

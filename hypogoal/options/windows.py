@@ -1,5 +1,7 @@
 """What policies see that do not see all of a picture: the neighbourhood of the agent, or half the side (both ours)."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +38,9 @@ class AgentWindows(Resumable):
         self.engine, self.localiser = engine, localiser
         self.observation_shape = (SIDE, SIDE, *engine.observation_shape[2:])
         self._centres = np.full((1024, 2), np.nan)
+
+    def items(self) -> dict[str, Any]:
+        return {"_centres": self._centres[:1]}
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
         """uint8 (n, SIDE, SIDE, C) of states (n,)."""

@@ -16,6 +16,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.drafts import sweep_up
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, replacing, sync
 from hypogoal.core.own_code import UsersCode
@@ -50,6 +51,7 @@ class Marks:
         for kind in self.kinds:
             if inside(folder, kind) is None:
                 raise UserError("a folder of marks leads elsewhere", folder / kind, "Give another --out.")
+            sweep_up(folder / kind)
             for file in sorted((folder / kind).glob("[!.]*")):
                 if file.suffix in (".png", ".npy"):
                     self._files[file.stem] = file

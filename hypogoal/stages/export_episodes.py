@@ -2,13 +2,12 @@
 
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.compute import prepare
-from hypogoal.core.drafts import put_in_place
+from hypogoal.core.drafts import draft, put_in_place
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.meta.episodes import Episode, agent_of, play_episodes
@@ -31,8 +30,6 @@ def export_episodes(
         raise UserError("a Minari dataset needs a version in its name", out.name, "Give --out DIR/NAME-v0.")
     source = open_artefact(meta, "meta").whole()
     out = claim(out, kind="episodes", inputs=[meta], force=force)
-    made = out.with_name(f".{out.name}.new")
-    shutil.rmtree(made, ignore_errors=True)
     where = source.config.get("layouts") or source.config["layout_seed"]
     described = (
         f"Episodes of an agent that chooses among {len(source.config['sub_goals']) * source.config['members']} options "
@@ -45,14 +42,11 @@ def export_episodes(
             yield episode
             progress.update(number)
 
-    try:
+    with draft(out, {"kind": "episodes"}, force=force) as work:
         with Progress("export", total=episodes, quiet=quiet) as progress:
-            steps = write_minari(
-                made, told(progress), name=dataset_id(out), actions=loop.engine.n_actions, description=described
-            )
-        put_in_place(made, out)
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
+            about = {"name": dataset_id(out), "description": described}
+            steps = write_minari(work.files, told(progress), actions=loop.engine.n_actions, **about)
+        put_in_place(work.files, out)
     return steps
 
 

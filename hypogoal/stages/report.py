@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from hypogoal.cards import create_artefact
 from hypogoal.core.artefacts import Artefact, claim, find_artefacts, versions
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import replace_text, replacing
 from hypogoal.dataset import PICTURE
 from hypogoal.evaluation.run import fitting, read_evaluation
 
@@ -136,9 +137,10 @@ def draw_figures(run: Path, folder: Path, kind: str = "svg", *, force: bool = Fa
         folder.mkdir(parents=True, exist_ok=True)
         for path, drawing in files.items():
             if drawing.figure is not None:
-                path.write_bytes(to_file(drawing.figure, drawing.stem, kind))
+                with replacing(path) as fresh:
+                    fresh.write_bytes(to_file(drawing.figure, drawing.stem, kind))
         text = [f"## {path.name}\n\n{escape(of.caption, quote=False)}\n" for path, of in files.items()]
-        captions.write_text("\n".join([*text, *(f"{line}\n" for line in missing)]), encoding="utf-8")
+        replace_text(captions, "\n".join([*text, *(f"{line}\n" for line in missing)]))
     except OSError as error:
         raise UserError(f"cannot be written ({error.strerror})", folder, "Choose another folder.") from None
     return [*files, captions], missing

@@ -14,7 +14,7 @@ from typing import Any
 
 from hypogoal.core.artefacts import check_parent
 from hypogoal.core.compute import check_name
-from hypogoal.core.drafts import GO_ON, sole_writer
+from hypogoal.core.drafts import GO_ON, sole_writer, sweep_up
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.terminal import say
@@ -214,6 +214,8 @@ def _begin(
     if confirm is not None and wall_seconds(todo, planned.workers, factor) > LONG_SECONDS:
         confirm(told[-1])
     (out / records.LOGS).mkdir(parents=True, exist_ok=True)
+    for folder in (out, out / records.LOGS):
+        sweep_up(folder)
     if lost and unsure:  # said to who asked for quiet, too
         _say(f"{lost}, and is written anew: what is complete is kept where its command makes it")
         if old := [cell.name for cell in unsure if records.read_record(out, cell).code != 0]:

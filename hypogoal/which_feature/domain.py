@@ -58,7 +58,7 @@ class RoomsEngine(Engine):
     ``layout_seed`` draws the rooms. An episode has one step, so it is never cut.
     """
 
-    resumes = True
+    resumes = alike = True
     n_states = 0
 
     def __init__(self, layout_seed: int, count: int, max_steps: int, factors: tuple[str, ...], truth: str, rooms: int):

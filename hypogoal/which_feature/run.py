@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.config import as_dict, from_values, resolve, setting
+from hypogoal.core.drafts import sweep_up
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_json, replace_text, write_table
 from hypogoal.core.progress import Progress
@@ -193,6 +194,8 @@ def _begin(out: Path, config: WhichFeatureConfig) -> None:
     elif read_json(path, "the benchmark's settings are", "Choose another --out.") != shared(config):
         raise UserError("this benchmark was begun with other settings", out, "Give those, or choose another --out.")
     (out / "cells").mkdir(exist_ok=True)
+    for folder in (out, out / "cells"):
+        sweep_up(folder)
 
 
 def _read(path: Path, factors: Sequence[str]) -> Cell:

@@ -2,6 +2,8 @@
 
 import errno
 import os
+import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +18,7 @@ from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.drafts import LOCK, check_complete, draft, draft_folder, unfinished
 from hypogoal.core.errors import Complete, NumericalError, UserError
+from hypogoal.core.files import write_table
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "chooser": "ppo"}, "seed": 7}
 
@@ -261,6 +264,77 @@ def test_the_folder_one_is_in_can_be_the_output(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(here)
     finish(Path("."), force=True)
     assert open_artefact(here, "meta") and os.listdir(tmp_path) == ["here"]
+
+
+def test_no_room_leaves_nothing(tmp_path: Path) -> None:
+    """Spec G2: at whichever write the room ends, the first included."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    failed = 0
+    for limit in (*range(0, 120, 8), *range(120, 1500, 60)):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        try:
+            with create_artefact(tmp_path / "out", **ABOUT, card=lambda about, folder: "a card\n" * 20) as folder:
+                (folder / "half").write_text("x" * 200)
+                write_table(folder / "numbers.csv", ["a"], [["b" * 300]])
+        except OSError:
+            failed += 1
+            assert os.listdir(tmp_path) == []
+        else:
+            assert os.listdir(tmp_path) == ["out"]
+            shutil.rmtree(tmp_path / "out")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert 20 < failed < 38
+
+
+def test_want_of_memory_says_that_the_checkpoint_is_kept(tmp_path: Path) -> None:
+    """Spec G1: and so does whatever else ends a stage, unless it says itself what to do about the checkpoint."""
+    note = ["the last checkpoint is kept: give the same command with --resume to go on"]
+    for number, error in enumerate((MemoryError(), RuntimeError("can't allocate memory"), UserError("your code"))):
+        with pytest.raises(type(error)) as caught:
+            stop(tmp_path / str(number), error)
+        assert notes_of(caught.value) == note
+    with pytest.raises(UserError) as refused:
+        stop(tmp_path / "odd", UserError("it does not fit", None, "Give --force and no --resume to begin anew."))
+    assert notes_of(refused.value) == []
+
+
+WRITE = """
+import os, signal, sys
+from pathlib import Path
+from hypogoal.core.drafts import draft
+from hypogoal.core.files import replacing
+
+folder, checkpoint = Path(sys.argv[1]), sys.argv[2:]
+with replacing(folder / "arrays.npz") as fresh, draft(folder / "meta", {}, force=True) as work:
+    fresh.write_bytes(b"x" * 1000)
+    if checkpoint:
+        (work.files.parent / "checkpoint").mkdir()
+        (work.files.parent / "checkpoint" / "stage.safetensors").write_bytes(b"x")
+    (folder / "meta").rename(folder / ".meta.old")
+    print("written", flush=True)
+    signal.pause()
+"""
+
+
+@pytest.mark.parametrize("checkpoint", [False, True])
+def test_what_a_killed_process_left_is_removed_by_whoever_comes_next(tmp_path: Path, checkpoint: bool) -> None:
+    """Spec G2: whatever that writes in the folder. While the process lives, and where it has a checkpoint, it stays."""
+    finish(tmp_path / "meta")
+    (tmp_path / ".mine.partial").mkdir()  # no draft of ours
+    (tmp_path / ".mine.partial" / "precious").touch()
+    own = {".mine.partial", "meta", "other"}
+    command = [sys.executable, "-c", WRITE, str(tmp_path), *(["x"] if checkpoint else [])]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout is not None and writer.stdout.readline() == "written\n"
+        hidden = {f".arrays.npz.{writer.pid}.new", ".meta.partial", ".meta.old"}
+        finish(tmp_path / "other")
+        assert {*os.listdir(tmp_path)} == {".mine.partial", "other", *hidden}
+        writer.send_signal(signal.SIGKILL)
+    finish(tmp_path / "other", force=True)
+    assert {*os.listdir(tmp_path)} == ({".mine.partial", "other", ".meta.partial", ".meta.old"} if checkpoint else own)
+    finish(tmp_path / "meta", force=True)
+    assert {*os.listdir(tmp_path)} == own
 
 
 HOLD = """

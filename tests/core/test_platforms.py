@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hypogoal.core import drafts
+from hypogoal.core import drafts, locks
 from hypogoal.core.errors import UserError
 from hypogoal.core.workers import in_processes
 
@@ -110,12 +110,12 @@ def test_locks_without_flock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     held: list[int] = []
 
     def locking(descriptor: int, mode: int, count: int) -> None:
-        assert (os.lseek(descriptor, 0, os.SEEK_CUR), mode, count) == (drafts.LOCKED_BYTE, 2, 1)
+        assert (os.lseek(descriptor, 0, os.SEEK_CUR), mode, count) == (locks.LOCKED_BYTE, 2, 1)
         if held:
             raise OSError(36, "Resource deadlock avoided")
         held.append(descriptor)
 
-    monkeypatch.setattr(drafts, "fcntl", None)
+    monkeypatch.setattr(locks, "fcntl", None)
     monkeypatch.setattr(drafts, "PATIENCE_SECONDS", 0.1)
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
     with (

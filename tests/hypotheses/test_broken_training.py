@@ -11,6 +11,7 @@ import torch
 from test_views import CROP, montezuma_states
 
 from hypogoal.core.checkpoints import Checkpoints, State
+from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma_emulator import observed_pixel
 from hypogoal.hypotheses import views
 from hypogoal.hypotheses.config import EnsembleConfig
@@ -84,6 +85,15 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
     for last in (5, 4, 4):
         with pytest.raises(Broken):
             trained(Breaking(path, last))
+    saved = Checkpoints(path).load() or {}
+    for name in (*saved, *saved["part"], "finished", "beyond") if config.schedule == "sequential" else ():
+        odd = {**saved, "part": {key: value for key, value in saved["part"].items() if key != name}}
+        odd = {key: value for key, value in odd.items() if key != name}
+        odd |= {"finished": {"round": config.members}, "beyond": {"round": 9}}.get(name, {})
+        Checkpoints(path).save(odd)
+        with pytest.raises(UserError, match="does not fit"):
+            trained(Checkpoints(path))
+    Checkpoints(path).save(saved)
     resumed, told = trained(Checkpoints(path))
     assert told == expected[-len(told) :] and told
     again, nothing = trained(Checkpoints(path))

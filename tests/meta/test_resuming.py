@@ -9,9 +9,10 @@ import pytest
 import torch
 from corridor import Corridor
 from loops import CASES, loop_of
+from misfits import misfits
 
-from hypogoal.core.checkpoints import Checkpoints, State
-from hypogoal.core.errors import NumericalError
+from hypogoal.core.checkpoints import Checkpoints, State, Unlike, require_alike
+from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.learners import episodes
 from hypogoal.meta import training
@@ -76,6 +77,22 @@ def test_breaks_leave_no_trace(case: str, tmp_path: Path, monkeypatch: pytest.Mo
     fresh = loop_of(case).learner.state()  # type: ignore[attr-defined]
     assert any(not torch.equal(value, fresh[name]) for name, value in weights.items()), "nothing was learned"
 
+    saved, like = Checkpoints(path).load() or {}, loop_of(case).snapshot()
+    require_alike(saved, like)
+    if not loop.engine.alike:  # an own domain's, of which only it knows what belongs there
+        del saved["engine"], like["engine"]
+    accepted = [what for what in misfits(saved) if fits(saved, like)]
+    assert accepted == []
+
+
+def fits(saved: State, like: State) -> bool:
+    """Whether a state could be that of what is to go on."""
+    try:
+        require_alike(saved, like)
+    except Unlike:
+        return False
+    return True
+
 
 @pytest.mark.parametrize(("until", "reached"), [(0.9, True), (1.0, False)])
 def test_training_that_succeeds_ends_whatever_breaks_it(
@@ -126,6 +143,22 @@ def test_nan_stops_and_the_last_good_checkpoint_stays(tmp_path: Path) -> None:
     saved = checkpoints.load()
     assert saved is not None and saved["loop"]["recorder"]["episodes"]["steps"] == 39 * 3
     assert all(torch.isfinite(value).all() for value in saved["loop"]["learner"]["online"].values())
+
+
+def test_a_checkpoint_of_something_else_is_one_line(tmp_path: Path) -> None:
+    """Spec G2: its checksum is right; it is refused before anything is done, and stays. So is one of odd values."""
+    path = tmp_path / "checkpoint.safetensors"
+    case = "DoorKey, many layouts, random"
+    with pytest.raises(Broken):
+        run(case, tmp_path, Breaking(path, 23))
+    saved = Checkpoints(path).load() or {}
+    saved["loop"]["engine"]["sites"] = saved["loop"]["engine"]["sites"][:-1]
+    for name, fault in (("logged", "missing: /logged"), ("log", "missing: /log"), ("loop", "missing: /loop"), ("", "")):
+        odd = {key: value for key, value in saved.items() if key != name}
+        Checkpoints(path).save(odd)
+        with pytest.raises(UserError, match=f"the checkpoint does not fit .*{fault}.*Give --force and no --resume"):
+            run(case, tmp_path, Checkpoints(path))
+        assert path.exists()
 
 
 class Plain(Corridor):

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from hypogoal.core.checkpoints import Checkpoints, optimiser_snapshot, restore_optimiser
+from hypogoal.core.checkpoints import Checkpoints, growing, optimiser_snapshot, require_alike, restore_optimiser
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.seeding import global_state, restore_global, rng_for, seed_for
@@ -67,13 +67,13 @@ class _Watch(BaseCallback):
         self._seen, self._next = 0, LOG_INTERVAL
 
     def _on_rollout_start(self) -> None:
-        self.checkpoints.offer(self.snapshot)
+        self.checkpoints.offer(lambda: self.snapshot(self.model))
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self, agent: BaseAlgorithm) -> dict[str, Any]:
         """Where this is, where the agent is, and how much is logged."""
         log = self.log.snapshot() if self.log else 0
         watch = [self.first_goal, self._seen, self._next]
-        return {"agent": agent_snapshot(self.model, self.env), "watch": watch, "log": log}
+        return {"agent": agent_snapshot(agent, self.env), "watch": watch, "log": log}
 
     def restore(self, agent: BaseAlgorithm, snapshot: Mapping[str, Any]) -> None:
         """Continue with ``agent`` from a ``snapshot`` of the same training."""
@@ -182,10 +182,12 @@ def train(
             agent.exploration_schedule = lambda _: epsilon(agent.chosen, env.episodes.steps, watch.first_goal)
             agent.exploration_rate = 1.0
         saved = checkpoints.load()
-        if saved:
-            watch.restore(agent, saved)
-        if log:
-            log.restore(saved["log"] if saved else 0)
+        with checkpoints.restoring():
+            if saved is not None:
+                require_alike(saved, watch.snapshot(agent))
+                watch.restore(agent, saved)
+            if log:
+                log.restore(saved["log"] if saved else 0)
         with checkpoints:
             agent.learn(
                 steps - agent.num_timesteps,
@@ -203,7 +205,6 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
     The library saves its agents as pickles, without their environments and random numbers. Here what it knows between
     two rollouts is written down field by field; within a rollout (under a second) it cannot be interrupted.
     """
-    assert agent._last_obs is not None
     dqn: dict[str, Any] = {}
     if isinstance(agent, ExploringDQN):
         buffer = agent.replay_buffer
@@ -212,17 +213,19 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
         dqn = {
             "pos": buffer.pos,
             "full": buffer.full,
-            "columns": {name: getattr(buffer, name)[:kept].copy() for name in REPLAY_COLUMNS},
+            "columns": {name: growing(getattr(buffer, name)[:kept].copy()) for name in REPLAY_COLUMNS},
             "explore": agent.explore_rng.bit_generator.state,
             "counts": [agent._n_calls, agent.exploration_rate],
         }
+    shape = (env.num_envs, *env.observation_space.shape)  # type: ignore[misc]
+    fresh = np.zeros(shape, env.observation_space.dtype), np.ones(env.num_envs, np.bool_)
     return {
         "policy": agent.policy.state_dict(),
         "optimiser": optimiser_snapshot(agent.policy.optimizer),
         "counts": {name: getattr(agent, name) for name in COUNTS},
-        "logged": _logged(agent, prefix="train/"),
-        "last_observations": agent._last_obs,
-        "last_starts": agent._last_episode_starts,
+        "logged": growing(_logged(agent, prefix="train/"), 0.0),
+        "last_observations": fresh[0] if agent._last_obs is None else agent._last_obs,
+        "last_starts": fresh[1] if agent._last_episode_starts is None else agent._last_episode_starts,
         "dqn": dqn,
         "env": env.snapshot(),
         "torch": global_state(agent.device),
@@ -245,8 +248,9 @@ def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, A
         dqn, buffer = snapshot["dqn"], agent.replay_buffer
         assert buffer is not None
         buffer.pos, buffer.full = dqn["pos"], dqn["full"]
+        kept = buffer.buffer_size if buffer.full else buffer.pos
         for name, values in dqn["columns"].items():
-            getattr(buffer, name)[: len(values)] = values
+            getattr(buffer, name)[:kept] = values
         agent.explore_rng.bit_generator.state = dqn["explore"]
         agent._n_calls, agent.exploration_rate = dqn["counts"]
     env.restore(snapshot["env"])

@@ -1,0 +1,84 @@
+"""Locks that the kernel lets go of when their process ends, however it does; files that nobody holds are left over."""
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+fcntl: Any  # on POSIX a module, elsewhere None
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+LOCKED_BYTE = 1 << 30
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that cannot lock
+
+
+def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
+    """Take the kernel's lock on a file, which whoever inherits the file holds too, until the last of them closes it.
+
+    Whether it was free; None where the system cannot lock, and nobody is kept out.
+    """
+    if fcntl is None:
+        return None if shared else _try_lock_byte(file)
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        return None
+    return True
+
+
+def _try_lock_byte(file: IO[Any]) -> bool | None:
+    """On Windows: a byte far behind the text, so that others can read who has the lock."""
+    try:
+        import msvcrt
+    except ImportError:
+        return None
+    os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
+    try:
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    except OSError:
+        return False
+    return True
+
+
+def is_there(file: IO[Any], path: Path) -> bool:
+    """Whether ``path`` still is the file that was opened: its owner removes it at the end."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    return False
+
+
+@contextlib.contextmanager
+def fresh_file(path: Path) -> Iterator[None]:
+    """An empty file, locked while the block writes it by its name; gone when the block leaves it there.
+
+    Windows renames no open files: there it is not locked.
+    """
+    try:
+        while True:
+            with path.open("wb") as file:
+                if fcntl is None:
+                    file.close()
+                elif try_lock(file) is False or not is_there(file, path):
+                    continue  # someone takes it for left over, and removes it
+                yield
+                return
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def remove_left_over(path: Path) -> None:
+    """Remove a :func:`fresh_file` whose process has ended; where the system cannot lock, nobody knows, and it stays."""
+    if fcntl is None or path.is_symlink() or not path.is_file():
+        return
+    with path.open("r+b") as file:
+        if try_lock(file) and is_there(file, path):
+            path.unlink()
