@@ -222,7 +222,9 @@ def print_next(quiet: bool, *words: object) -> None:
 
 def command_again(context: typer.Context, **changes: object) -> str:
     """The command that runs, as one would type it, with other values of some options."""
-    words: list[object] = ["hypogoal", context.info_name]
+    from hypogoal.core.commands import command as typed
+
+    words: list[object] = [context.info_name]
     for option in context.command.params:
         value = changes.get(str(option.name), context.params.get(str(option.name)))
         if option.param_type_name == "argument":
@@ -231,7 +233,7 @@ def command_again(context: typer.Context, **changes: object) -> str:
             switch = option.opts[0]
             values = value if isinstance(value, list) else [value]
             words += [switch] if value is True else [word for each in values for word in (switch, each)]
-    return shlex.join(map(str, words))
+    return typed(*words)
 
 
 def echo(value: Any, as_json: bool, text: list[str]) -> None:
