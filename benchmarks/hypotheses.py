@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from hypogoal.core.compute import prepare
 from hypogoal.core.progress import Progress
+from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
@@ -274,7 +275,7 @@ def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -
         for method in tested:
             other = by_seed(test, method, chosen[method], ranking, goals)
             if method != "dbat" and len(own) == len(other):
-                yield [f"{method}{title}", interval(own - other), f"{(own > other).sum()} of {len(own)}"]
+                yield [f"{method}{title}", interval(own - other), f"{above(own, other).sum()} of {len(own)}"]
 
 
 def _seeds(numbers: Numbers) -> str:
