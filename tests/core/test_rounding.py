@@ -30,8 +30,10 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
 
 @pytest.mark.parametrize(
     "share",
-    [NEAR, SOLVED, Patience.ENOUGH, ace.LEAST_SHARE, *montezuma_states.SHARES.values()]
-    + [montezuma_states.SPARE, montezuma_states.FEWEST_POSITIVES, montezuma_states.FEWEST_AT_A_BASE],
+    [
+        *(NEAR, SOLVED, Patience.ENOUGH, ace.LEAST_SHARE, *montezuma_states.SHARES.values(), montezuma_states.SPARE),
+        *(montezuma_states.FEWEST_POSITIVES, montezuma_states.FEWEST_AT_A_BASE),
+    ],
 )
 def test_shares_of_counts_need_no_tolerance(share: float) -> None:
     """Where a constant's share of a whole number is a whole number, floats hit it: these are compared as they are."""

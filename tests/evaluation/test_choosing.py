@@ -136,11 +136,11 @@ def test_a_difference_of_exactly_two_tenths_counts(hundredths: int) -> None:
 @pytest.mark.parametrize("members", range(2, 12))
 def test_exactly_twenty_expected_choices_suffice(members: int) -> None:
     """Twenty times each of the members offered is twenty, though thirds do not add up so."""
-    options = list(range(members)) * 20
-    judged = judge(decisions(options, [list(range(members))] * len(options), members), np.zeros(members), members)
-    assert judged["preference"].tolist() == [1.0] * members
-    judged = judge(decisions(options[1:], [list(range(members))] * (len(options) - 1), members), np.zeros(members), members)
-    assert np.isnan(judged["preference"]).all()
+    options, quality = list(range(members)) * 20, np.zeros(members)
+    for count, known in ((len(options), True), (len(options) - 1, False)):
+        choices = decisions(options[:count], [list(range(members))] * count, members)
+        preference = judge(choices, quality, members)["preference"]
+        assert preference.tolist() == [1.0] * members if known else np.isnan(preference).all()
 
 
 @pytest.mark.parametrize("hundredths", range(101))
