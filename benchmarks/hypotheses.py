@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from hypogoal.core.compute import prepare
 from hypogoal.core.progress import Progress
+from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected, States
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
@@ -270,7 +271,7 @@ def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -
         cells = []
         for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
             own, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
-            cells.append(f"{interval(own - other)} ({(own > other).sum()})" if len(own) == len(other) else "-")
+            cells.append(f"{interval(own - other)} ({above(own, other).sum()})" if len(own) == len(other) else "-")
         if method != "dbat":
             yield [method, *cells]
 

@@ -23,6 +23,7 @@ from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
+from hypogoal.core.rounding import above
 from hypogoal.core.seeding import seed_for
 from hypogoal.dataset import Collected
 from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
@@ -206,7 +207,7 @@ def _cross_fitted(numbers: Numbers, method: str) -> list[str]:
     seeds = numbers[method]
     own, dbat = crossed(seeds, "ranking"), crossed(numbers["dbat"], "ranking")
     steps = f"{picked(seeds, 'first')}, {picked(seeds, 'second')}"
-    versus = ["-", "-"] if method == "dbat" else [interval(dbat - own), f"{(dbat > own).sum()} of {len(own)}"]
+    versus = ["-", "-"] if method == "dbat" else [interval(dbat - own), f"{above(dbat, own).sum()} of {len(own)}"]
     return [method, steps, interval(own), interval(crossed(seeds, "balanced_accuracy")), *versus]
 
 

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.manifests import MANIFEST, files_of, sealed
+from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import Collected, States, write_dataset
 
 SHAPE = (4, 5, 3)
@@ -28,7 +30,13 @@ def write(path: Path, states: int = 7, domain: str = "toy") -> Path:
 
 
 def fill(artefact: Path, kind: str, config: Mapping[str, Any]) -> None:
-    """Empty files in place of those that an artefact of a kind must have and a test does not read."""
+    """Empty files in place of those that an artefact of a kind must have and a test does not read.
+
+    Of options there are thresholds, which every evaluation reads: log-odds of 0, 1, and so on.
+    """
+    if kind in ("options", "meta"):
+        thresholds = torch.arange(len(config["sub_goals"]) * config["members"], dtype=torch.float32)
+        save_tensors(artefact / "options.safetensors", {"thresholds": thresholds})
     for name in files_of(kind, config) or ():
         if name.endswith(".h5") and not (artefact / name).exists():
             with create_hdf5(artefact / name):

@@ -33,7 +33,7 @@ def which_feature(
         str, Option(help="Planted features; another is moved, of two frames.")
     ] = "colour,shape,place,count",
     high: Annotated[float, Option(help="A member owns a feature that it ranks at least this well,")] = 0.95,
-    low: Annotated[float, Option(help="if it ranks every other feature at most this well.")] = 0.6,
+    low: Annotated[float, Option(help="if it ranks every other at most this well, either way round.")] = 0.6,
     set_: cli.Set = None,
     quiet: cli.Quiet = False,
 ) -> None:
@@ -46,9 +46,10 @@ def which_feature(
     scored on scenes in which all features are crossed:
 
     - coverage: the share of features that some member ranks by (area under the
-    ROC curve of at least --high) while it ranks by no other (at most --low)
+    ROC curve of at least --high) while it ranks by no other, neither way round
+    (1 - --low to --low)
     - best: the highest ranking of a feature by a member, mean over features
-    - same: the share of pairs of members with the same best feature
+    - same: the share of pairs of members that rank most by the same feature
     - gap: what the threshold of 0.5 costs in balanced accuracy
     - labels: how many it takes to find the right member, for the features
     that are covered

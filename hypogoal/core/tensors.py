@@ -35,21 +35,22 @@ def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     path.write_bytes(save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}))
 
 
-def load_tensors(path: Path) -> dict[str, Tensor]:
-    """Read tensors by name: as many bytes as the file has, whatever its header declares.
+def load_tensors(path: Path, only: str | None = None) -> dict[str, Tensor]:
+    """Read tensors by name, or ``only`` one of them: as many bytes as the file has, whatever its header declares.
 
     Missing, truncated, not safetensors, of another type than ``KEPT``, NaN or Inf is a ``UserError``.
     """
     import torch
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    from safetensors import SafetensorError, safe_open
 
     with open_file(path, "the weights are", AGAIN) as file:
         header, size = int.from_bytes(file.read(8), "little"), file.seek(0, os.SEEK_END)
     if header > min(size - 8, MAX_HEADER_BYTES):
         raise UserError(f"the weights are damaged (a header of {header} bytes in a file of {size})", path, AGAIN)
     try:
-        tensors: dict[str, Tensor] = load_file(path)
+        with safe_open(path, framework="pt") as weights:
+            names = [name for name in weights.keys() if only in (None, name)]  # noqa: SIM118
+            tensors: dict[str, Tensor] = {name: weights.get_tensor(name) for name in names}
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"the weights are damaged ({error})", path, AGAIN) from None
     check_types(tensors, path, AGAIN)

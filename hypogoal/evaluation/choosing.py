@@ -18,6 +18,7 @@ from rich.table import Table
 from scipy.stats import rankdata
 
 from hypogoal.core.artefacts import Artefact
+from hypogoal.core.rounding import DIGITS, above, at_least
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
@@ -100,17 +101,17 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
     of_goal = choices.offered & (options // members == (choices.options // members)[:, None])
     several = of_goal.sum(axis=1) > 1
     taken, among = choices.options[several], of_goal[several]
-    expected = (among / among.sum(axis=1, keepdims=True)).sum(axis=0)
+    expected = (among / among.sum(axis=1, keepdims=True)).sum(axis=0).round(DIGITS)  # in any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
-    preference = np.where(expected >= LEAST, chosen / np.maximum(expected, 1e-12), np.nan)
+    preference = np.where(at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
     rhos, better, worse = [], 0, 0
     for goal in range(len(quality) // members):
         own = slice(goal * members, (goal + 1) * members)
         known = ~np.isnan(quality[own]) & ~np.isnan(preference[own])
-        if known.sum() > 1 and np.ptp(quality[own][known]) >= DIFFERENCE:
+        if known.sum() > 1 and at_least(np.ptp(quality[own][known]), DIFFERENCE):
             rhos.append(rank_correlation(quality[own][known], preference[own][known]))
         for one, other in combinations(options[own].tolist(), 2):
-            if abs(quality[one] - quality[other]) >= DIFFERENCE:
+            if at_least(abs(quality[one] - quality[other]), DIFFERENCE):
                 good, bad = (one, other) if quality[one] > quality[other] else (other, one)
                 both = among[:, one] & among[:, other]
                 better, worse = better + int((taken[both] == good).sum()), worse + int((taken[both] == bad).sum())
@@ -124,7 +125,7 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
         "preference": preference,
         "within_rho": mean_of([rho for rho in rhos if not math.isnan(rho)]),
         "pair": better / (better + worse) if better + worse else math.nan,
-        "score": float((got - mean).sum()) / gain if gain > 0 else math.nan,
+        "score": float((got - mean).sum()) / gain if above(gain, 0.0) else math.nan,
     }
 
 

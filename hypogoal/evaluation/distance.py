@@ -41,7 +41,7 @@ from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
 from hypogoal.evaluation.rooms import CELL, WHICH, group_name, of_rooms
-from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, within
+from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, thresholds_of, within
 from hypogoal.hypotheses.scores import most_and_least
 
 if TYPE_CHECKING:
@@ -211,7 +211,10 @@ def numbers(work: Work) -> dict[str, Any]:
             for option, states in read_terminations(artefact.path / "terminations.h5").items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
         about = {"path": path, "ladder": artefact.config["start"], "seed": artefact.seed, **about}
-        options += [{**about, **row} for row in rows_of_ladder(artefact, executions[path], validated)]
+        learned, thresholds = rows_of_ladder(artefact, executions[path], validated), thresholds_of(artefact)
+        for option in (option for row in learned for option in row["options"]):
+            option["threshold"] = thresholds[option["option"]].item()
+        options += [{**about, **row} for row in learned]
         work.progress.advance()
     names = {artefact.config["domain"] for artefact in found.ladders}
     domain = installed_domain(names.pop()) if len(names) == 1 else None

@@ -37,22 +37,21 @@ def sub_goal_metrics(
     labels: NDArray[np.bool_],
     layout_seeds: NDArray[np.int64] | None,
     unlabelled: NDArray[np.bool_],
+    thresholds: NDArray[np.float32],
 ) -> dict[str, Any]:
     """Spec F1, F2: one sub-goal's K members by their verdicts on N held-out states and on M unlabelled ones.
 
-    Scores of every member, pooled over the layouts, which are told where they are known (N,); best, mean and worst
-    balanced accuracy; the mean disagreement of two members on either set of states.
+    Scores of every member, pooled over the layouts, which are told where they are known (N,), at its own threshold
+    (K,); best, mean and worst balanced accuracy; the mean disagreement of two members on either set of states.
     """
     scores, members = member_scores(heldout, labels), heldout.shape[1]
     says_yes = unlabelled.mean(0) if len(unlabelled) else np.full(members, math.nan)
+    more = {"says_yes_unlabelled": says_yes, "threshold": thresholds.astype(np.float64)}
     return {
         "sub_goal": sub_goal,
         "states": len(labels),
         "positives": int(labels.sum()),
-        "members": [
-            {"member": member, **row, "says_yes_unlabelled": float(says_yes[member])}
-            for member, row in enumerate(by_member(scores))
-        ],
+        "members": [{"member": member, **row} for member, row in enumerate(by_member(scores | more))],
         "balanced_accuracy": best_mean_worst(scores["balanced_accuracy"]),
         "layouts": [] if layout_seeds is None else np.unique(layout_seeds).tolist(),
         "disagreement": {"unlabelled": mean_disagreement(unlabelled), "heldout": mean_disagreement(heldout)},
@@ -62,8 +61,8 @@ def sub_goal_metrics(
 def look(work: Work, judgement: Judgement) -> None:
     """Every member on held-out and unlabelled states."""
     split, judged = judgement.split, judgement.judged
-    layouts = split.origins.get("layout_seed")
-    judgement.row.update(sub_goal_metrics(judgement.case.sub_goal, judged.verdicts, split.labels, layouts, judged.told))
+    layouts, said = split.origins.get("layout_seed"), (judged.told, judged.thresholds)
+    judgement.row.update(sub_goal_metrics(judgement.case.sub_goal, judged.verdicts, split.labels, layouts, *said))
 
 
 def of_layouts(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:

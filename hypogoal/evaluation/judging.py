@@ -57,6 +57,7 @@ class Judged(NamedTuple):
     probabilities: NDArray[np.float32]  # (N, K), that the sub-goal is reached
     verdicts: NDArray[np.bool_]  # (N, K), each at its member's own threshold
     told: NDArray[np.bool_]  # (M, K), the verdicts on unlabelled states
+    thresholds: NDArray[np.float32]  # (K,), each member's own, of the probability
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def judge(case: Case) -> Judged:
     thresholds = ensemble.thresholds.numpy()
     probabilities = ensemble.predict(split.observations, positions_of(split.origins))
     told = ensemble.predict(unlabelled.observations, unlabelled.positions)
-    return Judged(probabilities, probabilities > thresholds, told > thresholds)
+    return Judged(probabilities, probabilities > thresholds, told > thresholds, thresholds)
 
 
 @lru_cache(maxsize=1)

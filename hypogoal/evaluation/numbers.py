@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 from scipy.stats import binomtest, bootstrap, trim_mean
 
+from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 
 Metrics = Mapping[str, Any]
@@ -255,7 +256,7 @@ def compare_pairs(
     there = ~(np.isnan(first) | np.isnan(second))
     marks = [mark for mark, both in zip(units, there, strict=True) if both]
     difference = first[there] - second[there]
-    better = np.sign(difference if higher else -difference)
+    better = np.sign((difference if higher else -difference).round(DIGITS))
     scores, differences = (by_unit(values, marks) for values in ((1 + better) / 2, difference))
     won, lost = int((scores > 0.5).sum()), int((scores < 0.5).sum())
     return {

@@ -95,6 +95,21 @@ def takes(artefact: Artefact) -> bool:
     return artefact.kind != "baseline" and artefact.config["termination"] != "oracle"
 
 
+def thresholds_of(artefact: Artefact) -> NDArray[np.float64]:
+    """The probabilities (G*K,) above which an artefact's options end; they may have fallen while it learned.
+
+    NaN where options end at true sub-goals, and of files from before 0.7.
+    """
+    from hypogoal.core.tensors import load_tensors  # with PyTorch, which a report needs not
+    from hypogoal.options.termination import THRESHOLDS, thresholds_in
+
+    options = len(artefact.config["sub_goals"]) * artefact.config["members"]
+    saved = load_tensors(artefact.path / "options.safetensors", THRESHOLDS) if takes(artefact) else {}
+    if not saved:
+        return np.full(options, np.nan)
+    return 1 / (1 + np.exp(-thresholds_in(saved, options).astype(np.float64)))
+
+
 def within(contents: Contents, source: Artefact) -> str | None:
     """An ensemble's path within the run; None where it is not one of the run's."""
     same = (artefact for artefact in contents.ensembles if artefact.path.resolve() == source.path.resolve())

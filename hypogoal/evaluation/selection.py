@@ -23,7 +23,7 @@ from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
-from hypogoal.evaluation.run import Choices, read_choices, within
+from hypogoal.evaluation.run import Choices, read_choices, thresholds_of, within
 from hypogoal.hypotheses.scores import member_scores, most_and_least
 from hypogoal.meta.config import layout_seeds
 
@@ -97,6 +97,9 @@ def numbers(work: Work) -> dict[str, Any]:
                 work.arrays[place].attrs["states"] = count
             of = {name: about[name] for name in ("path", "seed", "layout_seed")}
             chosen = selection_of_run(choices, members.match, config["sub_goals"], config["members"])
+            thresholds = thresholds_of(artefact)
+            for member in (member for goal in chosen for member in goal["members"]):
+                member["threshold"] = thresholds[member["option"]].item()
             rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})
         if rows:
             metrics.append({"name": agent["name"], "runs": rows})

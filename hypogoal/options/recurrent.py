@@ -2,6 +2,7 @@
 
 The GRU is unrolled over the option's own steps: acting carries its hidden state from the option's first step on;
 learning samples a step and replays the option's execution up to it. Every member learns from its own executions.
+BatchNorm sees a batch's distinct images, see DEV-51.
 """
 
 import copy

@@ -1,6 +1,7 @@
 """Spec H5: how often policies fool a success classifier, where, and what a mend changes."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,9 @@ def audit(
         write_trained(folder, loop, world, about, config, seed)
         table, report = read_table(folder / exploits.TABLE, exploits.COLUMNS), dict.fromkeys(POLICIES)
         for option, (name, edge) in enumerate(zip(POLICIES, edges.tolist(), strict=False)):
-            report[name] = {"threshold": edge, **findings(loop, table, option, world.sub_goals, folder)}
+            ended = float(1 / (1 + np.exp(-loop.terminations.thresholds[option])))  # it may have fallen: patience
+            threshold = edge if math.isclose(ended, edge, rel_tol=1e-6) else ended  # which float32 log-odds round
+            report[name] = {"threshold": threshold, **findings(loop, table, option, world.sub_goals, folder)}
         report["random_play"] = random_play(loop, column, rng_for(seed, "random-play"))
         (folder / "audit.json").write_text(json.dumps(plain(report), indent=1) + "\n", encoding="utf-8")
     return report

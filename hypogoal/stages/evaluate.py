@@ -24,11 +24,10 @@ from hypogoal.evaluation.run import LAST, WINDOW, find, most_used
 from hypogoal.experiments.cells import DERIVED
 from hypogoal.experiments.records import PLAN, read_plan
 from hypogoal.experiments.status import stamp_of
-from hypogoal.hypotheses.ensemble import THRESHOLD
 from hypogoal.meta.config import layout_seeds
 from hypogoal.needs import evaluation_needs
 
-SETTINGS = {"window": WINDOW, "solved": SOLVED, "threshold": THRESHOLD}
+SETTINGS = {"window": WINDOW, "solved": SOLVED}
 LADDERS = {"executions": LAST, "inside_counts": INSIDE, "near": NEAR}  # settings that only runs with ladders have
 
 

@@ -97,5 +97,5 @@ def train_baseline(
         save_tensors(folder / "policy.safetensors", weights(agent))
         write_layout(folder, engine, config.layout_seed, config.random_episodes, seed)
     episodes = env.episodes
-    success = episodes.success() if episodes else 0.0
-    return {"steps": episodes.steps, "episodes": len(episodes), "success": success, "length": episodes.length()}
+    counted = {"steps": episodes.steps, "episodes": len(episodes)}
+    return counted | {"success": episodes.success(), "length": episodes.length()}

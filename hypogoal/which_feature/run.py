@@ -44,7 +44,7 @@ class WhichFeatureConfig(EnsembleConfig):
     seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
     factors: tuple[str, ...] = setting(FACTORS, f"planted features, of {', '.join(KNOWN)}", choices=KNOWN)
     high: float = setting(0.95, "a member owns a factor that it ranks at least this well", low=0.5, high=1.0)
-    low: float = setting(0.6, "if it ranks every other factor at most this well", low=0.0, high=1.0)
+    low: float = setting(0.6, "if it ranks every other factor at most this well, either way round", low=0.5, high=1.0)
 
 
 def resolved(options: Mapping[str, Any], assignments: Iterable[str] = ()) -> WhichFeatureConfig:

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.rounding import at_least
 from hypogoal.hypotheses.scores import best_threshold, member_scores, ranking
 
 THRESHOLD = 0.5  # of the probability, above which a member says yes
@@ -33,18 +34,19 @@ def balanced_accuracies(probabilities: NDArray[np.float32], factors: NDArray[np.
 
 
 def owned(ranked: Table, high: float = 0.95, low: float = 0.6) -> NDArray[np.bool_]:
-    """Which member owns which factor, bool (K, F): it ranks by it, at least ``high``, and by no other, at most ``low``.
+    """Which member owns which factor, bool (K, F): it ranks by it, at least ``high``, and by no other.
 
-    ``ranked``, ``high`` and ``low`` are areas under the ROC curve, see :func:`rankings`.
+    By no other: neither way round, so all others lie within 1 - ``low`` and ``low``. ``ranked``, ``high`` and ``low``
+    (at least .5) are areas under the ROC curve, see :func:`rankings`.
     """
-    known, unknown = ranked >= high, ranked <= low
+    known, unknown = at_least(ranked, high), at_least(low - 0.5, np.abs(ranked - 0.5))
     return known & (unknown.sum(axis=1, keepdims=True) == ranked.shape[1] - 1)
 
 
 def redundancy(ranked: Table) -> float:
-    """The share of pairs of members whose best factor is the same; NaN for one member. Chance: 1 / F."""
-    best = ranked.argmax(axis=1)
-    same = [best[a] == best[b] for a, b in combinations(range(len(best)), 2)]
+    """The share of pairs of members that rank most by the same factor, either way round; NaN for one. Chance: 1 / F."""
+    most = np.abs(ranked - 0.5).argmax(axis=1)
+    same = [most[a] == most[b] for a, b in combinations(range(len(most)), 2)]
     return float(np.mean(same)) if same else float("nan")
 
 
@@ -69,13 +71,13 @@ def labels_needed(
     verdicts = probabilities > THRESHOLD
     most = min(MOST_LABELS, len(verdicts))
     orders = np.stack([rng.permutation(len(verdicts))[:most] for _ in range(ORDERS)])  # (R, n)
-    right = ranked >= ranked.max(axis=0) - NEAR  # (K, F)
+    right = at_least(ranked, ranked.max(axis=0) - NEAR)  # (K, F)
     needed = []
     for factor, truth in enumerate(factors.T):
         hits = (verdicts == truth[:, None])[orders].cumsum(axis=1)  # (R, n, K)
         picked = hits == hits.max(axis=2, keepdims=True)
         sure = (picked & right[:, factor]).sum(axis=2) / picked.sum(axis=2)
         chances = np.concatenate([[right[:, factor].mean()], sure.mean(axis=0)])
-        failing = np.flatnonzero(chances < SURE)
+        failing = np.flatnonzero(~at_least(chances, SURE))
         needed.append(failing[-1] + 1 if len(failing) else 0)
     return np.array(needed, dtype=np.int64)

@@ -104,3 +104,48 @@ def test_what_nobody_knows_is_left_out() -> None:
     assert math.isnan(judged["pair"])
     assert math.isnan(judged["score"])
     assert math.isnan(judged["within_rho"])
+
+
+@pytest.mark.parametrize("hundredths", range(0, 81, 4))
+def test_a_difference_of_exactly_two_tenths_counts(hundredths: int) -> None:
+    """Whatever floating point makes of it, and a hundredth less does not."""
+    low, high, short = (number / 100 for number in (hundredths, hundredths + 20, hundredths + 19))
+    choices = decisions([0] * 20 + [1] * 30, [[0, 1]] * 50, 2)
+    judged = judge(choices, np.array([low, high]), 2)
+    assert judged["pair"] == 0.6
+    assert judged["within_rho"] == pytest.approx(1.0)
+    judged = judge(choices, np.array([low, short]), 2)
+    assert math.isnan(judged["pair"])
+    assert math.isnan(judged["within_rho"])
+
+
+@pytest.mark.parametrize("members", range(2, 12))
+def test_exactly_twenty_expected_choices_suffice(members: int) -> None:
+    """Twenty times each of the members offered is twenty, though thirds do not add up so."""
+    options, quality = list(range(members)) * 20, np.zeros(members)
+    for count, known in ((len(options), True), (len(options) - 1, False)):
+        choices = decisions(options[:count], [list(range(members))] * count, members)
+        preference = judge(choices, quality, members)["preference"]
+        assert preference.tolist() == [1.0] * members if known else np.isnan(preference).all()
+
+
+@pytest.mark.parametrize("hundredths", range(101))
+def test_members_of_one_quality_leave_nothing_to_choose(hundredths: int) -> None:
+    """The mean of three equal numbers may be off by rounding; that is no gain."""
+    judged = judge(decisions([0, 1, 2] * 20, [[0, 1, 2]] * 60, 3), np.full(3, hundredths / 100), 3)
+    assert math.isnan(judged["score"])
+    assert math.isnan(judged["pair"])
+
+
+def test_the_order_of_decisions_does_not_matter() -> None:
+    """Sums of thirds and halves in another order: equal preferences stay equal, and share their rank."""
+    rng, offered = np.random.default_rng(0), [[0, 1, 2], [0, 1], [0, 2], [1, 2]] * 30
+    taken = [some[row // 4 % 2 if len(some) == 2 else 0] for row, some in enumerate(offered)]  # 60, 30 and 30 times
+    quality = np.array([0.1, 0.5, 0.9])
+    expected = judge(decisions(taken, offered, 3), quality, 3)
+    assert expected["within_rho"] == pytest.approx(-np.sqrt(3) / 2)
+    for _ in range(20):
+        order = rng.permutation(len(taken))
+        judged = judge(decisions([taken[row] for row in order], [offered[row] for row in order], 3), quality, 3)
+        assert judged["within_rho"] == expected["within_rho"]
+        assert judged["preference"].tolist() == expected["preference"].tolist()

@@ -30,6 +30,17 @@ def test_a_win_in_every_pair_is_not_certainty():
     assert found["difference"] == pytest.approx(7 / 5)
 
 
+def test_means_that_differ_by_rounding_alone_are_ties():
+    """The same three members in another order, the other method's are no better and no worse."""
+    members = np.array([[0.1, 0.2, 0.3], [0.7, 0.8, 0.9], [0.4, 0.6, 0.7]])
+    first, second = members.mean(axis=1), members[:, [2, 0, 1]].mean(axis=1)
+    assert (first != second).any()
+    for higher in (True, False):
+        found = pairs(first, second, higher=higher)
+        assert (found["wins"], found["ties"], found["probability"]) == (0, 3, 0.5)
+        assert np.isnan(found["sign_test"])
+
+
 def test_pairs_of_one_unit_are_one_piece_of_evidence():
     """Spec F5: one ensemble that wins on nine ladders has won once; two of three units won is no 6 of 9."""
     once = pairs([1] * 9, [0] * 9, [0] * 9)

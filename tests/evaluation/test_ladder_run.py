@@ -142,6 +142,10 @@ def test_distances_are_those_of_the_tables(metrics):
     wanted = [1.5 * (10 * (validated[seed] + 1) + seed) for seed in (0, 1)]
     assert dbat["validated"]["mean"] == pytest.approx(np.mean(wanted))
     assert len(found["options"]) == 2 * 2 * 4
+    for row in found["options"]:
+        fell = [np.nan, np.nan] if row["method"] == "oracle termination" else [0.5, 1 / (1 + np.exp(-1))]
+        told = [np.nan if (edge := option["threshold"]) is None else edge for option in row["options"]]
+        assert told == pytest.approx(fell[: len(told)], nan_ok=True)
     pairs = {(row["second"], row["quantity"].split()[1]): row for row in metrics["comparisons"]["distance"]}
     best, mean = pairs["single CNN", "best"], pairs["single CNN", "mean"]
     assert best["ties"] == best["n"] == 4 and best["units"] == 2

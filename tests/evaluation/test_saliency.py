@@ -212,7 +212,7 @@ def test_attributions_are_to_what_members_see(tmp_path):
     where = {name: np.arange(3) for name in ("room", "x", "y")}
     split = States(observations, np.array([True, False, False]), where)
     yes = np.array([[True], [True], [False]])
-    judged = Judged(np.array([[0.9], [0.8], [0.1]], np.float32), yes, yes[2:])
+    judged = Judged(np.array([[0.9], [0.8], [0.1]], np.float32), yes, yes[2:], np.array([0.5], np.float32))
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
         here = Here(tmp_path, "down", tmp_path, {})
         work = Work(Contents(tmp_path, [], [], [], [], []), arrays, None, shown=0)

@@ -153,6 +153,14 @@ def test_a_policy_learns_to_fool_and_none_fools_the_truth(tmp_path: Path) -> Non
     assert truth["before"]["there"] >= 50
 
 
+def test_a_threshold_that_falls_is_told_as_it_ends(tmp_path: Path) -> None:
+    """From .9, which this classifier never says, to half of its log-odds: with patience, and not without."""
+    where = [*CORRIDOR, *settings("steps=400", "mend=0", "warm_up=400", "threshold=0.9")]
+    for rule, told in (("learned", 0.9), ("patience:100", 0.75)):
+        report, _ = audited(tmp_path / rule.partition(":")[0], "too_soon", *where, *settings(f"termination={rule}"))
+        assert report["before"]["threshold"] == pytest.approx(told)
+
+
 def test_places_are_kinds_of_their_own(tmp_path: Path) -> None:
     """Spec H5: two places that look like success to it are two kinds, the more frequent first, each with its film."""
     played = settings("steps=400", "mend=0", "warm_up=400", "option_timeout=1")  # nothing is learned, so both are met

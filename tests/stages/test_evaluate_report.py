@@ -1,5 +1,6 @@
 """Spec A5, F, F7: a run of real, tiny artefacts is evaluated and drawn; what is missing is named."""
 
+import csv
 import io
 import json
 import re
@@ -49,7 +50,8 @@ def run(tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "tiny"
     collect(DOMAIN, DoorKeyConfig(heldout_layouts=2, unlabelled_seeds=(1,)), run / "data.h5", **QUIET)
     train_ensemble(run / "data.h5", TrainEnsembleConfig(steps=20, **SMALL), run / "ensemble", **QUIET)
-    other = TrainEnsembleConfig(steps=20, diversity="none", sub_goals=("collect-red-key",), **SMALL)
+    rule = {"diversity": "none", "threshold": "positives-median"}
+    other = TrainEnsembleConfig(steps=20, sub_goals=("collect-red-key",), **rule, **SMALL)
     train_ensemble(run / "data.h5", other, run / "ensemble-none", **QUIET)
     source = run / "ensemble"
     train_options(source, TrainOptionsConfig(steps=1_024, **SHORT), run / "options", **QUIET)
@@ -129,6 +131,35 @@ def test_members_are_judged_on_heldout_states(run, metrics):
     assert goal["disagreement"]["heldout"] == pytest.approx((yes[:, 0] != yes[:, 1]).mean())
     assert goal["layouts"] == sorted(set(split.origins["layout_seed"].tolist()))
     assert len(metrics["hypotheses"]) == len(SUB_GOALS) + 1
+
+
+def test_thresholds_are_those_of_members_and_of_options(run, metrics, tmp_path):
+    """Whatever rule set them; of options they are the artefact's, which may have fallen since."""
+    from hypogoal.core.tensors import load_tensors, save_tensors
+    from hypogoal.evaluation.run import thresholds_of
+    from hypogoal.hypotheses.ensemble import read_ensemble
+
+    by_place = {}
+    for name, ensemble in zip(("ensemble", "ensemble-none"), metrics["ensembles"], strict=True):
+        source = open_artefact(run / name)
+        for goal in ensemble["sub_goals"]:
+            wanted = read_ensemble(source.path, source.config, goal["sub_goal"]).thresholds.tolist()
+            assert [member["threshold"] for member in goal["members"]] == wanted
+            by_place |= {(name, goal["sub_goal"], str(member)): value for member, value in enumerate(wanted)}
+    assert by_place["ensemble", "collect-red-key", "0"] == 0.5 != by_place["ensemble-none", "collect-red-key", "0"]
+    assert "threshold" not in metrics["settings"]
+    with (run / "evaluation" / "numbers.csv").open(newline="") as file:
+        told = [row for row in csv.DictReader(file) if row["quantity"] == "threshold" and row["scope"] == "heldout"]
+    assert {(row["artefact"], row["sub_goal"], row["member"]): float(row["value"]) for row in told} == by_place
+    (agent,) = metrics["selection"][0]["runs"]
+    assert {member["threshold"] for goal in agent["sub_goals"] for member in goal["members"]} == {0.5}
+
+    shutil.copytree(run / "meta", tmp_path / "meta")
+    weights = load_tensors(tmp_path / "meta" / "options.safetensors")
+    weights["thresholds"][3] = -np.log(3.0)
+    save_tensors(tmp_path / "meta" / "options.safetensors", weights)
+    assert thresholds_of(open_artefact(tmp_path / "meta")) == pytest.approx([0.5] * 3 + [0.25] + [0.5] * 6)
+    assert np.isnan(thresholds_of(open_artefact(run / "meta-oracle"))).all()
 
 
 def test_attributions_are_complete(run, metrics):

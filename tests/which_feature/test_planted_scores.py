@@ -54,6 +54,34 @@ def test_a_member_that_uses_two_factors_owns_neither() -> None:
     assert scores.owned(ranked, low=0.8).any(axis=0).mean() == 0.25
 
 
+def test_a_member_that_ranks_by_another_factor_the_wrong_way_round_owns_neither() -> None:
+    """A ranking of .25 says as much of a factor as one of .75: what is owned does not change with a factor's sign."""
+    against = (0.6 * FACTORS[:, :1] - 0.2 * FACTORS[:, 1:2]).astype(np.float32)
+    ranked = scores.rankings(against, FACTORS)
+    assert ranked[0].tolist() == [1.0, 0.25, 0.5, 0.5]
+    assert not scores.owned(ranked).any()
+    table = rng().random((500, 4)) * 0.5 + 0.25
+    table[:, 0] = 1.0
+    turned = np.where(rng().random((500, 4)) < 0.5, table, 1 - table)
+    turned[:, 0] = 1.0
+    assert (scores.owned(table) == scores.owned(turned)).all()
+    assert 0 < scores.owned(table).sum() < 500
+
+
+@pytest.mark.parametrize("low", [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9])
+def test_bounds_of_owning_are_met_exactly(low: float) -> None:
+    """On either side, a thousandth beyond them no more; the same of the upper bound."""
+    for other, owns in ((low, True), (1 - low, True), (low + 0.001, False), (1 - low - 0.001, False)):
+        assert scores.owned(np.array([[0.95, other]]), low=low).any() == owns
+    assert not scores.owned(np.array([[0.949, 0.5]]), low=low).any()
+
+
+def test_redundancy_asks_by_what_members_rank_not_which_way_round() -> None:
+    """Members that rank by the first factor, one of them against it."""
+    assert scores.redundancy(np.array([[0.9, 0.6], [0.1, 0.6]])) == 1.0
+    assert scores.redundancy(np.array([[0.9, 0.6], [0.3, 0.8]])) == 0.0
+
+
 def test_redundancy_counts_pairs() -> None:
     """Best factors 0, 0, 1: one pair of three. One member has no pairs."""
     ranked = scores.rankings(SURE[:, [0, 0, 1]], FACTORS)
@@ -89,3 +117,17 @@ def test_labels_do_not_tell_members_that_say_the_same() -> None:
     members = np.concatenate([0.5 * SURE[:, :1], np.full((320, 1), 0.2, np.float32)], axis=1)
     needed = scores.labels_needed(members, FACTORS, scores.rankings(members, FACTORS), rng())
     assert needed[0] == scores.MOST_LABELS + 1
+
+
+def test_a_member_is_right_that_ranks_a_hundredth_below_the_best() -> None:
+    """``NEAR`` exactly; two hundredths below it is wrong, and no label tells members apart that say the same."""
+    members = np.repeat(SURE[:, :1], 2, axis=1)
+    for less, needed in ((1, 0), (2, scores.MOST_LABELS + 1)):
+        ranked = np.array([[0.57, 0.83, 0.97, 1.0], [0.57, 0.83, 0.97, 1.0]]) - [[0], [less / 100]]
+        assert (scores.labels_needed(members, FACTORS, ranked, rng()) == needed).all()
+
+
+def test_a_probability_of_nine_tenths_is_sure() -> None:
+    """Nine of ten members that say the same are right: .9 after any number of labels, however means are rounded."""
+    ranked = np.array([[1.0] * 4] * 9 + [[0.5] * 4])
+    assert (scores.labels_needed(np.repeat(SURE[:, :1], 10, axis=1), FACTORS, ranked, rng()) == 0).all()
