@@ -72,7 +72,7 @@ def ensemble_needs(
     ways |= next(({f"--set batch_size={batch}": memory(batch)} for batch in batches if memory(batch) < free), {})
     if dtype == PICTURE and max(shape[:2]) > LARGE:
         area = (LARGE / max(shape[:2])) ** 2
-        ways[f"pictures of {LARGE} pixels (hypogoal import --resize {LARGE})"] = memory(config.batch_size, area=area)
+        ways[f"pictures of {LARGE} pixels (import them with --resize {LARGE})"] = memory(config.batch_size, area=area)
     fitting = [way for way, needed in ways.items() if needed < free]
     smaller = f"It fits with {' or '.join(fitting)}." if fitting else "Give fewer or smaller states."
     seconds = len(goals) * steps * (cost.seconds + config.batch_size * cost.seconds_each) / workers
