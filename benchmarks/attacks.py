@@ -573,11 +573,14 @@ def writers(box: Box, name: str) -> tuple[list[str], Path]:
     arrays = box.whole / "arrays.npz"
     if not arrays.exists() and not run("export", whole / "data.h5", "--out", arrays).accepted():
         raise RuntimeError("the data cannot be exported")
+    other = box.whole / "other"
+    if not other.exists():
+        shutil.copytree(whole, other)
     commands: dict[str, tuple[list[Any], str]] = {
         "import": (["import", arrays, "--out"], "made.h5"),
         "arrays": (["export", whole / "data.h5", "--out"], "made.npz"),
         "episodes": (["export", whole / "meta", "--out"], "made-v0"),
-        "compare": (["compare", whole, whole, "--out"], "made"),
+        "compare": (["compare", whole, other, "--out"], "made"),
         "figures": (["report", whole, "--figures"], "made"),
         "sheets": (["show", whole / "data.h5", "--pictures"], "made"),
     }
