@@ -25,7 +25,7 @@ LONG_SECONDS = 3600.0  # from here on one is asked first
 # the network or the baseline, a table of such; cores; and the setting of collect that says how much is held out.
 RATES = (
     "collect", "member_step", "localiser", "step", "baseline_step", "evaluated_ensemble", "evaluated_member",
-    "collect_cores", "evaluate_cores", "heldout",
+    "evaluated_agent", "collect_cores", "evaluate_cores", "heldout",
 )  # fmt: skip
 
 
@@ -56,6 +56,8 @@ class Estimates:
         collected = (self.domain.collected_bytes(self.settings(cell)) for cell in cells if cell.stage == "collect")
         states = judging(max(collected, default=0), self.domain.observation_shape, self.domain.observation_dtype)
         seconds = self._rate("evaluated_ensemble") * len(members) + self._rate("evaluated_member") * sum(members)
+        agents = [self.settings(cell).network for cell in cells if cell.stage == "train-meta"]
+        seconds += sum(self._rate("evaluated_agent", network) for network in agents)  # frozen play
         cores = min(int(self._rate("evaluate_cores")) or 1, max(1, len(members)))
         return Cost(seconds, BASE + states, 2 * LOGS, cores)
 

@@ -1,6 +1,7 @@
 """Experiments as data (Spec A6, G4): what their cells are, in which order they can run, and what they cost."""
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Cell, Cost, Plan, depths, moved
-from hypogoal.experiments.costs import cost_lines
+from hypogoal.experiments.costs import Estimates, cost_lines
 from hypogoal.experiments.records import check_same, write_plan
 from hypogoal.experiments.runners.local import Outcome
 from hypogoal.settings import configuration
@@ -227,6 +228,16 @@ def test_the_cost_is_that_of_the_cells_given_shared_among_the_workers() -> None:
     assert cost_lines(cells, 4, 1.0)[0].split()[:5] == ["collect", "3", "x", "80", "min,"]
     unknown = [Cell("x", ("collect",), OUT / "x")]
     assert cost_lines(unknown, 2, 1.0)[-1] == "1 commands: time not known"
+
+
+def test_an_evaluation_costs_the_frozen_play_of_each_agent() -> None:
+    """Spec F5, G4: seconds of each agent, by its network, beside those of ensembles."""
+    cells = plan("doorkey", OUT, assignments=["controls=", "baselines=", "seeds=0"]).cells
+    agents = [cell for cell in cells if cell.stage == "train-meta"]
+    estimates = Estimates({"evaluated_agent": {"light": 4, "planned": 1}}, "doorkey")
+    assert agents and estimates.closing(cells).seconds == 4 * len(agents)
+    planned = [replace(cell, arguments=(*cell.arguments, "--set", "network=planned")) for cell in agents]
+    assert estimates.closing(planned).seconds == len(agents)
 
 
 def test_every_cell_of_a_named_experiment_has_a_cost_and_a_place() -> None:
