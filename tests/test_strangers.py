@@ -16,10 +16,12 @@ from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, find_input, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, parse_json, read_bytes, read_json
+from hypogoal.core.own_code import given
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.experiments.cells import Cell, Plan
 from hypogoal.experiments.format import make_plan, read_experiment
 from hypogoal.experiments.records import LOGS, PLAN, log_of, open_log, read_plan, write_plan
+from hypogoal.hypotheses.networks import load_network
 from hypogoal.inspection import faults_of
 
 ENDLESS = ("/proc/self/pagemap", "/proc/self/mem", "/proc/cpuinfo", "/sys/kernel/notes", "/sys/fs/cgroup/cgroup.procs")
@@ -202,6 +204,15 @@ def test_a_log_of_an_artefact_holds_anything(tmp_path: Path, capsys: pytest.Capt
         assert code == 0 or (code == 2 and len(lines) == 1 and "an artefact is damaged" in lines[0]), lines
 
 
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "0x" + "f" * 500, "-9007199254740992", "9007199254740992"])
+def test_toml_has_the_same_bounds(tmp_path: Path, number: str) -> None:
+    """Spec G2: wherever an experiment or a preset has a number."""
+    for text in (OWN.replace("minutes = 1 ", f"minutes = {number} "), f"{OWN}\n[settings.a]\nvalue = [{number}]"):
+        (tmp_path / "own.toml").write_text(text)
+        with pytest.raises(UserError, match="not valid TOML"):
+            read_experiment(tmp_path / "own.toml")
+
+
 TYPES = {"F4": 4, "F8_E4M3": 8, "F8_E5M2": 8, "F8_E4M3FNUZ": 8, "F8_E5M2FNUZ": 8, "F8_E8M0": 8, "F6_E2M3": 6,
          "BF16": 16, "F16": 16, "C64": 64, "I8": 8, "I16": 16, "U16": 16, "U32": 32, "U64": 64, "XX": 8}  # fmt: skip
 
@@ -229,3 +240,20 @@ def test_a_type_that_is_not_kept_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"of type torch\.bfloat16 are not kept \(at x\): a"):
         save_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(2, dtype=torch.bfloat16)})
     assert not any(tmp_path.iterdir())
+
+
+def test_a_network_that_could_not_be_kept_is_not_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spec B6, G2: said when it is made, not after days of training."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "halves.py").write_text("""
+import torch
+def layers(channels): return [torch.nn.Conv2d(channels, 2, 1).bfloat16(), torch.nn.ReLU()], (4,)
+class encoder(torch.nn.Module):
+    def __init__(self, channels):
+        super().__init__()
+        self.register_buffer("known", torch.zeros(2).half())
+    def forward(self, x): return x.flatten(1)
+""")
+    for name, kind in (("layers", "bfloat16"), ("encoder", "float16")):
+        with given(f"halves:{name}"), pytest.raises(UserError, match=rf"keeps weights of type torch\.{kind}.*float32"):
+            load_network(f"halves:{name}")((8, 8, 3))

@@ -16,14 +16,15 @@ import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, TypeVar
 
 from hypogoal.core.errors import UserError, printable
 from hypogoal.core.locks import fresh_file
 
+T = TypeVar("T")
 MAX_TEXT_BYTES = 64 * 2**20
 END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
-MAX_JSON_DEPTH = 32
+MOST_DEPTH = 32  # of JSON and TOML
 MOST_HOLE, HOLE_RATIO = 2**30, 1000  # a larger file that stores less than a thousandth of its bytes is no data
 # File systems on which the kernel makes up a file as it is read: its size is none, and some never end.
 KERNEL = frozenset([
@@ -162,20 +163,24 @@ def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
 
 
 def _parsed(text: str) -> Any:
-    """JSON that is ``MAX_JSON_DEPTH`` deep at most, its integers exact in a float; else a ``ValueError``."""
+    """JSON whose values are :func:`_bounded`; else a ``ValueError``."""
     try:
-        value = json.loads(text)
+        return _bounded(json.loads(text))
     except RecursionError:
-        raise ValueError("too deep") from None
-    level = [value]
-    for _ in range(MAX_JSON_DEPTH):
+        raise ValueError("it is too deep") from None
+
+
+def _bounded(value: T) -> T:
+    """A value of JSON or TOML: at most ``MOST_DEPTH`` deep, its integers exact in a float; else a ``ValueError``."""
+    level: list[Any] = [value]
+    for _ in range(MOST_DEPTH):
         if any(isinstance(item, int) and abs(item) > MOST_INTEGER for item in level):
-            raise ValueError("an integer is too large")
+            raise ValueError(f"it has an integer beyond {MOST_INTEGER}")
         groups = (item for item in level if isinstance(item, (dict, list)))
         level = [inner for item in groups for inner in (item.values() if isinstance(item, dict) else item)]
         if not level:
             return value
-    raise ValueError("too deep")
+    raise ValueError("it is too deep")
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
@@ -186,7 +191,7 @@ def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
                 raise ValueError(f"more than {MOST_DOTS} dots in line {number}")
         table = tomllib.loads(text)
         repr(table)  # hexadecimals of any length are read, and not printed
-        return table
+        return _bounded(table)
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
 
