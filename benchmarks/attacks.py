@@ -595,10 +595,10 @@ COSTLY = ("ensemble", "options", "ppo", "rooms", "meta", "audit", "dqn", "sequen
 def writes(box: Box, rng: Rng, case: int) -> bool:
     """A disk that is full from one write of a command on, or refuses one alone; then there is room, and it is resumed.
 
-    Each fifth case is of a command that trains. Nothing hidden may stay but a checkpoint that the message names.
+    Each tenth case is of a command that trains. Nothing hidden may stay but a checkpoint that the message names.
     """
-    costly, cheap = COSTLY[case // 5 % len(COSTLY)], CHEAP[(case - case // 5) % len(CHEAP)]
-    name = costly if case % 5 == 4 else cheap
+    costly, cheap = COSTLY[case // 10 % len(COSTLY)], CHEAP[(case - case // 10) % len(CHEAP)]
+    name = costly if case % 10 == 9 else cheap
     counts = box.root / f"{name}.writes"
     words, out = writers(box, name)
     log = box.root / "log"
@@ -611,7 +611,7 @@ def writes(box: Box, rng: Rng, case: int) -> bool:
         words, out = writers(box, name)
     at, once = 1 + rng.randrange(int(counts.read_text())), rng.random() < 0.3
     ended = Command(*words, environment={**faked, "FULL_AT": str(at), **({"FULL_ONCE": "1"} if once else {})}).wait()
-    if name == "import":  # which says before what is odd about the data
+    if name in ("import", "episodes"):  # which say before what is odd about the data, and how far they are
         ended = dataclasses.replace(ended, words=ended.words[ended.words.rstrip().rfind("\n") + 1 :])
     where = f"{name}, {'only ' * once}write {at} of {counts.read_text()}"
     try:
@@ -622,7 +622,7 @@ def writes(box: Box, rng: Rng, case: int) -> bool:
         if left and not command_has(out):
             raise Bad(f"left {left[:3]}: {ended.words}")
         check_whole(out) if name not in ("arrays", "figures", "sheets", "episodes") else None
-        resumed = ["--resume"] if command_has(out) else ["--force"] if out.exists() and not accepted else []
+        resumed = ["--resume"] if command_has(out) else ["--force"] if out.exists() and name != "sheets" else []
         if not accepted and not (again := run(*words, *resumed)).accepted():
             raise Bad(f"cannot be made then: {again.words}")
         if hidden := [path for path in entries(box.case) if Path(path).name.startswith(".")]:
