@@ -13,7 +13,7 @@ from torch.autograd.graph import saved_tensors_hooks
 
 from hypogoal.core.seeding import torch_generator
 from hypogoal.dataset import NUMBERS, Observations, standard_of
-from hypogoal.diversity import OBJECTIVES
+from hypogoal.diversity import OBJECTIVES, load_objective
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
@@ -38,9 +38,9 @@ class StepCost(NamedTuple):
 def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SECONDS) -> StepCost:
     """What a step on a CPU takes with states like these (N, *shape), N > 1, and as many unlabelled ones in a batch.
 
-    Batches grow from two states until ``seconds`` are over; a line through the last two is the answer. Of members that
-    share nothing one is tried, since all take the same. An objective of the user's own is not called: D-BAT is in its
-    place. States that the network does not take are a ``UserError``.
+    Batches grow from two states until ``seconds`` are over; a line through the first and the last is the answer. Of
+    members that share nothing one or two are tried: all take the same. An objective of the user's own is not called,
+    D-BAT is in its place. States that the network does not take are a ``UserError``.
     """
     pictures = states.dtype != NUMBERS
     cut, margin = pictures and config.view == "agent-crop", config.jitter
@@ -51,8 +51,9 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     view = FullView(shape, None if pictures else standard_of(shape, states))
     states = states if pictures else view.see(states)
     separate, alone = config.encoder == "separate", config.schedule == "sequential"
-    members = 1 if separate else config.members
     objective = config.diversity if config.diversity in OBJECTIVES else "dbat"
+    few = 1 if alone or load_objective(objective).pair_loss else 2  # a loss of all is 0 for one
+    members = min(few, config.members) if separate else config.members
     sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]
     sizes += [config.batch_size] * (sizes[-1] < config.batch_size)
     config = replace(config, diversity=objective, batch_kind="plain", steps=len(sizes) + 2)
@@ -78,16 +79,17 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
             rows.append((size, *_tried(training, size, ensemble)))
             if len(rows) > 1 and time.process_time() > end:
                 break
-    (fewer, less, sooner), (more, most, later) = rows[-2:][0], rows[-1]
+    (fewer, less, sooner), (more, most, later) = rows[0], rows[-1]
     kept_each, seconds_each = (max(0.0, rise) / max(1, more - fewer) for rise in (most - less, later - sooner))
     weights = sum(weight.nbytes for weight in ensemble.parameters())
     learning = LEARNING * sum(weight.nbytes for weight in training.optimiser.param_groups[0]["params"])
     times = config.members / members  # as many as were tried
     at_once = 1.0 if alone else times
+    copies = at_once + BACKWARD / (members if separate else 1)
     return StepCost(
         weights=times * weights,
-        memory=times * weights + at_once * learning + (at_once + BACKWARD) * (most - more * kept_each),
-        memory_each=(at_once + BACKWARD) * kept_each,
+        memory=times * weights + at_once * learning + copies * (most - more * kept_each),
+        memory_each=copies * kept_each,
         seconds=at_once * max(0.0, later - more * seconds_each),
         seconds_each=at_once * seconds_each,
     )
