@@ -121,13 +121,15 @@ def put_in_place(made: Path, out: Path) -> None:
     old = out.with_name(f".{out.name}{OLD}")
     if out.exists():
         out.rename(old)
-    made.rename(out)
-    sync(out.parent)
-    _remove(old)
+    try:
+        made.rename(out)
+        sync(out.parent)
+    finally:
+        _settle(out)
 
 
 def _settle(out: Path) -> None:
-    """Finish what a process that died in ``put_in_place`` had begun."""
+    """Finish what :func:`put_in_place` had begun: what was moved aside comes back where nothing took its place."""
     out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if old.exists() and not out.exists():

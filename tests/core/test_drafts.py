@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from toy_data import reseal
 from hypogoal.cli import notes_of
 from hypogoal.core.artefacts import claim, create_artefact, open_artefact
 from hypogoal.core.checkpoints import checkpoints_of
-from hypogoal.core.drafts import LOCK, check_complete, draft, draft_folder, unfinished
+from hypogoal.core.drafts import LOCK, check_complete, draft, draft_folder, put_in_place, unfinished
 from hypogoal.core.errors import Complete, NumericalError, UserError
 from hypogoal.core.files import write_table
 
@@ -180,6 +181,19 @@ def test_a_death_between_two_renames_loses_nothing(tmp_path: Path) -> None:
         stop(out, Broken(), force=True, checkpoint=False)
     assert set(open_artefact(out).manifest["files"]) == {"whole"}
     assert [path.name for path in tmp_path.iterdir()] == ["meta"]
+
+
+def test_a_rename_that_fails_loses_nothing(tmp_path: Path) -> None:
+    """Spec G2: what stood there is there again; another disk is one on which no rename ends."""
+    finish(tmp_path / "meta")
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as far:
+        made = Path(far) / "made"
+        made.mkdir()
+        if made.stat().st_dev == tmp_path.stat().st_dev:
+            pytest.skip("there is one disk only")
+        with pytest.raises(OSError, match="cross-device"):
+            put_in_place(made, tmp_path / "meta")
+    assert os.listdir(tmp_path) == ["meta"] and os.listdir(tmp_path / "meta")
 
 
 def test_a_command_that_could_not_be_read_again_begins_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
