@@ -158,7 +158,7 @@ def tables(path: Path) -> Iterator[str]:
             for chooser in (("agent", "uniform") if agent in optioned else ("agent",))
         ),
     )
-    yield "Share of episodes solved, layout by layout: the agent / chance among its own options."
+    yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
     yield from by_layout(shares, optioned)
     if practised := [agent for agent in optioned if not np.isnan(of(agent, "agent", PRACTICE)).all()]:
         yield "Practice, in thousands of steps: until chance solved 95 of the last 100 episodes, or to its limit."

@@ -162,10 +162,10 @@ def tables(path: Path) -> Iterator[str]:
     titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest", "within 1.5 shortest paths"]
     yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
     frozen = [method for method in methods if len(known(of(method, "success", "frozen")))]
-    yield "Played on, frozen: the agent / chance among its own options."
+    yield "Without further training: the agent / uniform-random choice among its own options."
     yield ""
     yield from table(
-        ["", "solved", "length / shortest", "within 1.5 shortest paths"],
+        ["", "solved", "length / shortest", "within 1.5 shortest paths", "layouts"],
         (
             [
                 METHODS[method],
@@ -173,6 +173,7 @@ def tables(path: Path) -> Iterator[str]:
                     " / ".join(interval(known(of(method, quantity, who)), 2) for who in ("frozen", UNIFORM))
                     for quantity in ("success", "length_over_shortest", "near")
                 ),
+                str(len(known(of(method, "success", "frozen")))),
             ]
             for method in frozen
         ),

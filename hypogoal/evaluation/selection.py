@@ -167,7 +167,7 @@ def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
 
 def missing(work: Work) -> list[str]:
     """Sub-goals of which the domain does not know where they are reached, and where to say it."""
-    domains = {work.contents.name(artefact): artefact.config["domain"] for artefact in work.contents.agents}
+    domains = {work.contents.name(artefact): artefact.config.get("domain", "") for artefact in work.contents.agents}
     unknown = {
         (goal["sub_goal"], domains[run["path"]]): None
         for agent in work.metrics["selection"]
