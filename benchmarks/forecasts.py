@@ -27,6 +27,7 @@ DIVERSITY = ("dbat", "divdis", "none", "input-gradients")
 
 def drawn(rng: np.random.Generator) -> tuple[tuple[int, ...], TrainEnsembleConfig]:
     """A shape of observations, and settings that take them."""
+    shape: tuple[int, ...]
     if rng.random() < 0.2:
         shape, network = (int(rng.integers(1, 5000)),), "mlp"
     else:
