@@ -29,7 +29,8 @@ def drawn(rng: np.random.Generator) -> tuple[tuple[int, ...], TrainEnsembleConfi
     """A shape of observations, and settings that take them."""
     shape: tuple[int, ...]
     if rng.random() < 0.2:
-        shape, network = (int(rng.integers(1, 5000)),), "mlp"
+        shape: tuple[int, ...] = (int(rng.integers(1, 5000)),)
+        network = "mlp"
     else:
         shape = (*(int(side) for side in rng.integers(41, 260, 2)), int(rng.integers(1, 5)))
         network = str(rng.choice(["doorkey", "montezuma", "tiles", "mlp"]))

@@ -143,7 +143,7 @@ def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept
     members = len(about["sub_goals"]) * about["members"] * judging_member(about.get("network", "auto"), shape, dtype)
-    batch = 2 * config.option_batch + (config.meta_batch if isinstance(config, TrainMetaConfig) else 0)
+    batch = config.option_batch + (config.meta_batch if isinstance(config, TrainMetaConfig) else 0)
     packed = stops / domain.packed
     # A checkpoint is a copy of the state, in memory while it is written.
     memory = BASE + 2 * (state + stops) + members + batch * LEARNED * np.prod(shape)
