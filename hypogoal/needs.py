@@ -40,7 +40,7 @@ LEARNED = 10  # bytes inside the light networks for each number of a picture tha
 PASSED = 20  # bytes inside a member for each number of a picture that is judged
 EXPLAINED = 8  # states whose attributions are computed at once
 SAMPLE_NUMBERS = 2**22  # of the states that are read for a trial, at most
-LARGE = 160  # pixels of a side, above which smaller pictures are proposed
+LARGE = 160  # pixels of a side, above which smaller pictures are proposed: such train within 2 GB
 
 
 def ensemble_needs(

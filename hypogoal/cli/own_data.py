@@ -17,7 +17,6 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.terminal import give, say
 from hypogoal.settings import configuration
 
-LARGE = 160  # pixels of a picture's side, above which smaller ones are proposed: such train within 2 GB
 PLAYED = "a domain, a Gymnasium environment's id, or module:object."
 
 if TYPE_CHECKING:
@@ -66,6 +65,7 @@ def import_(
 def _print_observations(context: typer.Context, data: Path, resize: int, quiet: bool) -> None:
     """What the states of a data file were taken for; of large pictures the command that imports them smaller."""
     from hypogoal.dataset import PICTURE, open_dataset
+    from hypogoal.needs import LARGE
 
     dataset = open_dataset(data)
     sizes = " x ".join(map(str, dataset.observation_shape))
