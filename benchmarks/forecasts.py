@@ -27,7 +27,6 @@ DIVERSITY = ("dbat", "divdis", "none", "input-gradients")
 
 def drawn(rng: np.random.Generator) -> tuple[tuple[int, ...], TrainEnsembleConfig]:
     """A shape of observations, and settings that take them."""
-    shape: tuple[int, ...]
     if rng.random() < 0.2:
         shape: tuple[int, ...] = (int(rng.integers(1, 5000)),)
         network = "mlp"
