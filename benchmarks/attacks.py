@@ -199,7 +199,8 @@ class Box:
         """The run, with the outputs of stages, and its evaluation and report."""
         for name in needed(names):
             unbroken(STAGES[name], self.run)
-        for command in (("evaluate", self.run), ("report", self.run)) if evaluated else ():
+        missing = evaluated and not (self.run / "report").exists()
+        for command in (("evaluate", self.run), ("report", self.run)) if missing else ():
             if not run(*command, "-q", "--resume").accepted():
                 raise RuntimeError("the run cannot be evaluated")
         self.look = self._look()
@@ -694,7 +695,7 @@ RUN_FREE = ("boards", "minari", "images", "arrays", "toml")  # families that nee
 
 
 def attack(box: Box, name: str, cases: range, seed: int) -> dict[str, Any]:
-    """The cases of a family, one after the other."""
+    """The cases of a family, one after the other, until Ctrl-C."""
     counts: Counter[str] = Counter()
     failures, slowest, box.most = [], 0.0, 0
     for case in cases:
@@ -702,6 +703,8 @@ def attack(box: Box, name: str, cases: range, seed: int) -> dict[str, Any]:
         try:
             counts["accepted" if FAMILIES[name](box, random.Random(f"{seed} {name} {case}"), case) else "refused"] += 1
             box.check_outside()
+        except KeyboardInterrupt:
+            break
         except Bad as bad:
             counts["bad"] += 1
             failures.append(f"{name} case {case}: {bad}")
@@ -709,7 +712,7 @@ def attack(box: Box, name: str, cases: range, seed: int) -> dict[str, Any]:
         slowest = max(slowest, time.monotonic() - began)
     outcomes = {kind: counts[kind] for kind in ("refused", "accepted", "bad")}
     numbers = {"slowest": f"{slowest:.1f} s", "memory": f"{box.most / 1e9:.1f} GB"}
-    return {"family": name, "cases": len(cases), **outcomes, **numbers, "failures": failures}
+    return {"family": name, "cases": sum(counts.values()), **outcomes, **numbers, "failures": failures}
 
 
 def measure() -> None:
