@@ -26,6 +26,7 @@ from hypogoal.learners.baselines.settings import HYPERPARAMETERS
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
     "choosing-doorkey": choosing.tables,
+    "figure3-ladders": ladders.tables,
     "figure4-ladders": ladder_options.tables,
     "figure6-doorkey": figure6.tables,
     "finished-episodes": finished.tables,
