@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import ANEW, growing
+from hypogoal.core.checkpoints import ANEW, Unlike, growing
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, layers
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
@@ -305,6 +305,8 @@ class GymnasiumEngine(TurnEngine):
     environment does not do so earlier. ``success`` is asked at the end of each, see ``GymnasiumDomain``.
     """
 
+    alike = True
+
     def __init__(
         self,
         make: MakeEnv,
@@ -419,6 +421,8 @@ class GymnasiumEngine(TurnEngine):
         width, size = len(self._ask.names), 2 * self.memory
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
+        if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, size):
+            raise Unlike("at /loop/engine: its pictures and labels are not as many")
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import growing
+from hypogoal.core.checkpoints import Unlike, growing
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
@@ -40,6 +40,7 @@ class MontezumaEngine(TurnEngine):
     n_actions = game.N_ACTIONS
     observation_shape = game.OBSERVATION_SHAPE
     position_names = ("room", "x", "y")
+    alike = True
 
     def __init__(
         self,
@@ -158,6 +159,12 @@ class MontezumaEngine(TurnEngine):
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
         self._positions = bytearray(snapshot["positions"].tobytes())
         self._alive = bytearray(snapshot["alive"].tobytes())
+        played = len(self._alive) - len(self.starts)
+        if (
+            len(self._positions) != 3 * len(self._alive)
+            or len(snapshot["stacks"]) != min(played, self.memory) + self.count
+        ):
+            raise Unlike("at /loop/engine: its states, positions and stacks are not as many")
         frames = [frame.copy() for frame in snapshot["frames"]]  # to be freed one by one
         stacks = [tuple(frames[row] for row in rows) for rows in snapshot["stacks"].tolist()]
         self._seen = stacks[: -self.count]

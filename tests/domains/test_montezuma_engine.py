@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
+from hypogoal.core.checkpoints import Unlike
 from hypogoal.core.errors import UserError
 from hypogoal.domains import montezuma_env
 from hypogoal.domains.base import Engine
@@ -418,6 +419,16 @@ def test_snapshots_are_exact() -> None:
         assert all(np.array_equal(a, b) for a, b in zip(played(resumed, actions[begin:end]), expected, strict=True))
         everything = np.arange(unbroken.n_states)
         assert np.array_equal(resumed.positions(everything), unbroken.positions(everything))
+
+
+@pytest.mark.parametrize("name", ["positions", "alive", "stacks"])
+def test_a_snapshot_whose_parts_do_not_fit_is_refused(name: str) -> None:
+    """Spec G2: as many positions and stacks as there are states; before anything is played."""
+    engine = MontezumaEngine("1L", 2, start_states=2, max_steps=12)
+    played(engine, busy(np.random.default_rng(1), (5, 2)))
+    snapshot = engine.snapshot()
+    with pytest.raises(Unlike, match="not as many"):
+        engine.restore({**snapshot, name: snapshot[name][:-1]})
 
 
 def test_without_the_emulator_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
