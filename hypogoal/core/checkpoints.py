@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import replace_file
+from hypogoal.core.files import MOST_INTEGER, replace_file
 from hypogoal.core.stopping import SIGNALS, stop
 
 if TYPE_CHECKING:
@@ -281,6 +281,8 @@ def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
         or (type(saved) in (int, float) and fresh is None)
     ):
         raise Unlike(f"not {type(fresh).__name__} at {where}")
+    elif type(saved) is int and abs(saved) > MOST_INTEGER >= abs(fresh or 0):  # a generator's own are as large
+        raise Unlike(f"no such count at {where}")
 
 
 def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:

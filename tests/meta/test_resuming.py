@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from corridor import Corridor
@@ -176,3 +177,13 @@ def test_an_engine_without_snapshots_begins_anew(tmp_path: Path, monkeypatch: py
     checkpoints = Breaking(tmp_path / "checkpoint.safetensors", 1)
     assert run("plain", tmp_path, checkpoints).recorder.steps == STEPS
     assert not checkpoints.saved and checkpoints.steps == 0
+
+
+def test_counts_that_no_training_reaches_are_refused() -> None:
+    """Spec G2: 10 ** 30 updates that are due would never end; a generator's own state is as large and stays."""
+    generator = np.random.default_rng(0).bit_generator.state
+    fresh = {"due": 3, "rng": generator}
+    require_alike({"due": 2**53 - 1, "rng": np.random.default_rng(1).bit_generator.state}, fresh)
+    for count in (2**62, -(10**30)):
+        with pytest.raises(Unlike, match="no such count at /due"):
+            require_alike({"due": count, "rng": generator}, fresh)
