@@ -46,6 +46,8 @@ BASELINES = ("ppo", "dqn")
 PLANNED = "planned"
 POLICIES = {"learned": "learned options", PLANNED: "planned options"}  # baselines have none
 PRACTICE, PRACTISED = "practice", "practised"  # steps in the plain world, and whether chance solved it by then
+MOST_LAYOUTS = 10  # side by side in a table; more are in the rows alone
+ROOMS = {"third": "", "second": "-second", "first": "-first"}  # settings, by what their files' names end in
 COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
 SHOWN = {
     "success": "solved",
@@ -158,21 +160,40 @@ def tables(path: Path) -> Iterator[str]:
             for chooser in (("agent", "uniform") if agent in optioned else ("agent",))
         ),
     )
-    yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
-    yield from by_layout(shares, optioned)
+    if len(layouts) <= MOST_LAYOUTS:
+        yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
+        yield from by_layout(shares, optioned)
     if practised := [agent for agent in optioned if not np.isnan(of(agent, "agent", PRACTICE)).all()]:
-        yield "Practice, in thousands of steps: until chance solved 95 of the last 100 episodes, or to its limit."
+        yield "Practice by uniform-random choice, thousands of steps until 95 of 100 were solved, or the limit."
         yield from by_layout(practice, practised)
 
 
 def rooms(path: Path) -> Iterator[str]:
-    """The tables of all settings of rooms, the last one first."""
-    for which in ("", "-second", "-first"):
-        of = path.with_stem(path.stem + which)
-        if of.exists():
-            yield f"The {which[1:] or 'third'} setting:"
-            yield ""
-            yield from tables(of)
+    """Three settings side by side, and the seeds of the third; every other number is in the rows."""
+    settings = {which: _read(path.with_stem(path.stem + suffix)) for which, suffix in ROOMS.items()}
+
+    def of(rows: list[dict[str, str]], method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
+        wanted = (method, chooser, quantity)
+        return np.array([float(r["value"]) for r in rows if (r["method"], r["chooser"], r["quantity"]) == wanted])
+
+    def shown(rows: list[dict[str, str]], method: str) -> str:
+        solved, uniform = (of(rows, method, chooser, "success") for chooser in ("agent", "uniform"))
+        many = f"({(solved >= 0.9).sum()})"
+        return f"{interval(solved, 2)} {many} / {uniform.mean():.2f}" if len(solved) else "-"
+
+    methods = [method for method in METHODS if any(row["method"] == method for row in settings["first"])]
+    yield "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
+    yield ""
+    titles = [f"{which} setting" for which in settings]
+    yield from table(["", *titles], ([METHODS[m], *(shown(rows, m) for rows in settings.values())] for m in methods))
+    yield "Seed by seed, the third setting: the agent."
+    yield ""
+    third = settings["third"]
+    seeds = sorted({row["layout"] for row in third}, key=int)
+    known = [method for method in methods if len(of(third, method, "agent", "success"))]
+    yield from table(
+        ["", *seeds], ([METHODS[m], *(f"{v:.2f}" for v in of(third, m, "agent", "success"))] for m in known)
+    )
 
 
 def _mean(values: NDArray[np.float64]) -> str:

@@ -88,20 +88,49 @@ def tables(path: Path) -> Iterator[str]:
         "Coverage (best) by weight, seed 100 at mix .5; in bold what the rule chose.", cells, chosen(cells)
     )
     test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS]
-    yield from _board("Test", test)
+    main = [cell for cell in test if cell.mix == CHOICE_MIX]
+    yield from _board("Test", main)
+    mixes = sorted({cell.mix for cell in test} - {CHOICE_MIX})
+    yield from _side_by_side(
+        "Test at other mixes", {f"mix {mix:g}": [cell for cell in test if cell.mix == mix] for mix in mixes}
+    )
     yield "Test at mix .5: the share of seeds in which some member owns the feature, and the highest ranking of it."
     yield ""
-    yield from table(["", *FACTORS], _by_factor([cell for cell in test if cell.mix == CHOICE_MIX]))
+    yield from table(["", *FACTORS], _by_factor(main))
     if LONG.exists():
         yield from _board("600 steps", read(LONG))
 
 
 def tables_of_two(path: Path) -> Iterator[str]:
     """What the cells of two features say, members trained at once and one after the other."""
-    for title, cells in (("At once", read(path)), ("One after the other", read(path.with_name(SEQUENTIAL.name)))):
-        what = f"{title}: coverage (best) by weight, seed 100 at mix 1; in bold what the rule chose."
+    boards = {}
+    for title, cells in (("at once", read(path)), ("one after the other", read(path.with_name(SEQUENTIAL.name)))):
+        what = f"{title.capitalize()}: coverage (best) by weight, seed 100 at mix 1; in bold what the rule chose."
         yield from _weights(what, cells, chosen(cells, OF_TWO, CHOICE_MIX_OF_TWO))
-        yield from _board(title, [cell for cell in cells if cell.seed not in CHOICE_SEEDS])
+        for mix in (0.5, 1.0):
+            test = [cell for cell in cells if cell.seed not in CHOICE_SEEDS and cell.mix == mix]
+            boards[f"{title}, mix {mix:g}"] = test
+    yield from _side_by_side("Test", boards)
+
+
+def _side_by_side(title: str, boards: Mapping[str, Sequence[Cell]]) -> Iterator[str]:
+    """Coverage (best) of each objective at its chosen weight, a column for each set of cells."""
+    columns = {name: {_objective(line): line for line in summary(cells, HIGH, LOW)} for name, cells in boards.items()}
+    objectives = [name for name in (*OBJECTIVES, *UNWEIGHTED) if any(name in lines for lines in columns.values())]
+    yield f"{title}: coverage with Student's 95 % interval over five seeds (best)."
+    yield ""
+    yield from table(
+        ["", *columns],
+        ([name, *(_covered(lines.get(name)) for lines in columns.values())] for name in objectives),
+    )
+
+
+def _objective(line: Line) -> str:
+    return line.entry.partition(":")[0]
+
+
+def _covered(line: Line | None) -> str:
+    return "-" if line is None else f"{told(line.coverage)} ({line.best.mean():.2f})"
 
 
 def _weights(what: str, cells: Iterable[Cell], winners: Mapping[str, str]) -> Iterator[str]:
