@@ -107,9 +107,9 @@ def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
     return ((observations - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS)
 
 
-def leave_out(states: States, *known: Observations) -> States:
+def leave_out(states: States, *training: Observations) -> States:
     """Spec B3: the states whose observations are none of ``known``, (M, ...) each, which members learn from."""
-    seen = {digest(picture) for pictures in known for picture in pictures}
+    seen = {digest(picture) for pictures in training for picture in pictures}
     return states.where(np.array([digest(picture) not in seen for picture in states.observations], np.bool_))
 
 
@@ -124,14 +124,14 @@ def joined(parts: Sequence[States]) -> States:
 
 def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal of whose positives, or negatives, there are few among the labels (N, G)."""
-    told = []
+    lines = []
     for goal, column in zip(goals, labels.T, strict=True):
         positives = int(column.sum())
         fewest = min(positives, len(labels) - positives)
         if fewest < max(FEW, RARE * len(labels)):
             which = "positives" if fewest == positives else "negatives"
-            told.append(f"{goal} has {fewest} {which} among {len(labels)} labelled states: classes are unbalanced")
-    return told
+            lines.append(f"{goal} has {fewest} {which} among {len(labels)} labelled states: classes are unbalanced")
+    return lines
 
 
 def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
@@ -206,8 +206,8 @@ def write_dataset(
 def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ...]) -> None:
     labels, shape = states.labels, (len(states.observations), len(sub_goals))
     if getattr(labels, "dtype", None) != np.bool_ or labels.shape != shape:  # of the text 'False' NumPy makes True
-        found = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
-        raise UserError(f"the domain's {split} labels are not truth values", found, f"Give bool {shape}.")
+        actual = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
+        raise UserError(f"the domain's {split} labels are not truth values", actual, f"Give bool {shape}.")
     first: Any = None
     for index, sub_goal in enumerate(sub_goals):
         group = file.create_group(f"{split}/{sub_goal}")
@@ -344,10 +344,10 @@ class Dataset:
 
     def _observations(self, file: Any, base: str, rows: slice | None = None) -> Observations:
         name = f"{base}/observations"
-        found = self._found(file, name)
+        stored = self._found(file, name)
         dtype = self.observation_dtype
-        if found.shape[1:] != self.observation_shape or found.dtype != dtype:
-            raise hdf5.Foreign(f"{name!r} is {found.dtype} {found.shape}, not {dtype} (N, {self.observation_shape})")
+        if stored.shape[1:] != self.observation_shape or stored.dtype != dtype:
+            raise hdf5.Foreign(f"{name!r} is {stored.dtype} {stored.shape}, not {dtype} (N, {self.observation_shape})")
         values = hdf5.read_array(file, name, "uf", rows)
         if dtype == NUMBERS and not np.isfinite(values).all():
             raise hdf5.Foreign(f"{name!r} has numbers that are not finite")
@@ -356,10 +356,10 @@ class Dataset:
     @staticmethod
     def _found(file: Any, name: str) -> Any:
         hdf5.size_of(file, name, "uf")
-        found = file[name]
-        if not found.shape:
+        stored = file[name]
+        if not stored.shape:
             raise hdf5.Foreign(f"{name!r} is a single number")
-        return found
+        return stored
 
     @staticmethod
     def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:

@@ -40,13 +40,13 @@ def describe_path(path: Path) -> dict[str, Any]:
 def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
-        about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        about |= {"observation_dtype": str(dataset.observation_dtype)}
-        return {"kind": "data", "path": str(path), "counts": dataset.counts(), **about, "config": dataset.config}
+        details = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
+        details |= {"observation_dtype": str(dataset.observation_dtype)}
+        return {"kind": "data", "path": str(path), "counts": dataset.counts(), **details, "config": dataset.config}
     artefact = open_artefact(path)
     keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
-    about = {"path": str(path), **artefact.manifest, "result": result_of(path)}
-    return {key: about.get(key) for key in ("path", *keys)}
+    details = {"path": str(path), **artefact.manifest, "result": result_of(path)}
+    return {key: details.get(key) for key in ("path", *keys)}
 
 
 def result_of(path: Path) -> dict[str, float]:
@@ -55,13 +55,13 @@ def result_of(path: Path) -> dict[str, float]:
     for line in json_lines(text for log in (LOG, SCORES) for text in read_end(path / log)):
         if line.get("scope", "all") == "all":
             last[str(line.get("sub_goal")), str(line.get("member"))] = line
-    found: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
+    values: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
     for (goal, _), line in last.items():
         for name in RESULTS:
             value: Any = line.get(name)
             if type(value) in (int, float) and abs(value) < 1e300:
-                found[name][goal] = max(value, found[name].get(goal, value))
-    return {told: sum(found[name].values()) / len(found[name]) for name, told in RESULTS.items() if found[name]}
+                values[name][goal] = max(value, values[name].get(goal, value))
+    return {title: sum(values[name].values()) / len(values[name]) for name, title in RESULTS.items() if values[name]}
 
 
 def numbers_in(kind: str, path: Path) -> dict[str, Any]:
@@ -90,7 +90,9 @@ def outcome(kind: str, path: Path) -> list[str]:
 def count_lines(counts: Mapping[str, Any]) -> list[str]:
     """The numbers of states of a data file."""
     rows = [(split, goal, *row.values()) for split in SPLITS for goal, row in counts[split].items()]
-    text = [f"{split:9s} {goal:20s} {states:7d} states {yes:7d} positives" for split, goal, states, yes in rows]
+    text = [
+        f"{split:9s} {goal:20s} {states:7d} states {positives:7d} positives" for split, goal, states, positives in rows
+    ]
     return [*text, f"unlabelled                     {counts['unlabelled']:7d} states"]
 
 
@@ -115,13 +117,13 @@ def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
         raise UserError("the evaluation is damaged", path, "Evaluate the run again.") from None
 
 
-def lines(about: dict[str, Any]) -> list[str]:
+def lines(details: dict[str, Any]) -> list[str]:
     """A description as text, a line a fact, what it came to first."""
-    if about["kind"] == "run":
-        return [line for part in about["artefacts"] for line in lines(part)[:1]]
-    result = ", ".join(f"{name} {value:.4g}" for name, value in (about.get("result") or {}).items())
-    text = [f"{about['path']}: {about['kind']}" + (f"; {result}" if result else "")]
-    for key, value in about.items():
+    if details["kind"] == "run":
+        return [line for part in details["artefacts"] for line in lines(part)[:1]]
+    result = ", ".join(f"{name} {value:.4g}" for name, value in (details.get("result") or {}).items())
+    text = [f"{details['path']}: {details['kind']}" + (f"; {result}" if result else "")]
+    for key, value in details.items():
         if isinstance(value, dict) and key != "result":
             text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
         elif key == "inputs" and value:
@@ -145,9 +147,9 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
         raise UserError("contact sheets need a data file", path, "Give the .h5 file of the states.")
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
-        given = f"{dataset.observation_dtype} {dataset.observation_shape}"
+        actual = f"{dataset.observation_dtype} {dataset.observation_shape}"
         do = advice("Read them as arrays", "export", path, "--out", f"{path.stem}.npz")
-        raise UserError("the states are not pictures", given, do)
+        raise UserError("the states are not pictures", actual, do)
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []

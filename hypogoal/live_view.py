@@ -95,10 +95,10 @@ def read_progress(run: Path) -> list[Progressing]:
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'run' or a stage writes into.")
     logs = [*run.rglob(LOG), *run.rglob(f".*{PARTIAL}/{FOLDER}/*.jsonl")]  # an ensemble's sub-goals have one each
-    found = [_read(log, run) for log in sorted(logs)]
-    if not found:
+    rows = [_read(log, run) for log in sorted(logs)]
+    if not rows:
         raise UserError(f"nothing to watch: no {LOG}", run, "Training stages write it as they go; is one running?")
-    return sorted(found, key=lambda row: (row.seconds is None, row.title))
+    return sorted(rows, key=lambda row: (row.seconds is None, row.title))
 
 
 def _read(log: Path, run: Path) -> Progressing:
@@ -109,9 +109,9 @@ def _read(log: Path, run: Path) -> Progressing:
     place = draft.with_name(draft.name[1 : -len(PARTIAL)]) if draft else log.parent
     name = place.relative_to(run).as_posix() if place != run else place.name
     goal = str(last.get("sub_goal", ""))
-    own = [line for line in lines if line.get("sub_goal", "") == goal]
+    same_goal = [line for line in lines if line.get("sub_goal", "") == goal]
     watched = next((key for key in WATCHED if key in last), "")
-    series = tuple(float(line[watched]) for line in own if _is_number(line.get(watched)))
+    series = tuple(float(line[watched]) for line in same_goal if _is_number(line.get(watched)))
     whole = draft is None and (place / MANIFEST).is_file()
     try:
         seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
@@ -122,8 +122,8 @@ def _read(log: Path, run: Path) -> Progressing:
 
 def _lines(log: Path) -> list[dict[str, Any]]:
     """The lines of a log that say a step."""
-    found = [line for line in json_lines(read_end(log)) if plain_name(line.get("sub_goal", "none"))]
-    return [line for line in found if type(line.get("step")) is int and 0 <= line["step"] <= MOST_INTEGER]
+    lines = [line for line in json_lines(read_end(log)) if plain_name(line.get("sub_goal", "none"))]
+    return [line for line in lines if type(line.get("step")) is int and 0 <= line["step"] <= MOST_INTEGER]
 
 
 def _is_number(value: Any) -> bool:
@@ -161,12 +161,12 @@ def _ago(seconds: float) -> str:
 
 def curve(values: Sequence[float], bounds: tuple[float, float] | None = None, width: int = CURVE) -> str:
     """Values as blocks of characters, each the mean of an equal part; from their least to their greatest."""
-    known = [value for value in values if _is_number(value)]
-    count = min(width, len(known))
+    numbers = [value for value in values if _is_number(value)]
+    count = min(width, len(numbers))
     if count == 0:
         return ""
-    edges = [round(index * len(known) / count) for index in range(count + 1)]
-    means = [sum(known[start:end]) / (end - start) for start, end in pairwise(edges)]
+    edges = [round(index * len(numbers) / count) for index in range(count + 1)]
+    means = [sum(numbers[start:end]) / (end - start) for start, end in pairwise(edges)]
     low, high = bounds or (min(means), max(means))
     span = (high - low) or 1.0
     places = (min(max((value - low) / span, 0.0), 1.0) for value in means)

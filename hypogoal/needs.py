@@ -117,10 +117,10 @@ def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
     name = network_for(network, dtype)
     try:
         with torch.device("meta"):
-            made = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
+            built = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
     except UserError:
-        made = None
-    return float(sum(weights.nbytes for weights in made.parameters())) if made else MEMBER
+        built = None
+    return float(sum(weights.nbytes for weights in built.parameters())) if built else MEMBER
 
 
 def ensemble_disk(sub_goals: int, weights: float) -> float:

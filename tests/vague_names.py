@@ -10,26 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "hypogoal"
-VAGUE = frozenset(
-    [
-        "told",
-        "found",
-        "about",
-        "given",
-        "here",
-        "there",
-        "own",
-        "of",
-        "made",
-        "known",
-        "said",
-        "asked",
-        "what",
-        "one",
-        "yes",
-        "chance",
-    ]
-)
+VAGUE = frozenset((
+    "told", "found", "about", "given", "here", "there", "own", "of", "made", "known", "said", "asked", "what", "one",
+    "yes", "chance",
+))  # fmt: skip
 LIMIT = 0.2
 WORST = 10
 Function = ast.FunctionDef | ast.AsyncFunctionDef

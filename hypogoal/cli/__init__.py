@@ -53,14 +53,14 @@ def main(arguments: list[str] | None = None) -> int:
         sys.unraisablehook = stopping.unraised
         open_streams()
         shield()
-    given = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in given
-    given = [argument for argument in given if argument != "--debug"]
+    words = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in words
+    words = [argument for argument in words if argument != "--debug"]
     try:
         if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background
             signal.signal(signal.SIGINT, stopping.stop)
         os.getcwd()  # which may have been deleted
-        return _called(given)
+        return _called(words)
     except Unprinted as error:
         # Not 0: whoever reads the output has not got it. Nor 2: the command was right.
         return _fail(f"the output is complete, but could not be printed ({error.strerror})", 1)
@@ -88,8 +88,8 @@ def _advice(error: Any) -> str:
     stage = getattr(context, "info_name", "")
     if not hasattr(error, "possibilities") or stage not in TABLES:
         return f"See '{context.command_path if context else 'hypogoal'} --help'."
-    known = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
-    return f"Settings are given as --set {key if known else 'key'}=VALUE; 'hypogoal config {stage}' lists them."
+    is_setting = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
+    return f"Settings are given as --set {key if is_setting else 'key'}=VALUE; 'hypogoal config {stage}' lists them."
 
 
 def _told(error: BaseException) -> tuple[str, int]:
@@ -112,8 +112,8 @@ def _internal(error: BaseException) -> tuple[str, int]:
         return _refused(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
     if isinstance(error, MemoryError) or any(text in str(error) for text in MEMORY_TEXTS):
         return with_notes(f"there is not enough memory. Nothing was half-written. {NO_MEMORY}", error), 2
-    if (told := users_own(error)) is not None:
-        return with_notes(str(told), error), 2
+    if (user_error := users_own(error)) is not None:
+        return with_notes(str(user_error), error), 2
     first = next(iter(str(error).splitlines()), "")  # those of numbers that are none have a tensor after it
     return f"internal error: {type(error).__name__}: {first}. Run again with --debug for the traceback.", 1
 
@@ -124,9 +124,9 @@ def _commands() -> Any:
     return typer.main.get_command(app)
 
 
-def _called(given: list[str]) -> int:
+def _called(words: list[str]) -> int:
     try:
-        code: object = _commands()(args=given, standalone_mode=False, prog_name="hypogoal")
+        code: object = _commands()(args=words, standalone_mode=False, prog_name="hypogoal")
     except Complete as complete:
         say(complete, err=True)
         give(complete.path)
@@ -136,7 +136,7 @@ def _called(given: list[str]) -> int:
 
 def _refused(error: OSError) -> tuple[str, int]:
     """What to tell, and the exit code, when the system will not read or write a file."""
-    known = {
+    remedies = {
         errno.EMFILE: "Allow more open files (ulimit -n).",
         errno.ENFILE: "Close some programs: the system has as many files open as it can.",
         errno.ENOMEM: NO_MEMORY,
@@ -152,13 +152,13 @@ def _refused(error: OSError) -> tuple[str, int]:
     if not _homed():
         return "the current folder no longer exists. Change to another one.", 2
     # HDF5 tells the number in its text only: "... errno = 28, error message = ..."
-    told = re.search(r"errno = (\d+)", str(error))
-    code = error.errno or (int(told[1]) if told else 0)
+    match = re.search(r"errno = (\d+)", str(error))
+    code = error.errno or (int(match[1]) if match else 0)
     where = f": {error.filename}" if error.filename else ""
     if code in (errno.EACCES, errno.EPERM) and error.filename and not _may_read(error.filename):
         return f"{os.strerror(code)}{where}. Ask for permission to read it.", 2
-    if code in known:
-        return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
+    if code in remedies:
+        return f"{os.strerror(code)}{where}. Nothing was half-written. {remedies[code]}", 2
     return _internal(error)
 
 

@@ -63,7 +63,7 @@ def import_(
 
 
 def _print_observations(context: typer.Context, data: Path, resize: int, quiet: bool) -> None:
-    """What the states of a data file were taken for; of large pictures the command that imports them smaller."""
+    """Say how states were read, as pictures or numbers; of large pictures, how to import them smaller."""
     from hypogoal.dataset import PICTURE, open_dataset
     from hypogoal.needs import LARGE
 
@@ -134,17 +134,17 @@ def label(
 
 
 def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
-    """``KEY=VALUE``, the value as JSON where it is some, else as text."""
-    found: dict[str, Any] = {}
+    """``KEY=VALUE`` by key; the value is parsed as JSON if it is valid JSON, else it is text."""
+    values: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not (equals and name.isidentifier()):
             raise UserError("--arg needs KEY=VALUE", assignment, "For example --arg layout_seed=3.")
         try:
-            found[name] = json.loads(value)
+            values[name] = json.loads(value)
         except (ValueError, RecursionError):
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
 @cli.command(cli.OWN, "check mine:DOMAIN")
@@ -167,22 +167,22 @@ def check(
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
-    kept = True
+    passed = True
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
-        config = configuration("collect", domain, None, set_, {"play": play}, given=True) if domain else None
+        config = configuration("collect", domain, None, set_, {"play": play}, by_user=True) if domain else None
         with Progress("check", total=1, quiet=domain is None) as progress:
-            told = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
-            for verdict in _verdicts(domain, diversity, network, config, told):
+            options = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
+            for verdict in _verdicts(domain, diversity, network, config, options):
                 with progress.paused():
                     for line in verdict.lines:
                         say(line)
-                kept &= verdict.ok
-    if not kept:
+                passed &= verdict.ok
+    if not passed:
         raise typer.Exit(2)
 
 
 def _verdicts(
-    domain: str | None, diversity: str | None, network: str | None, config: Any, told: dict[str, Any]
+    domain: str | None, diversity: str | None, network: str | None, config: Any, options: dict[str, Any]
 ) -> Iterator[Verdict]:
     from hypogoal.testing import check_domain, check_network, check_objective
 
@@ -190,9 +190,9 @@ def _verdicts(
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
-        found = load_domain(domain, given=True)
-        yield from check_domain(found, config, name=domain, **told)
-        seen = tuple(found.observation_shape), found.observation_dtype
+        loaded = load_domain(domain, given=True)
+        yield from check_domain(loaded, config, name=domain, **options)
+        seen = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective
 

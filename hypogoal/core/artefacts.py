@@ -111,11 +111,11 @@ def sha256_of(path: Path) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that an artefact's numbers depend on."""
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
+            installed[name] = metadata.version(name)
+    return installed
 
 
 def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
@@ -153,9 +153,9 @@ def check_kind(out: Path, kind: str) -> None:
             return
         if not (out / MANIFEST).is_file():
             raise UserError(f"what stands there is not of kind {kind!r}: a folder that has no manifest", out, AWAY)
-        found = _manifest_kind(out)
-        if found != kind:
-            what = f"it is of kind {found!r}" if found else "its manifest cannot be read"
+        existing = _manifest_kind(out)
+        if existing != kind:
+            what = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
             raise UserError(f"what stands there is not of kind {kind!r}: {what}", out, AWAY)
     elif not (out.is_file() and {DATA: _is_data, ARRAYS: _is_arrays}.get(kind, lambda path: False)(out)):
         raise UserError(f"what stands there is not of kind {kind!r}: another file", out, AWAY)
@@ -212,7 +212,7 @@ def create_artefact(
     inputs: Sequence[Path] = (),
     force: bool = False,
     resume: bool = False,
-    card: Callable[[dict[str, Any], Path], str] = lambda about, folder: "",
+    card: Callable[[dict[str, Any], Path], str] = lambda header, folder: "",
 ) -> Iterator[Path]:
     """A folder to fill; at the end its ``card`` and its manifest are written and it is renamed to ``out``.
 
@@ -225,23 +225,23 @@ def create_artefact(
         Complete: with ``resume``, it was made with these.
     """
     inputs = [Path(path) for path in inputs]
-    given, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
+    requested, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
     config = config if isinstance(config, dict) else as_dict(config)
-    about = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
+    header = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
     entries = [_input_entry(path, out) for path in inputs]
-    check_writable({**about, "inputs": entries, "files": {}}, out)
-    identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
+    check_writable({**header, "inputs": entries, "files": {}}, out)
+    identity = {**header, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
     if resume and out.exists() and not drafts.unfinished(out):
         manifest = open_artefact(out, kind).manifest
         hashes = [entry["sha256"] for entry in manifest["inputs"]]
-        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
+        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, requested)
     with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
-        if text := card({**about, "inputs": entries}, work.files):
+        if text := card({**header, "inputs": entries}, work.files):
             (work.files / "README.md").write_bytes(text.encode())
-        made = sorted(file for file in work.files.rglob("*") if file.is_file())
-        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
-        manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
+        written = sorted(file for file in work.files.rglob("*") if file.is_file())
+        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
+        manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
         (work.files / MANIFEST).write_bytes(sealed(manifest))
         drafts.put_in_place(work.files, out)
 
@@ -299,14 +299,14 @@ def file_faults(artefact: Artefact) -> dict[str, str]:
 
 def extra_files(artefact: Artefact) -> list[str]:
     """What lies in the artefact's folder and is none of its files; artefacts and drafts within are no part of it."""
-    known, found = {MANIFEST, *artefact.manifest["files"]}, []
+    listed, present = {MANIFEST, *artefact.manifest["files"]}, []
     for place, folders, names in os.walk(artefact.path):
         inner = [Path(place, name) for name in folders if not name.endswith(drafts.PARTIAL)]
         inner = [path for path in inner if not (path / MANIFEST).exists()]
         folders[:] = sorted(path.name for path in inner if not path.is_symlink())
         files = [*(Path(place, name) for name in names), *(path for path in inner if path.is_symlink())]
-        found += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
-    return [name for name in found if name not in known]
+        present += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
+    return [name for name in present if name not in listed]
 
 
 def file_fault(folder: Path, name: str, digest: str) -> str:

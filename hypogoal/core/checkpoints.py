@@ -271,9 +271,9 @@ def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
             require_alike(value, like, f"{place}/{number}")
     elif hasattr(fresh, "dtype"):
         kind, shape = str(fresh.dtype), tuple(fresh.shape)
-        found = tuple(getattr(saved, "shape", ()))
-        grows = isinstance(fresh, _Rows) and len(found) == len(shape)
-        if str(getattr(saved, "dtype", "")) != kind or found[grows:] != shape[grows:]:
+        saved_shape = tuple(getattr(saved, "shape", ()))
+        grows = isinstance(fresh, _Rows) and len(saved_shape) == len(shape)
+        if str(getattr(saved, "dtype", "")) != kind or saved_shape[grows:] != shape[grows:]:
             raise Unlike(f"not {kind} {shape} at {where}")
     elif not (
         (saved == fresh if isinstance(fresh, str) else type(saved) is type(fresh))
@@ -298,7 +298,7 @@ def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None:
     """Continue from an ``optimiser_snapshot`` of one of the same parameters."""
-    state = {int(number): known[0] for number, known in snapshot.items() if known}
+    state = {int(number): moments[0] for number, moments in snapshot.items() if moments}
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
@@ -359,8 +359,8 @@ def _restored(value: Any, saved: Any) -> Any:
         value.clear()
         value.extend(saved)
     elif isinstance(value, list) and value and isinstance(value[0], Resumable | deque | np.random.Generator):
-        for item, known in zip(value, saved, strict=True):
-            _restored(item, known)
+        for item, saved_item in zip(value, saved, strict=True):
+            _restored(item, saved_item)
     elif isinstance(value, torch.nn.Module):
         value.load_state_dict(saved)
     elif isinstance(value, torch.optim.Optimizer):

@@ -31,8 +31,8 @@ def prepare(device: str = "auto") -> str:
     torch.set_flush_denormal(True)
     check_name(device)
     if device == "cuda" and not torch.cuda.is_available():
-        found = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
-        raise UserError("torch finds no GPU", found, "Use --device cpu, or see docs/gpu.md.")
+        installed = f"torch {torch.__version__}, {'for CUDA' if torch.version.cuda else 'built for the CPU only'}"
+        raise UserError("torch finds no GPU", installed, "Use --device cpu, or see docs/gpu.md.")
     return "cuda" if device == "cuda" else "cpu"
 
 

@@ -53,15 +53,15 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
         return {}
     every = resources.files("hypogoal") / "presets"
     folder = every / domain if domain.replace("-", "_").isidentifier() and (every / domain).is_dir() else every / DOMAIN
-    known = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    available = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
     if name.endswith(".toml"):
         if not Path(name).exists():
-            raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(known)}.")
+            raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(available)}.")
         text = read_text(Path(name), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
-    elif name in known:
+    elif name in available:
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     else:
-        raise UserError("unknown preset", name, f"Choose one of {', '.join(known)}, or give a .toml file.")
+        raise UserError("unknown preset", name, f"Choose one of {', '.join(available)}, or give a .toml file.")
     table = parse_toml(text, name, "the preset is", "Mend the file.")
     for key in table:
         if tables and key not in (*tables, stage):
@@ -136,9 +136,9 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
     return config_class(**checked)
 
 
-def meant(word: str, known: Iterable[str]) -> str:
+def meant(word: str, candidates: Iterable[str]) -> str:
     """A question for whoever wrote ``word`` and may have meant a known one; else empty."""
-    near = difflib.get_close_matches(word, [*known], n=1)
+    near = difflib.get_close_matches(word, [*candidates], n=1)
     return f"Did you mean {near[0]!r}? " if near else ""
 
 
@@ -155,14 +155,14 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
     kinds = typing.get_type_hints(config_class)
     rows = []
     for field in dataclasses.fields(config_class):
-        kind, default, about = kinds[field.name], field.default, dict(field.metadata)
+        kind, default, details = kinds[field.name], field.default, dict(field.metadata)
         for values, source in instead:
             if field.name in values:
-                default, about["source"] = values[field.name], source
+                default, details["source"] = values[field.name], source
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
-        rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source")})
+        rows.append(row | {key: details.get(key) for key in ("unit", "meaning", "source")})
         home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))
-        rows[-1] |= {"allowed": _allowed(about), "part": (home.__doc__ or "").partition(".")[0]}
+        rows[-1] |= {"allowed": _allowed(details), "part": (home.__doc__ or "").partition(".")[0]}
     return rows
 
 

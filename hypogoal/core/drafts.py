@@ -83,8 +83,8 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
     folder = draft_folder(out)
     called = Path(sys.argv[0]).name
     words = COMMAND.get() or ("hypogoal" if called == "__main__.py" else called, *sys.argv[1:])
-    told = [word for word in words if word != "--resume"]  # of which nothing depends
-    fresh = {"identity": identity, "command": told}
+    command = [word for word in words if word != "--resume"]  # of which nothing depends
+    fresh = {"identity": identity, "command": command}
     fresh = parse_json(
         json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
     )
@@ -113,16 +113,16 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         _clear(folder)
 
 
-def put_in_place(made: Path, out: Path) -> None:
+def put_in_place(finished: Path, out: Path) -> None:
     """Rename what was made, a folder or a file, to ``out``; what stood there is moved aside first and removed last."""
-    for path in [made, *made.rglob("*")]:
+    for path in [finished, *finished.rglob("*")]:
         sync(path)
     out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if out.exists():
         out.rename(old)
     try:
-        made.rename(out)
+        finished.rename(out)
         sync(out.parent)
     finally:
         _settle(out)
@@ -153,11 +153,11 @@ def sweep_up(folder: Path) -> None:
 
 
 def _sweep_draft(folder: Path, out: Path) -> None:
-    known = {FILES, FOLDER, BEGUN, LOCK}
+    expected = {FILES, FOLDER, BEGUN, LOCK}
     lock = folder / LOCK
     if any(path.is_symlink() for path in (folder, lock)) or not lock.is_file():
         return
-    if not all(name in known or FRESH.fullmatch(name) for name in os.listdir(folder)):
+    if not all(name in expected or FRESH.fullmatch(name) for name in os.listdir(folder)):
         return  # it is no draft
     with lock.open("r+b") as file:
         if try_lock(file) and is_there(file, lock) and not unfinished(out):
@@ -219,10 +219,10 @@ def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str
         raise UserError(f"{what} with {other}", out, do)
 
 
-def _that_matters(about: dict[str, Any]) -> dict[str, Any]:
+def _that_matters(identity: dict[str, Any]) -> dict[str, Any]:
     """What results depend on: not on how many processes there are, nor on how their manifest is written."""
-    about, config = {key: value for key, value in about.items() if key != "format"}, about.get("config")
-    return about if not isinstance(config, dict) else {**about, "config": {**config, "workers": None}}
+    identity, config = {key: value for key, value in identity.items() if key != "format"}, identity.get("config")
+    return identity if not isinstance(config, dict) else {**identity, "config": {**config, "workers": None}}
 
 
 def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
@@ -235,17 +235,17 @@ def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path)
     now = json.loads(json.dumps(now))
     keys = [key for key in now if key not in ("config", "versions")]
     settings = sorted(before["config"].keys() & now["config"].keys())
-    one, other = (
-        {"config": {key: about["config"][key] for key in settings}, **{key: about[key] for key in keys}}
-        for about in (before, now)
+    old, new = (
+        {"config": {key: identity["config"][key] for key in settings}, **{key: identity[key] for key in keys}}
+        for identity in (before, now)
     )
     do = "Give --force and no --resume, or write elsewhere."
-    check_same(one, other, out, "what is complete there was made", do)
+    check_same(old, new, out, "what is complete there was made", do)
     if now["config"] and not settings:
         raise UserError("what is complete there was made with other settings", out, do)
     versions = before.get("versions")
-    known = versions.items() if isinstance(versions, dict) else ()
-    others = [f"{name} {version}" for name, version in known if now["versions"].get(name) != version]
+    recorded = versions.items() if isinstance(versions, dict) else ()
+    others = [f"{name} {version}" for name, version in recorded if now["versions"].get(name) != version]
     return Complete(out, f"made with {', '.join(others)}" if others else "")
 
 

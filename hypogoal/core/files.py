@@ -298,5 +298,5 @@ def lies_in(folder: Path, path: Path) -> bool:
 
 def visible(folder: Path, pattern: str) -> list[Path]:
     """The paths below a folder that fit a pattern, sorted, but for what is hidden, as drafts are."""
-    found = ((path, path.relative_to(folder).parts) for path in folder.rglob(pattern))
-    return sorted(path for path, parts in found if not any(part.startswith(".") for part in parts))
+    candidates = ((path, path.relative_to(folder).parts) for path in folder.rglob(pattern))
+    return sorted(path for path, parts in candidates if not any(part.startswith(".") for part in parts))

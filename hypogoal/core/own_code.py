@@ -105,14 +105,14 @@ def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> A
             sys.path.append(os.getcwd())
         target = name
     if target is None:
-        known = ", ".join(sorted({*built_in, *entries}))
-        raise UserError(f"unknown {what}", name, f"Choose one of {known}, or give module:object.")
+        names = ", ".join(sorted({*built_in, *entries}))
+        raise UserError(f"unknown {what}", name, f"Choose one of {names}, or give module:object.")
     module, _, attribute = target.partition(":")
     if name not in built_in and not target.startswith("hypogoal."):
         _own.add(module.partition(".")[0])
     with UsersCode(f"the {what}", name, failed="cannot be loaded:"):
-        found = importlib.import_module(module)
-        return getattr(found, attribute) if attribute else found
+        loaded = importlib.import_module(module)
+        return getattr(loaded, attribute) if attribute else loaded
 
 
 class _Running(threading.local):
@@ -149,10 +149,10 @@ class UsersCode:
     ``method``, or a text, what the user calls it; ``failed`` stands between ``what`` and the exception.
     """
 
-    __slots__ = ("failed", "method", "of", "what")
+    __slots__ = ("failed", "method", "target", "title")
 
-    def __init__(self, what: str, of: object = None, method: str = "", *, failed: str = "raised"):
-        self.what, self.of, self.method, self.failed = what, of, method, failed
+    def __init__(self, title: str, target: object = None, method: str = "", *, failed: str = "raised"):
+        self.title, self.target, self.method, self.failed = title, target, method, failed
 
     def __enter__(self) -> Self:
         _running.blocks += 1
@@ -167,43 +167,43 @@ class UsersCode:
 
     def _told(self, error: BaseException) -> UserError:
         do = "Mend it; --debug shows how it was called."
-        if isinstance(self.of, str):
+        if isinstance(self.target, str):
             do = "Check the module and the object; --debug shows where."
         text = f"{type(error).__name__}: {_quoted(str, error)}"
         if isinstance(error, SystemExit):
             text, do = f"{_quoted(repr, error)}, to end the program", "Have it raise an error that says what is wrong."
         frames = traceback.extract_tb(error.__traceback__)
         theirs = [frame for frame in frames if not frame.filename.startswith(_libraries())]
-        if inspect.isclass(self.of) and not any(self._in_it(frame) for frame in theirs):
+        if inspect.isclass(self.target) and not any(self._in_it(frame) for frame in theirs):
             theirs = []  # it raised in what called it, since it cannot be called so, or gave what it should not
         place = _place(theirs[-1].filename, theirs[-1].lineno) if theirs else ""
-        if isinstance(self.of, str):
-            place = f"{self.of} ({place})" if place else self.of
-        return UserError(f"{self.what} {self.failed} {text}", place or self._place() or None, do)
+        if isinstance(self.target, str):
+            place = f"{self.target} ({place})" if place else self.target
+        return UserError(f"{self.title} {self.failed} {text}", place or self._place() or None, do)
 
     def refuse(self, gave: str, do: str) -> NoReturn:
         """Tell (``UserError``) that what it gave is not what it promised to, with the place where the code begins."""
-        raise UserError(f"{self.what} {gave}", self._place() or None, do)
+        raise UserError(f"{self.title} {gave}", self._place() or None, do)
 
     def _place(self) -> str:
         """Where the code begins; of an environment the user's own layers, the outermost first, else the innermost."""
-        spans = [span for layer in layers(self.of) if (span := self._span(layer))]
+        spans = [span for layer in layers(self.target) if (span := self._span(layer))]
         theirs = [span for span in spans if not span[0].startswith(_libraries())]
         return ", around ".join(dict.fromkeys(_place(*span[:2]) for span in theirs or spans[-1:]))
 
-    def _span(self, of: Any) -> tuple[str, int, int] | None:
+    def _span(self, target: Any) -> tuple[str, int, int] | None:
         """File, first line and number of lines of the method, function or class; None where Python does not know."""
         try:
-            of = inspect.unwrap(getattr(of, self.method) if self.method else getattr(of, "func", of))
-            of = of if inspect.isroutine(of) or inspect.isclass(of) else type(of)
-            source, first = inspect.getsourcelines(of)
-            return inspect.getsourcefile(of) or "", first, len(source)
+            target = inspect.unwrap(getattr(target, self.method) if self.method else getattr(target, "func", target))
+            target = target if inspect.isroutine(target) or inspect.isclass(target) else type(target)
+            source, first = inspect.getsourcelines(target)
+            return inspect.getsourcefile(target) or "", first, len(source)
         except Exception:  # noqa: BLE001 - whatever own objects do when they are asked
             return None
 
     def _in_it(self, frame: traceback.FrameSummary) -> bool:
         """Whether a frame is one of the method, function or class."""
-        file, first, count = self._span(self.of) or ("", 0, 0)
+        file, first, count = self._span(self.target) or ("", 0, 0)
         return frame.filename == file and first <= (frame.lineno or 0) < first + count
 
     def truth(self, value: Any, name: str) -> bool:
@@ -235,8 +235,8 @@ def users_own(error: BaseException) -> UserError | None:
     if isinstance(error, UserError | NumericalError):
         return None
     passed = [_module(frame) for frame, _ in traceback.walk_tb(error.__traceback__)]
-    own = next((module for module in passed if module in _own), None)
-    return UsersCode(f"own code of {own}")._told(error) if own else None
+    culprit = next((module for module in passed if module in _own), None)
+    return UsersCode(f"own code of {culprit}")._told(error) if culprit else None
 
 
 def as_number(value: Any) -> int | None:
@@ -259,12 +259,12 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "shape", None) == () else value
 
 
-def layers(of: Any) -> list[Any]:
+def layers(env: Any) -> list[Any]:
     """An environment's wrappers and itself, the outermost first; anything else alone."""
-    found = [of]
-    while hasattr(type(of), "unwrapped") and (of := getattr(of, "__dict__", {}).get("env")) is not None:
-        found.append(of)
-    return found
+    wrappers = [env]
+    while hasattr(type(env), "unwrapped") and (env := getattr(env, "__dict__", {}).get("env")) is not None:
+        wrappers.append(env)
+    return wrappers
 
 
 @functools.cache

@@ -29,17 +29,19 @@ def preflight(stage: str, out: Path, needs: Needs, *, resume: bool = False, quie
     if resume and out.exists() and not unfinished(out):
         return
     memory, disk, seconds, smaller = needs
-    free, known = available(), "unknown"
+    free, free_text = available(), "unknown"
     space = shutil.disk_usage(next(folder for folder in out.absolute().parents if folder.is_dir())).free
     if free is not None:
-        known = human(free)
+        free_text = human(free)
         if memory > free:
-            what = f"not enough memory: about {human(memory)} needed, {known} free"
+            what = f"not enough memory: about {human(memory)} needed, {free_text} free"
             raise UserError(what, stage, smaller)
     if disk > space:
         raise UserError(f"not enough disk: about {human(disk)} needed, {human(space)} free", out, "Free some of it.")
     if not quiet:
-        needed = f"needs about {human(memory)} of memory ({known} free), {human(disk)} of disk ({human(space)} free)"
+        needed = (
+            f"needs about {human(memory)} of memory ({free_text} free), {human(disk)} of disk ({human(space)} free)"
+        )
         say(f"{stage}: {needed}{f', {duration(seconds)}' if seconds else ''}", err=True)
 
 
@@ -51,8 +53,8 @@ def available() -> int | None:
 
 def free_memory() -> int | None:
     """Bytes of memory that can be had: the system's, or less where a control group allows less; None if unknown."""
-    known = [amount for amount in (_told("/proc/meminfo", "MemAvailable:"), *_groups()) if amount is not None]
-    return min(known) if known else None
+    limits = [amount for amount in (_told("/proc/meminfo", "MemAvailable:"), *_groups()) if amount is not None]
+    return min(limits) if limits else None
 
 
 def own_memory() -> int:
@@ -91,8 +93,8 @@ def _folders() -> list[Path]:
         lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError):
         return []
-    own = [CGROUP / line[3:].lstrip("/") for line in lines if line.startswith("0::")]
-    return [folder for place in own for folder in (place, *place.parents) if folder.is_relative_to(CGROUP)]
+    groups = [CGROUP / line[3:].lstrip("/") for line in lines if line.startswith("0::")]
+    return [folder for place in groups for folder in (place, *place.parents) if folder.is_relative_to(CGROUP)]
 
 
 def human(amount: float) -> str:

@@ -118,8 +118,8 @@ class Progress:
         rate = max(self.done - self._before, 0) / seconds
         speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""
         left = self.total - self.done
-        known = f" ({speed}, {duration(left / rate)} left)" if rate and left > 0 else ""
-        say(f"{self.title}: {self.done}/{self.total}{known}{f', {text}' if text else ''}", err=True)
+        estimate = f" ({speed}, {duration(left / rate)} left)" if rate and left > 0 else ""
+        say(f"{self.title}: {self.done}/{self.total}{estimate}{f', {text}' if text else ''}", err=True)
 
 
 def duration(seconds: float) -> str:
@@ -133,8 +133,8 @@ def duration(seconds: float) -> str:
 
 def said_left(text: str) -> float | None:
     """Seconds that a line of :class:`Progress` says are left; None where it says none."""
-    found = re.search(rf", ([0-9]{{1,9}}(?:\.[0-9]+)?) ({'|'.join(UNITS)}) left\)", text)
-    return float(found[1]) * UNITS[found[2]] if found else None
+    match = re.search(rf", ([0-9]{{1,9}}(?:\.[0-9]+)?) ({'|'.join(UNITS)}) left\)", text)
+    return float(match[1]) * UNITS[match[2]] if match else None
 
 
 class MetricsLog:

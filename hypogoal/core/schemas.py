@@ -41,14 +41,14 @@ def is_amount(value: Any) -> bool:
     return type(value) in (int, float) and 0 <= value <= LARGEST
 
 
-def is_list(of: Test) -> Test:
+def is_list(test: Test) -> Test:
     """A test of lists by their items."""
-    return lambda value: isinstance(value, list) and all(map(of, value))
+    return lambda value: isinstance(value, list) and all(map(test, value))
 
 
-def is_table(of: Test) -> Test:
+def is_table(test: Test) -> Test:
     """A test of objects by their values; their keys are texts."""
-    return lambda value: isinstance(value, dict) and all(map(is_text, value)) and all(map(of, value.values()))
+    return lambda value: isinstance(value, dict) and all(map(is_text, value)) and all(map(test, value.values()))
 
 
 def is_object(needed: Schema) -> Test:

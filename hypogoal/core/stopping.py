@@ -24,15 +24,15 @@ def stop(signum: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt(signum)
 
 
-def unraised(what: Any) -> None:
+def unraised(unraisable: Any) -> None:
     """As ``sys.unraisablehook``: a signal that came while an object was torn down comes again.
 
     Python would drop it with a traceback.
     """
-    if isinstance(what.exc_value, KeyboardInterrupt):
-        _thread.start_new_thread(_again, what.exc_value.args or (signal.SIGINT,))
+    if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        _thread.start_new_thread(_again, unraisable.exc_value.args or (signal.SIGINT,))
     else:
-        sys.__unraisablehook__(what)
+        sys.__unraisablehook__(unraisable)
 
 
 def _again(signum: int) -> None:

@@ -72,29 +72,29 @@ def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def check_fit(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], where: object, do: str) -> None:
+def check_fit(expected: Mapping[str, Tensor], weights: Mapping[str, Tensor], where: object, do: str) -> None:
     """Refuse (``UserError``) weights that are not those of a network, by name, shape and kind of number."""
-    for name in sorted({*wanted, *given}):
-        one, other = wanted.get(name), given.get(name)
-        if one is None or other is None or one.shape != other.shape or one.dtype != other.dtype:
+    for name in sorted({*expected, *weights}):
+        target, source = expected.get(name), weights.get(name)
+        if target is None or source is None or target.shape != source.shape or target.dtype != source.dtype:
             raise UserError(f"the weights do not fit the network (at {name})", where, do)
 
 
-def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object, *, own: bool = False) -> M:
-    """The module that ``make`` makes, with these weights; nothing is allocated before they are known to fit, unless
-    the user's ``own`` code makes it, which may need numbers.
+def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object, *, custom: bool = False) -> M:
+    """The module built by ``make``, with these weights; a ``UserError`` if they do not fit it or it cannot be built.
 
-    Where they do not, or none can be made as the manifest says, it is a ``UserError``.
+    Nothing is allocated before the weights are known to fit, unless the network is ``custom``, the user's code, which
+    may need real numbers.
     """
     import torch
 
     try:
-        # Shapes without numbers: what a manifest asks for may be a thousand times too large.
-        with torch.device("cpu" if own else "meta"):
+        # Shapes without numbers: a manifest may ask for a network a thousand times too large.
+        with torch.device("cpu" if custom else "meta"):
             module = make()
     except (RuntimeError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         raise UserError("the weights do not fit the manifest", where, AGAIN) from None
     check_fit(module.state_dict(), weights, where, AGAIN)
-    module = module if own else make()
+    module = module if custom else make()
     module.load_state_dict(weights)
     return module

@@ -33,8 +33,8 @@ def allowed(wanted: int) -> int:
     """How many processes a stage may use that was told to use ``wanted`` (0: all it can), no more than are allotted."""
     if not wanted:
         return cores()
-    told = os.environ.get(CORES, "")
-    return min(wanted, max(1, int(told))) if told.isdigit() else wanted
+    setting = os.environ.get(CORES, "")
+    return min(wanted, max(1, int(setting))) if setting.isdigit() else wanted
 
 
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
@@ -55,9 +55,9 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
     with environment(**SAFE_PATH):
         pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
-        own = own_code.allowed()
+        trusted = own_code.allowed()
         with environment(**SAFE_PATH):
-            futures = {pool.submit(_guarded, task, own): number for number, task in enumerate(tasks)}
+            futures = {pool.submit(_guarded, task, trusted): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
@@ -89,13 +89,13 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, KILLED)
 
 
-def _guarded(task: Callable[[], T], own: frozenset[str]) -> T:
+def _guarded(task: Callable[[], T], trusted: frozenset[str]) -> T:
     try:
-        with own_code.vouched(*own):
+        with own_code.vouched(*trusted):
             return task()
     except KeyboardInterrupt:  # the pool would give this process the next task
         os._exit(128 + signal.SIGTERM)
     except BaseException as error:
-        if (told := users_own(error)) is None:
+        if (user_error := users_own(error)) is None:
             raise
-        raise told from error  # where it came from is known here only: no traceback goes along
+        raise user_error from error  # where it came from is known here only: no traceback goes along

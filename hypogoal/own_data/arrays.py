@@ -45,8 +45,8 @@ def read_arrays(path: Path) -> Parts:
         if name in arrays and arrays[name].dtype.kind != "U":
             raise UserError(f"{name} are {arrays[name].dtype}, not texts", path, "Give numpy.array of str.")
     named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
-    given: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
-    return Parts(**given, **named)
+    values: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
+    return Parts(**values, **named)
 
 
 def read_states(path: Path) -> Observations:
@@ -64,10 +64,10 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
     first: dict[str, Observations] = {}
     for split, labels in columns.items():
         for goal in dataset.sub_goals:
-            found = getattr(dataset, split)(goal)
-            if not np.array_equal(first.setdefault(split, found.observations), found.observations):
+            states = getattr(dataset, split)(goal)
+            if not np.array_equal(first.setdefault(split, states.observations), states.observations):
                 raise UserError("its sub-goals have states of their own", dataset.path, "Read it with h5py instead.")
-            labels.append(found.labels)
+            labels.append(states.labels)
     arrays: dict[str, Any] = {
         "observations": first["labelled"],
         "labels": np.stack(columns["labelled"], axis=1),
@@ -107,9 +107,9 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
     arrays = {}
     _require_known(sorted(file.stem for file in path.glob("*.npy")), path)
     files = {name: path / f"{name}.npy" for name in KNOWN}
-    found = {name: file for name, file in files.items() if file.is_file()}
-    require_memory(sum(file.stat().st_size for file in found.values()), path)
-    for name, file in found.items():
+    existing = {name: file for name, file in files.items() if file.is_file()}
+    require_memory(sum(file.stat().st_size for file in existing.values()), path)
+    for name, file in existing.items():
         try:
             arrays[name] = np.load(file, allow_pickle=False)
         except DAMAGED as error:

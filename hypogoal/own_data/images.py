@@ -54,8 +54,8 @@ def read_images(folder: Path, *, resize: int = 0, stack: bool = False) -> Parts:
         file = [file for kind in kinds for file in files[kind]][row]
         return file.relative_to(folder).as_posix()
 
-    heldout, known = _labelled(*read[3:]) if read[3:] else (None, None)
-    return Parts(*_labelled(*read[:2]), read[2], heldout, known, name=name)
+    heldout, heldout_labels = _labelled(*read[3:]) if read[3:] else (None, None)
+    return Parts(*_labelled(*read[:2]), read[2], heldout, heldout_labels, name=name)
 
 
 def _labelled(positive: NDArray[np.uint8], negative: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

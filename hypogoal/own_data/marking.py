@@ -93,8 +93,8 @@ class Marks:
 
     def counts(self) -> dict[str, int]:
         """States of each kind."""
-        found = [file.parent.name for file in self._files.values()]
-        return {kind: found.count(kind) for kind in self.kinds}
+        kinds = [file.parent.name for file in self._files.values()]
+        return {kind: kinds.count(kind) for kind in self.kinds}
 
     def _move(self, name: str, kind: str) -> None:
         before = self._files[name]
@@ -402,8 +402,8 @@ def action_help(names: Sequence[str]) -> tuple[str, ...]:
     """Which keys play which actions, in lines."""
     if "NOOP" in names:
         return ("arrows or w a s d, space: move, fire; together, too",)
-    told = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
-    return tuple(", ".join(told[first : first + 3]) for first in range(0, len(told), 3))
+    texts = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
+    return tuple(", ".join(texts[first : first + 3]) for first in range(0, len(texts), 3))
 
 
 def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]]:

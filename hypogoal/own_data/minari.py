@@ -35,11 +35,11 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
     """
     if not labels:
         raise UserError("a Minari dataset has no labels", folder, "Give --label NAME=module:function.")
-    about = read_json(folder / METADATA, "the metadata are", DO)
-    stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
+    metadata = read_json(folder / METADATA, "the metadata are", DO)
+    stored = metadata.get("data_format", "hdf5") if isinstance(metadata, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
-    names, episodes = _episodes(folder / MINARI, key, _picture_shape(about.get("observation_space"), key))
+    names, episodes = _episodes(folder / MINARI, key, _picture_shape(metadata.get("observation_space"), key))
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
     order = rng_for(seed, "minari").permutation(len(episodes))
@@ -81,10 +81,10 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list
 def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:
     """The shape of a space of pictures, told as JSON, which Minari may have made JPEG; None where it is no such one."""
     try:
-        about = json.loads(space) if isinstance(space, str) else {}
-        about = about["subspaces"][key] if key else about
-        shape = tuple(about["shape"])
-        return shape if (about["type"], about["dtype"]) == ("Box", "uint8") and len(shape) in (2, 3) else None
+        box = json.loads(space) if isinstance(space, str) else {}
+        box = box["subspaces"][key] if key else box
+        shape = tuple(box["shape"])
+        return shape if (box["type"], box["dtype"]) == ("Box", "uint8") and len(shape) in (2, 3) else None
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
 
@@ -96,11 +96,11 @@ def _number(name: str) -> int:
 
 def _told(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.bool_]:
     """What the functions say of each observation, bool (N, G)."""
-    told = np.empty((len(observations), len(labels)), np.bool_)
+    truths = np.empty((len(observations), len(labels)), np.bool_)
     for column, label in enumerate(labels):
         with UsersCode(f"the label function {getattr(label, '__name__', column)}", label) as code:
-            told[:, column] = [code.truth(label(observation), "the label") for observation in observations]
-    return told
+            truths[:, column] = [code.truth(label(observation), "the label") for observation in observations]
+    return truths
 
 
 def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, actions: int, description: str) -> int:
@@ -129,7 +129,7 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
         | {bound: np.full(shape, value).tolist() for bound, value in zip(("low", "high"), bounds, strict=True)},
         "action_space": {"type": "Discrete", "dtype": "int64", "start": 0, "n": actions},
     }
-    about = {
+    metadata = {
         "total_episodes": count,
         "total_steps": total,
         "data_format": "hdf5",
@@ -138,7 +138,7 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
         "minari_version": MINARI_VERSION,
         "algorithm_name": "hypogoal",
         "description": description,
-        **{space: json.dumps(about) for space, about in spaces.items()},
+        **{name: json.dumps(space) for name, space in spaces.items()},
     }
-    (folder / METADATA).write_text(json.dumps(about) + "\n", encoding="utf-8")
+    (folder / METADATA).write_text(json.dumps(metadata) + "\n", encoding="utf-8")
     return total

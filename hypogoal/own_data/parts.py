@@ -57,8 +57,8 @@ def collected_of(
     if doubt := _reading(parts.observations).doubt:
         warned.append(doubt)
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
-        given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
-        raise UserError("the number of feature names is wrong", given, "Give one for each.")
+        counts = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
+        raise UserError("the number of feature names is wrong", counts, "Give one for each.")
     shape = images.shape[1:]
     labelled = States(images, as_labels(parts.labels, len(images), "the labels"), _rows(images))
     goals = named(sub_goals or parts.sub_goals, labelled.labels.shape[1])
@@ -67,11 +67,11 @@ def collected_of(
     looks, kind = looks_of(images), "picture" if images.dtype == PICTURE else "observation"
     names = partial(parts.name, "observations"), partial(parts.name, "heldout_observations")
     if parts.heldout_observations is not None and parts.heldout_labels is not None:
-        what = "the held-out observations"
-        heldout = as_observations(parts.heldout_observations, what, images, resize=resize, stack=stack)
-        told = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
-        test = States(heldout, told, _rows(heldout))
-        every = np.concatenate([looks, looks_of(heldout)]), np.concatenate([labelled.labels, told])
+        heldout = parts.heldout_observations
+        heldout = as_observations(heldout, "the held-out observations", images, resize=resize, stack=stack)
+        heldout_labels = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
+        test = States(heldout, heldout_labels, _rows(heldout))
+        every = np.concatenate([looks, looks_of(heldout)]), np.concatenate([labelled.labels, heldout_labels])
         warned += contradictions(*every, goals, _one_after_another(len(images), *names), kind=kind)
         do = "Hold out others, of other contexts."
         test = _apart(test, (images, unlabelled), "held-out", "to learn from", do, warned)
@@ -121,15 +121,15 @@ def require_memory(size: int, where: Path) -> None:
         raise UserError(what, where, "Give fewer states.")
 
 
-def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, of: str, do: str, warned: list[str]) -> States:
+def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, role: str, do: str, warned: list[str]) -> States:
     """States of a ``kind`` that look like none of the others, which are ``of`` another; none left: a ``UserError``."""
     kept = leave_out(states, *others)
     count = len(states.labels)
     if len(kept.labels) < count:
         twice = f"{count - len(kept.labels)} of {count} {kind} states"
-        warned.append(f"{twice} look like one {of}: they are left out")
+        warned.append(f"{twice} look like one {role}: they are left out")
     if not len(kept.labels):
-        raise UserError(f"every {kind} state looks like one {of}", None, do)
+        raise UserError(f"every {kind} state looks like one {role}", None, do)
     return kept
 
 
@@ -141,32 +141,32 @@ def as_observations(
     ``stack``: frames and colours in other places become channels. ``resize``: the longer side of pictures in pixels, at
     most. What is neither, none at all, or of another kind than those that they are to be ``like`` is a ``UserError``.
     """
-    found = f"{values.dtype} {values.shape}"
+    actual = f"{values.dtype} {values.shape}"
     if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
         do = "Give images (N, height, width, channels), or numbers (N, ...)."
-        raise UserError(f"{what} are not observations", found, do)
+        raise UserError(f"{what} are not observations", actual, do)
     if not len(values):
-        raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")
+        raise UserError(f"there are none of {what}", actual, "Give some: from other contexts, where unlabelled.")
     reading = _reading(values)
     stackable = reading.dtype == PICTURE and reading.picture is not None and len(reading.picture.axes) > 2
     if reading.fault and not (stack and stackable):
         pictures = reading.picture.expression(batch=True) if reading.picture else "uint8 (N, H, W, C)"
         stacks = ", as 'import --stack' does" if stackable else ""
         do = f"Of pictures give {pictures}{stacks}; of numbers x.reshape(len(x), -1)"
-        raise UserError(f"{what} {reading.fault}", found, f"{do}.")
+        raise UserError(f"{what} {reading.fault}", actual, f"{do}.")
     if reading.dtype == PICTURE:
         values = reading.picture.arrange(values) if reading.picture else values
         if resize and max(values.shape[1:3]) > resize:
             values = np.stack([shrunk_picture(picture, resize) for picture in values])
     elif resize:
-        raise UserError("only pictures can be resized", found, "Leave out --resize.")
+        raise UserError("only pictures can be resized", actual, "Leave out --resize.")
     else:
         values = values.astype(NUMBERS, copy=False)
         if not np.isfinite(values).all():
-            raise UserError(f"{what} have numbers that are not finite", found, "Give finite ones.")
+            raise UserError(f"{what} have numbers that are not finite", actual, "Give finite ones.")
     if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
-        given = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
-        raise UserError(f"{what} differ in shape or type from the labelled ones", given)
+        difference = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
+        raise UserError(f"{what} differ in shape or type from the labelled ones", difference)
     return np.ascontiguousarray(values)
 
 
@@ -178,16 +178,16 @@ def _reading(values: NDArray[Any]) -> Reading:
 
 def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = None) -> NDArray[np.bool_]:
     """Labels bool (count, G); another number of them, or other values than 0 and 1, are a ``UserError``."""
-    found = f"{values.dtype} {values.shape}"
+    actual = f"{values.dtype} {values.shape}"
     columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or len(columns) != count or columns.shape[1] == 0:
-        raise UserError(f"{what} do not fit {count} states", found, f"Give ({count},), or ({count}, sub-goals).")
+        raise UserError(f"{what} do not fit {count} states", actual, f"Give ({count},), or ({count}, sub-goals).")
     numbers = columns.dtype.kind in "biuf"
-    odd = np.setdiff1d(columns, (0, 1))[:3].tolist() if numbers else found
+    odd = np.setdiff1d(columns, (0, 1))[:3].tolist() if numbers else actual
     if odd:
         raise UserError(f"{what} are not only 0 and 1", odd, "1 where the sub-goal holds, 0 where not.")
     if goals is not None and columns.shape[1] != goals:
-        raise UserError(f"{what} are of {columns.shape[1]} sub-goals, not {goals}", found, "Give a column for each.")
+        raise UserError(f"{what} are of {columns.shape[1]} sub-goals, not {goals}", actual, "Give a column for each.")
     return columns.astype(np.bool_)
 
 

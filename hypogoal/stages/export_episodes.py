@@ -44,15 +44,15 @@ def export_episodes(
 
     with draft(out, {"kind": "episodes"}, force=force) as work:
         with Progress("export", total=episodes, quiet=quiet) as progress:
-            about = {"name": dataset_id(out), "description": described}
-            steps = write_minari(work.files, told(progress), actions=loop.engine.n_actions, **about)
+            details = {"name": dataset_id(out), "description": described}
+            steps = write_minari(work.files, told(progress), actions=loop.engine.n_actions, **details)
         put_in_place(work.files, out)
     return steps
 
 
 def dataset_id(out: Path) -> str:
     """By which id minari finds a dataset's folder: ``namespace/name-v0`` below where it looks, else ``name-v0``."""
-    told = os.environ.get("MINARI_DATASETS_PATH")
-    root = Path(os.path.expanduser("~"), ".minari", "datasets") if told is None else Path(told)
+    configured = os.environ.get("MINARI_DATASETS_PATH")
+    root = Path(os.path.expanduser("~"), ".minari", "datasets") if configured is None else Path(configured)
     place, root = out.resolve(), root.resolve()
     return place.relative_to(root).as_posix() if place.is_relative_to(root) else out.name

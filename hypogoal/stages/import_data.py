@@ -88,5 +88,5 @@ def export_data(data: Path, out: Path, *, force: bool = False) -> None:
     out = claim(out, kind=ARRAYS, inputs=[data], force=force)
     dataset = open_dataset(data)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as made:
-        write_arrays(made, dataset)
+    with replacing(out) as fresh:
+        write_arrays(fresh, dataset)

@@ -70,7 +70,7 @@ def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
     if source in gymnasium.registry:
         return gymnasium.make(source, **arguments)
     try:
-        found = own_code.load_own(source, "environment", ENTRY_POINTS, BUILT_IN)
+        loaded = own_code.load_own(source, "environment", ENTRY_POINTS, BUILT_IN)
     except UserError as error:
         if source.partition(":")[2] in gymnasium.registry:  # Gymnasium's module:id, and the module is loaded now
             return gymnasium.make(source, **arguments)
@@ -78,4 +78,4 @@ def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
             raise
         do = "Give a data file, a .npz file, a folder of images, a domain, an environment's id or module:object."
         raise UserError("neither a file nor an environment", source, do) from error
-    return found.make_env(**arguments) if isinstance(found, Domain) else found(**arguments)
+    return loaded.make_env(**arguments) if isinstance(loaded, Domain) else loaded(**arguments)
