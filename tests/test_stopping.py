@@ -73,7 +73,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path, capsys: pytest.Captu
         )
         assert unfinished(out) and not out.exists()
     for given, line in (
-        ([], "an unfinished output is there"),
+        ([], "an unfinished output exists"),
         (["--resume", "--seed", "1"], "begun with seed=0, not 1"),
     ):
         assert main([*arguments, *given]) == 2

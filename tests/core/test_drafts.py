@@ -124,9 +124,9 @@ def test_what_is_unfinished_is_not_begun_anew_by_mistake(tmp_path: Path) -> None
     out = tmp_path / "meta"
     with pytest.raises(Broken):
         stop(out, Broken())
-    with pytest.raises(UserError, match="an unfinished output is there"):
+    with pytest.raises(UserError, match="an unfinished output exists"):
         claim(out, kind="meta")
-    with pytest.raises(UserError, match="an unfinished output is there"):
+    with pytest.raises(UserError, match="an unfinished output exists"):
         finish(out)
     assert unfinished(out) and claim(out, kind="meta", resume=True) and claim(out, kind="meta", force=True)
 
