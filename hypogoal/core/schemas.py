@@ -5,7 +5,7 @@ from typing import Any
 
 from hypogoal.core.files import MOST_INTEGER
 
-MAX_AMOUNT = 1e18  # of bytes or seconds: a million terabytes, the age of the universe; sums of them stay finite
+LARGEST = 1e18  # of bytes or seconds: a million terabytes, the age of the universe; sums of them stay finite
 MOST_TEXT, MOST_WORD = 1 << 12, 1 << 16  # characters
 Test = Callable[[Any], bool]
 Schema = Mapping[str, Test]
@@ -38,7 +38,7 @@ def is_count(value: Any) -> bool:
 
 def is_amount(value: Any) -> bool:
     """Whether a value is a number of seconds or bytes."""
-    return type(value) in (int, float) and 0 <= value <= MAX_AMOUNT
+    return type(value) in (int, float) and 0 <= value <= LARGEST
 
 
 def is_list(test: Test) -> Test:
