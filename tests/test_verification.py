@@ -185,7 +185,7 @@ def test_verify_looks_inside_the_folder_only(run: Path, copy: Path, capsys: pyte
     assert faults_of(copy) == []
     outside = [note for note in notes_of(copy) if "outside" in note]
     assert outside == [
-        f"{copy}/comparison: its input {run.with_name('other')}/evaluation (evaluation) lies outside, not looked at"
+        f"{copy}/comparison: its input {run.with_name('other')}/evaluation (evaluation) lies outside, not checked"
     ]
     shutil.rmtree(copy / "ensemble")
     gone = [fault for fault in faults_of(copy) if f"its input {run}/ensemble (ensemble) is gone" in fault]
@@ -193,7 +193,7 @@ def test_verify_looks_inside_the_folder_only(run: Path, copy: Path, capsys: pyte
     assert open_artefact(copy / "meta").input("ensemble") == run / "ensemble"  # to a stage it is not
     assert main(["verify", str(copy / "meta"), "--json"]) == 0
     about = json.loads(capsys.readouterr().out)
-    assert about["faults"] == [] and "lies outside, not looked at" in about["notes"][0]
+    assert about["faults"] == [] and "lies outside, not checked" in about["notes"][0]
     (copy / "ensemble").symlink_to(run / "ensemble")  # which leads outside
     assert faults_of(copy) == [] and sum("/ensemble (ensemble) lies outside" in note for note in notes_of(copy)) == 7
     for relative in ("/", "../../..", "loop"):

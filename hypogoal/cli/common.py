@@ -104,17 +104,17 @@ def offer(kind: str) -> Any:
 
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
-OWN_PRESET = "demo, paper, or a .toml file of your own."
+OWN_PRESET = "demo, paper, or your .toml file."
 Preset = Annotated[str | None, Option("--preset", help=OWN_PRESET, autocompletion=offer("preset"))]
 DOMAINS = "doorkey, montezuma, which-feature, or module:object."
 DomainName = Annotated[str, Argument(help=DOMAINS, autocompletion=offer("domain"))]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET, autocompletion=offer("setting"))]
-PLAYED = "Also take states from this recorded play, a JSON file or a Minari dataset; own domains. Repeatable."
+PLAYED = "Also take states from recorded play, a JSON file or a Minari dataset; your domains only. Repeatable."
 Play = Annotated[list[str] | None, Option("--play", metavar="FILE", help=PLAYED)]
-Seed = Annotated[int, Option("--seed", min=0, max=MOST_INTEGER, help="Seed of everything that is random.")]
+Seed = Annotated[int, Option("--seed", min=0, max=MOST_INTEGER, help="Seed of all randomness.")]
 Force = Annotated[bool, Option("--force", help="Replace what is at --out.")]
-Resume = Annotated[bool, Option("--resume", help="Continue what was begun; keep what is complete.")]
+Resume = Annotated[bool, Option("--resume", help="Continue an unfinished output; keep a complete one.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Show no progress.")]
 Device = Annotated[str, Option("--device", help="Where to train: auto (the CPU), cpu or cuda.")]
 AsJson = Annotated[bool, Option("--json", help="Machine-readable output.")]

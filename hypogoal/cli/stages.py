@@ -13,7 +13,7 @@ from hypogoal.stages import domain_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
-FILMS = "RUN/report/videos/*.gif; the page shows the first. By default one, if possible."
+FILMS = "RUN/report/videos/*.gif; the page shows the first. Default: one, if possible."
 
 
 @cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
@@ -47,7 +47,7 @@ def train_ensemble(
 def train_options(
     call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
-    options: Annotated[Path | None, Option(help="Continue these options, perhaps in another place.")] = None,
+    options: Annotated[Path | None, Option(help="Continue these options, perhaps elsewhere.")] = None,
 ) -> None:
     """Learn an option (a policy) for every member."""
     from hypogoal.stages.train_meta import FIXED
@@ -77,7 +77,7 @@ def train_meta(
 def train_baseline(
     call: cli.StageCall,
     domain: cli.DomainName,
-    data: Annotated[Path | None, Option(help="Play in the world that these states were collected in.")] = None,
+    data: Annotated[Path | None, Option(help="Play in the world where these states were collected.")] = None,
     ensemble: Annotated[
         Path | None, Option(help="Pay --set bonus=X for a member's first positive prediction in an episode.")
     ] = None,
@@ -91,7 +91,7 @@ def audit(
     call: cli.StageCall,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
     domain: Annotated[str, Option(help=f"Where to play: {cli.DOMAINS}", autocompletion=cli.offer("domain"))],
-    sub_goal: Annotated[str, Option(help="The domain's sub-goal whose truth counts.")],
+    sub_goal: Annotated[str, Option(help="The domain's sub-goal that is the truth.")],
     member: Annotated[int, Option(min=0, help="Which member of the ensemble.")] = 0,
 ) -> None:
     """How often, and where, do policies fool a success classifier?"""

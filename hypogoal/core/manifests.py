@@ -17,7 +17,7 @@ MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
 LOG, SCORES = "metrics.jsonl", "scores.jsonl"
 INPUT = ("path", "relative", "kind", "sha256")
-NUMBERS = "numbers.csv"  # not in evaluations of format 1
+NUMBERS_CSV = "numbers.csv"  # not in evaluations of format 1
 
 
 def read_manifest(path: Path) -> dict[str, Any]:

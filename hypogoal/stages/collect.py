@@ -17,7 +17,7 @@ from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_datase
 from hypogoal.domains.base import BUILT_IN, Domain
 from hypogoal.options.config import OptionConfig
 
-COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
+COLLECT_BASE = 200e6  # bytes of a process that collects almost nothing
 
 
 def collect(
@@ -33,10 +33,10 @@ def collect(
 ) -> dict[str, Any]:
     """Collect ``domain``'s states into the HDF5 file ``out``, with an instance of its ``config_class``.
 
-    ``name`` is that by which later stages find the domain; its own where None. ``resume``: go on with what was begun,
-    of a domain whose collecting can be resumed. Returns numbers of states and positives per split and sub-goal.
+    ``name``, by default the domain's own, is the one by which later stages find it. ``resume``: continue an unfinished
+    output, for domains that can. Returns numbers of states and positives per split and sub-goal.
     """
-    require_names(domain.sub_goals)  # not after all the play, when the file is written
+    require_names(domain.sub_goals)  # before play, not when the file is written
     requested, out = out, claim(out, kind=DATA, force=force, resume=resume)
     identity: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
     identity["inputs"] = [{"path": str(path), "sha256": sha256_of(path)} for path in domain.inputs(config)]
