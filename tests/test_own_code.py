@@ -319,8 +319,8 @@ def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
         (lambda step: step._replace(succeeded=step.rewards), "the engine's step gave succeeded"),
         (lambda step: None, "the engine's step gave a NoneType, not a Step"),
         (lambda step: tuple(step), "the engine's step gave a tuple, not a Step"),
-        (lambda step: sys.exit(0), "own code of test_own_code raised SystemExit(0)"),
-        (lambda step: 1 // 0, "own code of test_own_code raised ZeroDivisionError"),
+        (lambda step: sys.exit(0), "user code in test_own_code raised SystemExit(0)"),
+        (lambda step: 1 // 0, "user code in test_own_code raised ZeroDivisionError"),
     ],
 )
 def test_engines_without_gymnasium_too(change: Callable[[Step], Any], message: str, told: Callable[..., str]) -> None:
@@ -384,7 +384,7 @@ NETWORKS: list[tuple[Callable[[int], Any], str]] = [
     (lambda channels: ([convolution(channels)], (2.5,)), "gave layers"),
     (lambda channels: (["layer"], (8,)), "gave layers"),
     (lambda channels: sys.exit(0), "raised SystemExit(0)"),
-    (lambda channels: ([Leaves(lambda: sys.exit(0))], (8,)), "own code of test_own_code raised SystemExit(0)"),
+    (lambda channels: ([Leaves(lambda: sys.exit(0))], (8,)), "user code in test_own_code raised SystemExit(0)"),
     (lambda channels: ([Leaves(lambda: 7)], (8,)), "makes 7 of images, not a tensor"),
     (lambda channels: ([convolution(channels).double()], (8,)), "takes no images of 3 channels"),
 ]

@@ -130,7 +130,7 @@ class Checkpoints:
         except (OSError, SafetensorError) as error:
             fresh.unlink(missing_ok=True)
             what = f"a checkpoint cannot be written ({error})"
-            raise UserError(what, self.path, "Make room, then give --resume to go on.") from None
+            raise UserError(what, self.path, "Free some disk space, then continue with --resume.") from None
 
     def load(self) -> State | None:
         """The saved state, or None. A damaged file is a ``UserError``."""
@@ -163,7 +163,7 @@ class Checkpoints:
             if users_own(error) is not None:
                 raise
             fault = str(error).partition("\n")[0] if isinstance(error, Unlike) else "at its values"
-            raise UserError(f"the checkpoint does not fit what is to go on ({fault})", self.path, ANEW) from error
+            raise UserError(f"the checkpoint does not fit this stage ({fault})", self.path, ANEW) from error
 
 
 def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:

@@ -27,7 +27,7 @@ PARTIAL = ".partial"
 FILES, BEGUN, LOCK, OLD = "files", "begun.json", "lock", ".old"
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 COMMAND: ContextVar[tuple[str, ...]] = ContextVar("COMMAND", default=())  # a program's call in place of a command
-GO_ON = "give the same command with --resume to go on"
+GO_ON = "give the same command with --resume to continue"
 
 
 @dataclass(frozen=True)

@@ -173,9 +173,9 @@ def check_dataset(dataset: Any, kinds: str) -> int:
         raise Foreign("a dataset is not readable") from None
     ratio = MOST_RATIO if settings.get_nfilters() else 1
     if stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES:
-        raise Foreign(f"{name!r} declares {human(size)}, of which {human(stored)} are stored in {human(whole)}")
+        raise Foreign(f"{name!r} declares {human(size)} but stores {human(stored)} in a file of {human(whole)}")
     if chunks > min(MAX_CHUNKS, max(stored, 1)):  # ``stored`` may be a lie
-        raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks, of which {human(stored)} are stored")
+        raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks but stores {human(stored)}")
     return size
 
 

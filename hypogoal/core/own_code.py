@@ -210,7 +210,7 @@ def users_own(error: BaseException) -> UserError | None:
         return None
     passed = [_module(frame) for frame, _ in traceback.walk_tb(error.__traceback__)]
     culprit = next((module for module in passed if module in _own), None)
-    return UsersCode(f"own code of {culprit}").error_for(error) if culprit else None
+    return UsersCode(f"user code in {culprit}").error_for(error) if culprit else None
 
 
 def as_number(value: Any) -> int | None:

@@ -37,7 +37,7 @@ def export_episodes(
     )
     loop = agent_of(source, seed)
 
-    def told(progress: Progress) -> Iterator[Episode]:
+    def counted(progress: Progress) -> Iterator[Episode]:
         for number, episode in enumerate(play_episodes(loop, episodes), 1):
             yield episode
             progress.update(number)
@@ -45,7 +45,7 @@ def export_episodes(
     with draft(out, {"kind": "episodes"}, force=force) as work:
         with Progress("export", total=episodes, quiet=quiet) as progress:
             details = {"name": dataset_id(out), "description": described}
-            steps = write_minari(work.files, told(progress), actions=loop.engine.n_actions, **details)
+            steps = write_minari(work.files, counted(progress), actions=loop.engine.n_actions, **details)
         put_in_place(work.files, out)
     return steps
 
