@@ -1,7 +1,7 @@
 """hypogoal: transferable sub-goals by hypothesising which features generalise.
 
-Its environments are registered with Gymnasium. The heavy parts (torch, the environments' own modules) are imported on
-first use, so that ``import hypogoal`` and the command line's ``--help`` stay fast.
+Its environments are registered with Gymnasium. The heavy parts (torch, the environments' modules) are imported on first
+use, so that ``import hypogoal`` and the command line's ``--help`` stay fast.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ def __dir__() -> list[str]:
 
 @contextlib.contextmanager
 def _registered(_gymnasium: object = None) -> Iterator[None]:
-    """Have Gymnasium, once it is loaded, find the environments; their modules are loaded when one is made."""
+    """Register the environments once Gymnasium is loaded; their modules are loaded when one is made."""
     yield
     from gymnasium import register
 
@@ -57,6 +57,8 @@ def _registered(_gymnasium: object = None) -> Iterator[None]:
 if "gymnasium" in sys.modules:
     with _registered():
         pass
-else:  # when someone imports it: it takes longer than all that is imported here, and few need it
+else:
+    # Importing Gymnasium here would take longer than the rest of this package. An entry point ``gymnasium.envs`` would
+    # need an installed package and load hypogoal in every program that uses Gymnasium.
     sys.meta_path.insert(0, Around("gymnasium", _registered))
 sys.meta_path.insert(0, Around("cv2", plain_opencv))

@@ -1,7 +1,7 @@
-"""What is at a path, and is it whole: the answers of ``hypogoal show`` and ``hypogoal verify`` (Spec A8, G2).
+"""The kind, results and integrity of a path, for ``hypogoal show`` and ``hypogoal verify`` (Spec A8, G2).
 
-To verify, everything is read: schema, sizes, sha256, numbers, and whether the inputs recorded are still what they were.
-Nothing outside the folder that was asked for is looked at.
+Verifying reads everything: schema, sizes, sha256, numbers, and whether the recorded inputs are unchanged. Nothing
+outside the requested folder is read.
 """
 
 import contextlib
@@ -18,13 +18,13 @@ from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, lies_in, read_end, read_json, read_text, replacing, visible
 from hypogoal.core.hdf5 import open_hdf5, read_array, walk
-from hypogoal.core.manifests import AGAIN, LOG, NUMBERS, SCORES, UNSEALED
+from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV, SCORES, UNSEALED
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import drawn
 from hypogoal.dataset import PICTURE, SPLITS, open_dataset
 from hypogoal.domains.base import installed_domain
 
-# Numbers of logs, in the order in which they are told: what they are called.
+# The numbers of logs and their titles, in the order in which they are shown.
 RESULTS = {"balanced_accuracy": "best member's balanced accuracy", "labelled": "labelled loss"}
 RESULTS |= {name: name for name in ("success", "length", "reached", "terminated", "duration", "episodes")}
 EVALUATION = "evaluation"  # an artefact's kind, and its folder in a run
@@ -40,32 +40,32 @@ def describe_path(path: Path) -> dict[str, Any]:
 def _describe_part(path: Path) -> dict[str, Any]:
     if path.is_file():
         dataset = open_dataset(path)
-        about = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
-        about |= {"observation_dtype": str(dataset.observation_dtype)}
-        return {"kind": "data", "path": str(path), "counts": dataset.counts(), **about, "config": dataset.config}
+        details = {"domain": dataset.domain, "observation_shape": list(dataset.observation_shape)}
+        details |= {"observation_dtype": str(dataset.observation_dtype)}
+        return {"kind": "data", "path": str(path), "counts": dataset.counts(), **details, "config": dataset.config}
     artefact = open_artefact(path)
     keys = ("kind", "result", "inputs", "seed", "config", "command", "versions", "format", "files")
-    about = {"path": str(path), **artefact.manifest, "result": result_of(path)}
-    return {key: about.get(key) for key in ("path", *keys)}
+    details = {"path": str(path), **artefact.manifest, "result": result_of(path)}
+    return {key: details.get(key) for key in ("path", *keys)}
 
 
 def result_of(path: Path) -> dict[str, float]:
-    """The last numbers of an artefact's logs, if any: means over sub-goals, of scores the best member's."""
+    """The last numbers of an artefact's logs, if any: means over sub-goals; for scores the best member's."""
     last: dict[tuple[str, str], dict[str, Any]] = {}
     for line in json_lines(text for log in (LOG, SCORES) for text in read_end(path / log)):
         if line.get("scope", "all") == "all":
             last[str(line.get("sub_goal")), str(line.get("member"))] = line
-    found: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
+    values: dict[str, dict[str, float]] = {name: {} for name in RESULTS}
     for (goal, _), line in last.items():
         for name in RESULTS:
             value: Any = line.get(name)
             if type(value) in (int, float) and abs(value) < 1e300:
-                found[name][goal] = max(value, found[name].get(goal, value))
-    return {told: sum(found[name].values()) / len(found[name]) for name, told in RESULTS.items() if found[name]}
+                values[name][goal] = max(value, values[name].get(goal, value))
+    return {title: sum(values[name].values()) / len(values[name]) for name, title in RESULTS.items() if values[name]}
 
 
 def numbers_in(kind: str, path: Path) -> dict[str, Any]:
-    """The numbers of a data file, or in an artefact's folder of a ``kind``: of a training the last of its logs."""
+    """The numbers of a data file or of an artefact's folder of a ``kind``; for a training its last logged numbers."""
     if kind == "data":
         return open_dataset(path).counts()
     if kind in (EVALUATION, "comparison"):
@@ -74,7 +74,7 @@ def numbers_in(kind: str, path: Path) -> dict[str, Any]:
 
 
 def outcome(kind: str, path: Path) -> list[str]:
-    """What came out, from :func:`numbers_in`, in lines for people; none where there are no numbers."""
+    """The results, from :func:`numbers_in`, as lines; none if there are no numbers."""
     numbers = numbers_in(kind, path)
     if kind == "data":
         return count_lines(numbers)
@@ -90,12 +90,14 @@ def outcome(kind: str, path: Path) -> list[str]:
 def count_lines(counts: Mapping[str, Any]) -> list[str]:
     """The numbers of states of a data file."""
     rows = [(split, goal, *row.values()) for split in SPLITS for goal, row in counts[split].items()]
-    text = [f"{split:9s} {goal:20s} {states:7d} states {yes:7d} positives" for split, goal, states, yes in rows]
+    text = [
+        f"{split:9s} {goal:20s} {states:7d} states {positives:7d} positives" for split, goal, states, positives in rows
+    ]
     return [*text, f"unlabelled                     {counts['unlabelled']:7d} states"]
 
 
 def numbers_of(path: Path) -> Mapping[str, Any] | None:
-    """What ``metrics.json`` of an evaluation or of a run's holds; None where there is none, damaged a ``UserError``."""
+    """The contents of ``metrics.json`` of an evaluation, or of a run's; None if none, damaged a ``UserError``."""
     from hypogoal.evaluation.run import read_numbers
 
     for folder in (path, path / EVALUATION):
@@ -106,7 +108,7 @@ def numbers_of(path: Path) -> Mapping[str, Any] | None:
 
 
 def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
-    """The headline numbers, from :func:`numbers_of`, as tables; a ``UserError`` where they are damaged."""
+    """The headline numbers, from :func:`numbers_of`, as tables; a ``UserError`` if they are damaged."""
     from hypogoal.evaluation.questions import summary_table
 
     try:
@@ -115,13 +117,13 @@ def summary_of(numbers: Mapping[str, Any], path: Path) -> Table | Group:
         raise UserError("the evaluation is damaged", path, "Evaluate the run again.") from None
 
 
-def lines(about: dict[str, Any]) -> list[str]:
-    """A description as text, a line a fact, what it came to first."""
-    if about["kind"] == "run":
-        return [line for part in about["artefacts"] for line in lines(part)[:1]]
-    result = ", ".join(f"{name} {value:.4g}" for name, value in (about.get("result") or {}).items())
-    text = [f"{about['path']}: {about['kind']}" + (f"; {result}" if result else "")]
-    for key, value in about.items():
+def lines(details: dict[str, Any]) -> list[str]:
+    """A description as text, one fact per line, the result first."""
+    if details["kind"] == "run":
+        return [line for part in details["artefacts"] for line in lines(part)[:1]]
+    result = ", ".join(f"{name} {value:.4g}" for name, value in (details.get("result") or {}).items())
+    text = [f"{details['path']}: {details['kind']}" + (f"; {result}" if result else "")]
+    for key, value in details.items():
         if isinstance(value, dict) and key != "result":
             text += [f"{key}:", *(f"  {name}: {item}" for name, item in value.items())]
         elif key == "inputs" and value:
@@ -132,10 +134,11 @@ def lines(about: dict[str, Any]) -> list[str]:
 
 
 def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
-    """Pictures of a data file's labelled and held-out states, for each room and label one, to check labels by eye.
+    """Draw a data file's labelled and held-out states, one picture per room and label, to check labels by eye.
 
-    They are ``labelled/room-01-positives.png`` and so on in ``folder``, by sub-goal too where there are several. No
-    data file, states that are no pictures, or a folder that cannot be written to are a ``UserError``.
+    The files are ``labelled/room-01-positives.png`` and so on in ``folder``, in a folder per sub-goal if there are
+    several. A path that is no data file, states that are not pictures, and a folder that cannot be written are a
+    ``UserError``.
     """
     from PIL import Image
 
@@ -145,9 +148,9 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
         raise UserError("contact sheets need a data file", path, "Give the .h5 file of the states.")
     dataset = open_dataset(path)
     if dataset.observation_dtype != PICTURE or len(dataset.observation_shape) != 3:
-        given = f"{dataset.observation_dtype} {dataset.observation_shape}"
+        actual = f"{dataset.observation_dtype} {dataset.observation_shape}"
         do = advice("Read them as arrays", "export", path, "--out", f"{path.stem}.npz")
-        raise UserError("the states are not pictures", given, do)
+        raise UserError("the states are not pictures", actual, do)
     domain = installed_domain(dataset.domain)
     kinds = domain.kinds if domain else ()
     written = []
@@ -168,7 +171,7 @@ def write_contact_sheets(path: Path, folder: Path) -> list[Path]:
 
 
 def parts_of(run: Path) -> list[Path]:
-    """The data files and artefacts of a run; a ``UserError`` where there is none."""
+    """The data files and artefacts of a run; a ``UserError`` if there are none."""
     if not run.is_dir():
         raise UserError("no such file or folder", run, "Check the path.")
     artefacts = [manifest.parent for manifest in visible(run, MANIFEST)]
@@ -179,7 +182,7 @@ def parts_of(run: Path) -> list[Path]:
 
 
 def faults_of(path: Path) -> list[str]:
-    """One line for each thing that is wrong with a data file, an artefact or a run; none when it is whole."""
+    """One line for each fault of a data file, an artefact or a run; none if it is whole."""
     try:
         parts = _parts(path)
     except UserError as error:
@@ -189,13 +192,13 @@ def faults_of(path: Path) -> list[str]:
         try:
             for fault in _artefact_faults(open_artefact(part), path) if part.is_dir() else _data_faults(part):
                 faults.append(f"{part}: {fault}")
-        except UserError as error:  # a manifest that is a folder or a device is a fault of its own
+        except UserError as error:  # for example a manifest that is a folder
             faults.append(str(error))
     return faults
 
 
 def notes_of(path: Path) -> list[str]:
-    """One line for each thing in it that is no fault, and that only whoever asks can judge."""
+    """One line for each oddity that is no fault and that only the user can judge."""
     notes: list[str] = []
     with contextlib.suppress(UserError):
         for part in filter(Path.is_dir, _parts(path)):
@@ -215,7 +218,7 @@ def _notes_of(artefact: Artefact, folder: Path) -> Iterator[str]:
     yield from (f"{path}: {name}: not a part of it" for name in extra_files(artefact))
     for entry in artefact.manifest["inputs"]:
         if not lies_in(folder, artefact.path / entry["relative"]):
-            yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not looked at"
+            yield f"{path}: its input {entry['path']} ({entry['kind']}) lies outside, not checked"
 
 
 def _data_faults(path: Path) -> Iterator[str]:
@@ -239,19 +242,19 @@ def _artefact_faults(artefact: Artefact, folder: Path) -> Iterator[str]:
         within = lies_in(folder, artefact.path / entry["relative"])
         if within and (fault := find_input(artefact.path, entry, beside=True)[1]):
             yield f"its input {entry['path']} ({entry['kind']}) is {fault}"
-    if artefact.kind == "ensemble":  # last: what it needs may be missing
+    if artefact.kind == "ensemble":  # last, since its files may be missing
         for sub_goal in artefact.config["sub_goals"]:
             if f"{sub_goal}.safetensors" not in bad:
                 yield from _fault(partial(_check_members, artefact, sub_goal))
 
 
 def _check_members(artefact: Artefact, sub_goal: str) -> None:
-    """Refuse (``UserError``) weights that do not fit the manifest, and thresholds that are no probabilities."""
+    """Refuse (``UserError``) weights that do not fit the manifest, and thresholds that are not probabilities."""
     from hypogoal.hypotheses.ensemble import read_ensemble
 
     thresholds = read_ensemble(artefact.path, artefact.config, sub_goal).thresholds
     if not ((thresholds >= 0) & (thresholds <= 1)).all():
-        raise UserError(f"{sub_goal}: thresholds that are no probabilities: {thresholds.tolist()}")
+        raise UserError(f"{sub_goal}: thresholds that are not probabilities: {thresholds.tolist()}")
 
 
 def _fault(read: Callable[[], object]) -> Iterator[str]:
@@ -264,11 +267,11 @@ def _fault(read: Callable[[], object]) -> Iterator[str]:
 def _read_table(path: Path) -> None:
     from hypogoal.evaluation.run import read_table
 
-    read_table(path, ("value",) if path.name == NUMBERS else None)  # whose other columns are texts
+    read_table(path, ("value",) if path.name == NUMBERS_CSV else None)  # its other columns are texts
 
 
 def _read_lines(path: Path) -> None:
-    """JSON, one object a line; a number that was not there yet may be NaN."""
+    """Read JSON, one object per line; a number that was not known yet may be NaN."""
     for number, line in enumerate(read_text(path, "the log is", AGAIN).splitlines(), 1):
         if not [*json_lines([line])]:
             raise UserError(f"line {number} is not a JSON object", path, AGAIN)

@@ -1,4 +1,4 @@
-"""A live view of a run out of its ``metrics.jsonl`` files, also of those that are still being written (Spec A6)."""
+"""A live view of a run from its ``metrics.jsonl`` files, also those still being written (Spec A6)."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ from hypogoal.core.checkpoints import FOLDER
 from hypogoal.core.drafts import PARTIAL
 from hypogoal.core.errors import UserError, printable
 from hypogoal.core.files import MOST_INTEGER, inside, json_lines, plain_name, read_end
+from hypogoal.core.manifests import LOG
 from hypogoal.core.terminal import draw, screen
 
-LOG = "metrics.jsonl"
-SHARES = ("success", "reached")  # of episodes or executions, drawn from 0 to 1
-WATCHED = (*SHARES, "loss")  # the number that is followed: the first that a log has
+RATES = ("success", "reached")  # shares of episodes or executions, drawn from 0 to 1
+WATCHED = (*RATES, "loss")  # the number followed is the first of these in a log
 BARS = "▁▂▃▄▅▆▇█"
-NAME, CURVE = 28, 13  # columns of characters
-SECONDS = 2.0  # between two looks
+NAME, CURVE = 28, 13  # widths of columns in characters
+SECONDS = 2.0  # between updates
 WIDTH = 80
-LARGEST = 1e300  # of what is drawn
+MOST_DRAWN = 1e300  # sums and differences of larger numbers overflow
 
 
 @dataclass(frozen=True)
 class Progressing:
-    """One artefact that is made, or was."""
+    """One artefact in the making, or complete."""
 
     name: str  # its path within the run
-    sub_goal: str  # that an ensemble is at; empty for others
-    seconds: float | None  # since its log was written; None when it is complete
+    sub_goal: str  # the sub-goal that an ensemble is training; empty for others
+    seconds: float | None  # since its log was written; None if it is complete
     step: int  # the last logged
-    watched: str  # what is followed (one of ``WATCHED``), empty where there is nothing to follow
+    watched: str  # the number followed (one of ``WATCHED``), or empty
     series: tuple[float, ...]  # its values so far
-    lines: list[dict[str, Any]]  # its log so far, of an ensemble of all sub-goals
+    lines: list[dict[str, Any]]  # its log so far; for an ensemble of all sub-goals
 
     @property
     def title(self) -> str:
-        """What a person calls it."""
+        """The name for people."""
         return f"{self.name}: {self.sub_goal}" if self.sub_goal else self.name
 
 
 def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> None:
-    """Show how a run's artefacts are doing, again and again until it is finished or interrupted.
+    """Show the progress of a run's artefacts until the run is finished or interrupted.
 
-    ``once``: print the view once; so it is done too where there is no terminal, and where the run is finished.
-    ``boards`` get the logs too. No such folder, or nothing in it that logs, is a ``UserError``.
+    ``once``, without a terminal, or for a finished run, the view is printed once. ``boards`` get the logs too. A
+    missing folder or one without logs is a ``UserError``.
     """
     console = screen()
 
@@ -78,7 +78,7 @@ def watch(run: Path, *, once: bool = False, boards: Boards | None = None) -> Non
 
 
 def mirror(rows: Iterable[Progressing], boards: Boards) -> None:
-    """What is new in the logs to TensorBoard: a folder per artefact, of an ensemble one per sub-goal."""
+    """Write what is new in the logs for TensorBoard: a folder per artefact, for an ensemble one per sub-goal."""
     for row in rows:
         for goal in dict.fromkeys(line.get("sub_goal") for line in row.lines):
             lines = [line for line in row.lines if line.get("sub_goal") == goal]
@@ -86,49 +86,49 @@ def mirror(rows: Iterable[Progressing], boards: Boards) -> None:
 
 
 def finished(run: Path) -> bool:
-    """Whether ``hypogoal run`` has said that all is done, and nothing is made anew."""
+    """Whether ``hypogoal run`` has completed the run and nothing is being made anew."""
     return (run / "run.json").is_file() and not any(row.seconds is not None for row in read_progress(run))
 
 
 def read_progress(run: Path) -> list[Progressing]:
-    """What is being made first, then what is complete, each by its path; a ``UserError`` where nothing logs."""
+    """Artefacts in the making, then complete ones, each by path; a ``UserError`` if there are no logs."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder that 'run' or a stage writes into.")
-    logs = [*run.rglob(LOG), *run.rglob(f".*{PARTIAL}/{FOLDER}/*.jsonl")]  # an ensemble's sub-goals have one each
-    found = [_read(log, run) for log in sorted(logs)]
-    if not found:
+    logs = [*run.rglob(LOG), *run.rglob(f".*{PARTIAL}/{FOLDER}/*.jsonl")]  # an ensemble has one per sub-goal
+    rows = [_read(log, run) for log in sorted(logs)]
+    if not rows:
         raise UserError(f"nothing to watch: no {LOG}", run, "Training stages write it as they go; is one running?")
-    return sorted(found, key=lambda row: (row.seconds is None, row.title))
+    return sorted(rows, key=lambda row: (row.seconds is None, row.title))
 
 
 def _read(log: Path, run: Path) -> Progressing:
     lines = _lines(log)
     last = lines[-1] if lines else {}
-    named = re.compile(rf"\.+[^.].*{re.escape(PARTIAL)}")  # and not that of an output called '.' or '..'
+    named = re.compile(rf"\.+[^.].*{re.escape(PARTIAL)}")  # not for an output called '.' or '..'
     draft = next((folder for folder in log.parents if named.fullmatch(folder.name)), None)
     place = draft.with_name(draft.name[1 : -len(PARTIAL)]) if draft else log.parent
     name = place.relative_to(run).as_posix() if place != run else place.name
     goal = str(last.get("sub_goal", ""))
-    own = [line for line in lines if line.get("sub_goal", "") == goal]
+    same_goal = [line for line in lines if line.get("sub_goal", "") == goal]
     watched = next((key for key in WATCHED if key in last), "")
-    series = tuple(float(line[watched]) for line in own if _is_number(line.get(watched)))
+    series = tuple(float(line[watched]) for line in same_goal if _is_number(line.get(watched)))
     whole = draft is None and (place / MANIFEST).is_file()
     try:
         seconds = None if whole else max(0.0, time.time() - log.stat().st_mtime)
-    except OSError:  # renamed since: it has just become complete
+    except OSError:  # renamed meanwhile: it has just become complete
         seconds = None
     return Progressing(name, goal, seconds, int(last.get("step", 0)), watched, series, lines)
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
-    """The lines of a log that say a step."""
-    found = [line for line in json_lines(read_end(log)) if plain_name(line.get("sub_goal", "none"))]
-    return [line for line in found if type(line.get("step")) is int and 0 <= line["step"] <= MOST_INTEGER]
+    """The lines of a log that have a step."""
+    lines = [line for line in json_lines(read_end(log)) if plain_name(line.get("sub_goal", "none"))]
+    return [line for line in lines if type(line.get("step")) is int and 0 <= line["step"] <= MOST_INTEGER]
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it can be drawn; of the largest floats, sums and spans are no numbers."""
-    return type(value) in (int, float) and -LARGEST < value < LARGEST
+    """Whether a value is a number that can be drawn."""
+    return type(value) in (int, float) and -MOST_DRAWN < value < MOST_DRAWN
 
 
 def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
@@ -145,7 +145,7 @@ def view(rows: Sequence[Progressing], most: int | None = None) -> Table:
             "done" if row.seconds is None else f"{_ago(row.seconds)} ago",
             f"{row.step:,}",
             f"{row.watched} {row.series[-1]:.3g}" if row.series else "–",
-            curve(row.series, (0.0, 1.0) if row.watched in SHARES else None),
+            curve(row.series, (0.0, 1.0) if row.watched in RATES else None),
         )
     if len(shown) < len(rows):
         table.caption = f"and {len(rows) - len(shown)} more"
@@ -160,27 +160,27 @@ def _ago(seconds: float) -> str:
 
 
 def curve(values: Sequence[float], bounds: tuple[float, float] | None = None, width: int = CURVE) -> str:
-    """Values as blocks of characters, each the mean of an equal part; from their least to their greatest."""
-    known = [value for value in values if _is_number(value)]
-    count = min(width, len(known))
+    """Values as block characters, each the mean of an equal part; ``bounds`` default to the lowest and highest."""
+    numbers = [value for value in values if _is_number(value)]
+    count = min(width, len(numbers))
     if count == 0:
         return ""
-    edges = [round(index * len(known) / count) for index in range(count + 1)]
-    means = [sum(known[start:end]) / (end - start) for start, end in pairwise(edges)]
+    edges = [round(index * len(numbers) / count) for index in range(count + 1)]
+    means = [sum(numbers[start:end]) / (end - start) for start, end in pairwise(edges)]
     low, high = bounds or (min(means), max(means))
     span = (high - low) or 1.0
     places = (min(max((value - low) / span, 0.0), 1.0) for value in means)
     return "".join(BARS[int(place * (len(BARS) - 1) + 0.5)] for place in places)
 
 
-EVENTS = "events.out.tfevents.1.hypogoal"  # TensorBoard looks for such names; the number is a time to order them by
+EVENTS = "events.out.tfevents.1.hypogoal"  # the name that TensorBoard looks for; the number is a time
 
 
 class Boards:
-    """Event files of logs in a new folder ``out``, for TensorBoard: a folder per log, a tag per number.
+    """TensorBoard's event files in a new folder ``out``: a folder per log, a tag per number.
 
-    Names of logs and of their numbers are a stranger's: none leads out of ``out``, and for none a file is kept open.
-    Where ``out`` is there, or the extra is not installed, it is a ``UserError``.
+    Logs may be a stranger's: no name leads out of ``out``. No file is kept open, as torch's ``SummaryWriter`` would.
+    An existing ``out``, or a missing extra, is a ``UserError``.
     """
 
     def __init__(self, out: Path):
@@ -198,10 +198,10 @@ class Boards:
         self._steps: dict[Path, int] = {}
 
     def add(self, place: str, lines: Iterable[Mapping[str, Any]], now: float) -> None:
-        """What is new in a log; one that was cut off and is written again has the same numbers at the same steps.
+        """Write what is new in a log, the steps after the last one; a resumed stage logs the same numbers again.
 
-        Its folder is ``place`` within ``out``, or ``out`` itself for a name that would lead out of it. TensorBoard
-        shows the time ``now``, in seconds since 1970.
+        The folder is ``place`` within ``out``, or ``out`` if ``place`` would lead out of it. TensorBoard shows the time
+        ``now``, in seconds since 1970.
         """
         folder = inside(self._out, printable(place)) or self._out
         events = [] if folder in self._steps else [self._event(wall_time=now, file_version="brain.Event:2")]

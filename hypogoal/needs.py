@@ -1,7 +1,7 @@
-"""What each stage will need of memory, disk and time, said before it starts (``core.preflight``).
+"""Forecasts of each stage's memory, disk and time, printed before it starts (``core.preflight``).
 
-``BASE`` is what a process with torch has before it does anything. The rest is counted from the true shapes; what a step
-of ensemble training takes is measured (``hypotheses.trial``).
+A step of ensemble training is measured (``hypotheses.trial``). The rest is computed from the true shapes and the
+constants below, which tests/test_needs.py compares with what stages take.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from hypogoal.options.recording import STOPS_KEPT
 if TYPE_CHECKING:
     from hypogoal.hypotheses.trial import StepCost
 
-BASE = 400e6
-MEMBER = 8e6  # weights of a member whose network is the user's own, where it is not run
-WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.windows), while their table grows
+BASE = 400e6  # a process with torch, before it does anything
+MEMBER = 8e6  # weights of a member with the user's network, which is not run
+WINDOWS = 6e6  # a member's cached windows (hypotheses.windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
-LIGHT_POLICIES = 1e6  # weights of all light policies, which share most of them; 0.4 MB of 15 options, 0.7 with a grid
-COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's
-PER_TRANSITION = 50  # bytes in a replay, its sum tree included
-CHECKPOINTS = 2  # on disk: the last one stays until the next one is whole
+LIGHT_POLICIES = 1e6  # weights of all light policies, most of them shared; 0.4 MB for 15 options, 0.7 with a grid
+COPIES = 5  # of weights in training: the weights, a target, gradients, Adam's two moments
+PER_TRANSITION = 50  # bytes in a replay, with its sum tree
+CHECKPOINTS = 2  # on disk: the old one stays until the new one is whole
 LOGS = 5e6
-DATA = 3  # times the states are in memory: as read, joined, and as the network sees them
-LEARNED = 10  # bytes inside the light networks for each number of a picture that they learn from
-PASSED = 20  # bytes inside a member for each number of a picture that is judged
+DATA = 3  # copies of the states in memory: as read, joined, and as the network sees them
+LEARNED = 10  # bytes inside the light networks for each number of a picture in a batch
+PASSED = 20  # bytes inside a member for each number of a picture that it predicts
 EXPLAINED = 8  # states whose attributions are computed at once
-SAMPLE_NUMBERS = 2**22  # of the states that are read for a trial, at most
-LARGE = 160  # pixels of a side, above which smaller pictures are proposed: such train within 2 GB
+SAMPLE_NUMBERS = 2**22  # numbers of the states read for a trial, at most
+LARGE = 160  # pixels of a side; larger pictures get the advice to shrink them. At 160 training fits in 2 GB
 
 
 def ensemble_needs(
@@ -48,7 +48,7 @@ def ensemble_needs(
 ) -> Needs:
     """``train-ensemble``: ``steps`` for each sub-goal, each in a process, ``workers`` at once.
 
-    What a step takes is measured; on a GPU it is not in memory, and how long it takes is not known.
+    A step is measured on the CPU; on a GPU it takes no main memory, and its time is unknown.
     """
     from hypogoal.hypotheses.trial import step_cost
 
@@ -80,7 +80,7 @@ def ensemble_needs(
 
 
 def weights_only(weights: float) -> StepCost:
-    """The cost of a step of which only the members' weights, so many bytes, are known."""
+    """The cost of a step if only the bytes of the members' weights are known."""
     from hypogoal.hypotheses.trial import LEARNING, StepCost
 
     return StepCost(weights, (1 + LEARNING) * weights, 0.0, 0.0, 0.0)
@@ -88,9 +88,9 @@ def weights_only(weights: float) -> StepCost:
 
 @cache
 def ensemble_process(states: float, config: EnsembleConfig, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Needs:
-    """A process of ``train-ensemble`` with so many bytes of states that are not there yet: noise is in their place.
+    """A process of ``train-ensemble`` with this many bytes of states not yet collected; a step is measured on noise.
 
-    A network of the user's own is not run.
+    A network of the user's is not run.
     """
     from hypogoal.hypotheses.networks import NETWORKS, network_for
     from hypogoal.hypotheses.trial import step_cost
@@ -107,7 +107,7 @@ def ensemble_process(states: float, config: EnsembleConfig, shape: tuple[int, ..
 def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
     """Bytes of a member network for observations of this shape and type, from its shapes alone.
 
-    ``MEMBER`` for a network of the user's own, which is not run here, or for one that does not take them.
+    ``MEMBER`` for the user's network, which is not run here, and for one that does not take such observations.
     """
     import torch
 
@@ -117,71 +117,71 @@ def member_bytes(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
     name = network_for(network, dtype)
     try:
         with torch.device("meta"):
-            made = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
+            built = build_network(name, shape, torch_generator(0, "needs")) if name in NETWORKS else None
     except UserError:
-        made = None
-    return float(sum(weights.nbytes for weights in made.parameters())) if made else MEMBER
+        built = None
+    return float(sum(weights.nbytes for weights in built.parameters())) if built else MEMBER
 
 
 def ensemble_disk(sub_goals: int, weights: float) -> float:
-    """What ensembles with so many bytes of ``weights`` need on the disk, their checkpoints included."""
-    return sub_goals * CHECKPOINTS * 3 * weights + LOGS  # those, and two numbers of Adam's for each
+    """Bytes on disk of ensembles with this many bytes of ``weights``, with their checkpoints."""
+    return sub_goals * CHECKPOINTS * 3 * weights + LOGS  # the weights and Adam's two moments
 
 
-def play_needs(domain: Domain, about: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
-    """``train-options`` and ``train-meta`` in a domain; ``about`` is the ensemble manifest's configuration."""
-    from hypogoal.meta.training import frames_kept  # with torch, which nobody else here needs
+def play_needs(domain: Domain, ensemble: dict[str, Any], config: TrainOptionsConfig | TrainMetaConfig) -> Needs:
+    """``train-options`` and ``train-meta`` in a domain; ``ensemble`` is the ensemble manifest's configuration."""
+    from hypogoal.meta.training import frames_kept  # loads torch
 
-    oracle = config.termination == "oracle"
-    options = len(about["sub_goals"]) * (1 if oracle else about["members"])
+    sub_goals, members = len(ensemble["sub_goals"]), ensemble["members"]
+    options = sub_goals * (1 if config.termination == "oracle" else members)
     picture, shape, dtype = domain.observation_bytes, domain.observation_shape, domain.observation_dtype
     paper = config.network == "paper"
     replays = options if paper else 1
-    own = 0.0 if config.embedding in ("auto", "grid") else member_bytes(config.embedding, shape, dtype)
-    weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + own
+    embedding = 0.0 if config.embedding in ("auto", "grid") else member_bytes(config.embedding, shape, dtype)
+    weights = options * PAPER_POLICY if paper else LIGHT_POLICIES + embedding
     kept = domain.played_bytes(config.steps, frames_kept(config, options))
     stops = STOPS_KEPT * options * picture + config.save_visited * picture
     state = replays * config.replay * PER_TRANSITION + COPIES * weights + kept
-    members = len(about["sub_goals"]) * about["members"] * judging_member(about.get("network", "auto"), shape, dtype)
+    classifiers = sub_goals * members * judging_member(ensemble.get("network", "auto"), shape, dtype)
     batch = config.option_batch + (config.meta_batch if isinstance(config, TrainMetaConfig) else 0)
     packed = stops / domain.packed
-    # A checkpoint is a copy of the state, in memory while it is written.
-    memory = BASE + 2 * (state + stops) + members + batch * LEARNED * np.prod(shape)
+    # While a checkpoint is written, memory holds a copy of the state.
+    memory = BASE + 2 * (state + stops) + classifiers + batch * LEARNED * np.prod(shape)
     return Needs(memory, weights + packed + CHECKPOINTS * (state + packed) + LOGS)
 
 
 def judging_member(network: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
-    """Bytes of a member that judges states, its weights beside those of others (``hypotheses.stacked``) too."""
+    """Bytes of a member that predicts states, with a second copy of its weights in ``hypotheses.stacked``."""
     return 2 * member_bytes(network, shape, dtype) + WINDOWS
 
 
 def baseline_needs(
     observation: int, played: float, steps: int, chosen: PPOSettings | DQNSettings, members: float = 0.0
 ) -> Needs:
-    """``train-baseline`` on observations of so many bytes, of which the engine keeps ``played`` bytes.
+    """``train-baseline`` on observations of this many bytes, of which the engine keeps ``played`` bytes.
 
-    ``members`` is what those need who earn a bonus.
+    ``members`` are the bytes of the members that earn a bonus.
     """
     replays = isinstance(chosen, DQNSettings)
     state = 2.0 * observation * min(chosen.replay if isinstance(chosen, DQNSettings) else chosen.rollout, steps)
-    learned = 2 * LEARNED * observation * chosen.batch * (1 + replays)  # of a replay what came next, too
+    learned = 2 * LEARNED * observation * chosen.batch * (1 + replays)  # with a replay the next states, too
     memory = BASE + 100e6 + played + 2 * state + learned + members
     return Needs(memory, CHECKPOINTS * (replays * state + 50e6) + LOGS)
 
 
 def evaluation_needs(data: Sequence[Path], workers: int = 1) -> Needs:
-    """``evaluate``: the held-out and unlabelled states of one data file at a time, in each of its processes."""
+    """``evaluate``: each process holds the held-out and unlabelled states of one data file at a time."""
     largest = 0.0
     for dataset in map(open_dataset, data):
         counts = dataset.counts()
         heldout = max((row["states"] for row in counts["heldout"].values()), default=0)
         states = (heldout + counts["unlabelled"]) * dataset.observation_bytes
         largest = max(largest, judging(states, dataset.observation_shape, dataset.observation_dtype))
-    return Needs((workers + (workers > 1)) * (BASE + largest), 2 * LOGS)  # the one that asks holds the states too
+    return Needs((workers + (workers > 1)) * (BASE + largest), 2 * LOGS)  # the parent holds the states too
 
 
 def judging(states: float, shape: tuple[int, ...], dtype: np.dtype[Any]) -> float:
-    """Bytes for so many bytes of states, half as much again to read them, and what members make of some at once."""
+    """Bytes to predict this many bytes of states: half as much again to read them, and members' activations."""
     from hypogoal.hypotheses.deep_lift import AT_ONCE, INSIDE
     from hypogoal.hypotheses.networks import at_once
 

@@ -1,4 +1,4 @@
-"""The stages that have settings, listed once: a new one is a line here, its file and its command."""
+"""The list of stages with settings. A new stage is a line here, a file and a command."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -15,7 +15,7 @@ CONFIGS: Mapping[str, type] = {
     "train-baseline": BaselineConfig,
     "audit": AuditConfig,
 }
-OFTEN: Mapping[str, tuple[str, ...]] = {  # what people change most: options of the stage's command
+OFTEN: Mapping[str, tuple[str, ...]] = {  # the settings changed most, options of the stage's command
     "train-ensemble": ("members", "diversity", "diversity_weight", "network", "steps"),
     "train-options": ("steps", "layout_seed", "network", "termination", "option_timeout"),
     "train-meta": ("steps", "layout_seed", "network", "termination", "chooser"),
@@ -27,19 +27,19 @@ TABLES = (*STAGES, "run")  # of presets
 
 
 def options_of(stage: str) -> dict[str, dict[str, Any]]:
-    """What is known of the settings in ``OFTEN``, by the option of the stage's command that is short for ``--set``."""
+    """The settings in ``OFTEN``, described, by the option of the stage's command that is short for ``--set``."""
     rows = {row["name"]: row for row in describe(CONFIGS[stage])} if stage in CONFIGS else {}
     return {f"--{name.replace('_', '-')}": rows[name] for name in OFTEN.get(stage, ())}
 
 
 def described(config_class: type, stage: str, domain: str, preset: str | None = None) -> list[dict[str, Any]]:
-    """Every setting of a stage, see :func:`hypogoal.core.config.describe`, as a domain and a preset have them."""
+    """Every setting of a stage with the defaults of a domain and a preset, as :func:`hypogoal.core.config.describe`."""
     instead: list[tuple[Mapping[str, Any], str]] = []
-    if domain != DOMAIN:  # whose defaults are the classes' own: quicker than to load it
+    if domain != DOMAIN:  # DoorKey's defaults are the classes' own; loading it would take time
         from hypogoal.domains.base import load_domain
 
-        found = load_domain(domain, given=True)
-        instead.append((found.defaults.get(stage, {}), found.sources.get(stage, f"{domain}'s own")))
+        loaded = load_domain(domain, given=True)
+        instead.append((loaded.defaults.get(stage, {}), loaded.sources.get(stage, f"{domain}'s own")))
     if preset is not None:
         values = load_preset(preset, stage, domain, TABLES)
         checked = as_dict(from_values(config_class, values, stage))
@@ -54,22 +54,21 @@ def configuration(
     assignments: Iterable[str] | None,
     options: Mapping[str, Any] | None = None,
     *,
-    given: bool = False,
+    by_user: bool = False,
 ) -> Any:
-    """A stage's settings, with the presets and defaults of the domain it works on; see
-    :func:`hypogoal.core.config.resolve`.
+    """A stage's settings with the presets and defaults of its domain; see :func:`hypogoal.core.config.resolve`.
 
-    ``given``: the user gave the domain's name, no file did. No such domain is a ``UserError``.
+    ``by_user``: the user typed the domain's name; it is not from a file. An unknown domain is a ``UserError``.
     """
-    from hypogoal.domains.base import defaults_of, load_domain  # with Gymnasium, which a list of stages needs not
+    from hypogoal.domains.base import defaults_of, load_domain  # loads Gymnasium, not needed to list stages
 
     return resolve(
-        load_domain(domain, given=given).config_class if stage == "collect" else CONFIGS[stage],
+        load_domain(domain, given=by_user).config_class if stage == "collect" else CONFIGS[stage],
         stage=stage,
         preset=preset,
         options=options,
         assignments=assignments or (),
         domain=domain,
-        defaults=defaults_of(domain, stage, given=given),
+        defaults=defaults_of(domain, stage, given=by_user),
         tables=TABLES,
     )

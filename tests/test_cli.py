@@ -142,7 +142,7 @@ def test_resume_keeps_what_is_complete(made: Path, tmp_path: Path, capsys: pytes
         assert main(arguments) == 0
         said = capsys.readouterr()
         assert said.out == f"{out}\n" and f"{out} is complete already" in said.err
-    made_with = "what is complete there was made with"
+    made_with = "the complete output was made with"
     cases = [
         ([*collect, "--seed", "1"], f"{made_with} seed=0, not 1"),
         ([*train, "--diversity", "none"], f"{made_with} diversity=dbat, not none"),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from toy_data import SHAPE, reseal, write
+from toy_data import SHAPE, files_of, reseal, write
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact
@@ -21,7 +21,6 @@ from hypogoal.core.config import load_preset, preset_digest, resolve
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, parse_json, plain_name, read_text
 from hypogoal.core.hdf5 import set_attribute, walk
-from hypogoal.core.manifests import files_of
 from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
 from hypogoal.domains.base import load_domain

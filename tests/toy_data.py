@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.manifests import MANIFEST, files_of, sealed
+from hypogoal.core.manifests import LOG, MANIFEST, NUMBERS_CSV, SCORES, sealed
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import Collected, States, write_dataset
 
@@ -29,6 +29,28 @@ def write(path: Path, states: int = 7, domain: str = "toy") -> Path:
     return path
 
 
+def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
+    """The files that a stage always writes, by its artefact's kind and settings, besides the manifest.
+
+    Others (figures, videos, ``executions.csv``, ``exploits.csv``) depend on what happened.
+    """
+    if kind in ("options", "meta", "audit"):
+        played = {LOG, "episodes.csv", "layout.json", "options.safetensors", "choices.csv", "terminations.h5"}
+        played |= {"initiation.safetensors"} if config.get("initiation") == "learned" else set()
+        played |= {"visited.h5"} if config.get("save_visited") else set()
+        played |= {"audit.json", "exploits.csv"} if kind == "audit" else set()
+        chooses = kind == "meta" and config.get("chooser") in ("ppo", "thompson")
+        return played | ({"meta.safetensors"} if chooses else set())
+    scored = {SCORES} if config.get("score_every") else set()
+    return {
+        "ensemble": {LOG, *scored, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
+        "baseline": {LOG, "episodes.csv", "layout.json", "policy.safetensors"},
+        "evaluation": {"metrics.json", NUMBERS_CSV, "arrays.h5"},
+        "report": {"index.html"},
+        "comparison": {"index.html", "metrics.json"},
+    }[kind]
+
+
 def fill(artefact: Path, kind: str, config: Mapping[str, Any]) -> None:
     """Empty files in place of those that an artefact of a kind must have and a test does not read.
 
@@ -37,7 +59,7 @@ def fill(artefact: Path, kind: str, config: Mapping[str, Any]) -> None:
     if kind in ("options", "meta"):
         thresholds = torch.arange(len(config["sub_goals"]) * config["members"], dtype=torch.float32)
         save_tensors(artefact / "options.safetensors", {"thresholds": thresholds})
-    for name in files_of(kind, config) or ():
+    for name in files_of(kind, config):
         if name.endswith(".h5") and not (artefact / name).exists():
             with create_hdf5(artefact / name):
                 continue

@@ -1,6 +1,6 @@
 """The command line: each command parses, calls one stage and prints the artefact's path as its last line.
 
-Spec A1-A8. Heavy imports happen inside the commands, so that ``hypogoal --help`` is quick.
+Spec A1-A8. Heavy imports are inside the commands, so that ``hypogoal --help`` is quick.
 """
 
 import errno
@@ -24,7 +24,7 @@ from hypogoal.core.terminal import Unprinted, give, open_streams, say
 from hypogoal.settings import CONFIGS, TABLES
 
 NO_MEMORY = "Free some memory, allow more (ulimit -v), or choose smaller settings."
-# What torch, and whoever loads a library, raises in place of a MemoryError.
+# Texts of errors that torch and the loader of libraries raise in place of a MemoryError.
 MEMORY_TEXTS = ("can't allocate memory", "Cannot allocate memory", "failed to map segment")
 
 __all__ = ["app", "benchmark", "inspect", "main", "own_data", "stages", "sweep"]
@@ -43,30 +43,30 @@ def _root(
     version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
     debug: Annotated[bool, Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """What stands before a command."""
+    """Options before a command."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for ours."""
+    """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for hypogoal's."""
     if arguments is None:
-        signal.signal(signal.SIGTERM, stopping.stop)  # so that a cancelled job, too, leaves nothing half-written
+        signal.signal(signal.SIGTERM, stopping.stop)  # a cancelled job, too, leaves nothing half-written
         sys.unraisablehook = stopping.unraised
         open_streams()
         shield()
-    given = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in given
-    given = [argument for argument in given if argument != "--debug"]
+    words = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in words
+    words = [argument for argument in words if argument != "--debug"]
     try:
-        if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background
+        if arguments is None and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in the background
             signal.signal(signal.SIGINT, stopping.stop)
-        os.getcwd()  # which may have been deleted
-        return _called(given)
+        os.getcwd()  # raises if it was deleted
+        return _called(words)
     except Unprinted as error:
-        # Not 0: whoever reads the output has not got it. Nor 2: the command was right.
+        # Not 0, since the output was not received; not 2, since the command was right.
         return _fail(f"the output is complete, but could not be printed ({error.strerror})", 1)
-    except (Interrupted, KeyboardInterrupt) as stop:  # the latter: before a command was reached
+    except (Interrupted, KeyboardInterrupt) as stop:  # KeyboardInterrupt: before a command was reached
         if arguments is None:
-            for number in stopping.SIGNALS:  # all is put in order: who is in a hurry need not wait
+            for number in stopping.SIGNALS:  # all is cleaned up: a further signal may end the process at once
                 signal.signal(number, signal.SIG_DFL)
         cause = stop.__cause__ or stop
         number = cause.args[0] if cause.args else signal.SIGINT
@@ -76,24 +76,24 @@ def main(arguments: list[str] | None = None) -> int:
         if ended is not None:
             message = getattr(error, "format_message", lambda: "")()
             return _fail(f"{message.rstrip('.')}. {_advice(error)}", 2) if message else int(ended)
-        message, code = _told(error)
-        if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a pipe that nobody reads any more
+        message, code = _message(error)
+        if debug or (code == 1 and isinstance(error, SystemExit)):  # typer's, at a closed pipe
             raise
         return _fail(message, code)
 
 
 def _advice(error: Any) -> str:
-    """What to do about words that a command does not take; settings are often taken for options."""
+    """What to do about words that a command does not take; settings are often mistaken for options."""
     context, key = getattr(error, "ctx", None), getattr(error, "option_name", "").lstrip("-").replace("-", "_")
     stage = getattr(context, "info_name", "")
     if not hasattr(error, "possibilities") or stage not in TABLES:
         return f"See '{context.command_path if context else 'hypogoal'} --help'."
-    known = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
-    return f"Settings are given as --set {key if known else 'key'}=VALUE; 'hypogoal config {stage}' lists them."
+    is_setting = stage in CONFIGS and any(field.name == key for field in fields(CONFIGS[stage]))
+    return f"Settings are given as --set {key if is_setting else 'key'}=VALUE; 'hypogoal config {stage}' lists them."
 
 
-def _told(error: BaseException) -> tuple[str, int]:
-    """What to tell, and the exit code."""
+def _message(error: BaseException) -> tuple[str, int]:
+    """The message and the exit code."""
     if isinstance(error, UserError):
         return with_notes(str(error), error), 2
     if isinstance(error, NumericalError):
@@ -105,28 +105,28 @@ def _told(error: BaseException) -> tuple[str, int]:
 
 
 def _internal(error: BaseException) -> tuple[str, int]:
-    """What to tell, and the exit code, of an error that nobody foresaw: want of memory, own code's, or ours."""
+    """Message and exit code of an unexpected error: lack of memory, user code, or a bug."""
     from hypogoal.core.own_code import users_own
 
-    if os.strerror(errno.EMFILE) in str(error):  # torch's, which is no OSError
+    if os.strerror(errno.EMFILE) in str(error):  # torch's is not an OSError
         return _refused(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
     if isinstance(error, MemoryError) or any(text in str(error) for text in MEMORY_TEXTS):
         return with_notes(f"there is not enough memory. Nothing was half-written. {NO_MEMORY}", error), 2
-    if (told := users_own(error)) is not None:
-        return with_notes(str(told), error), 2
-    first = next(iter(str(error).splitlines()), "")  # those of numbers that are none have a tensor after it
+    if (user_error := users_own(error)) is not None:
+        return with_notes(str(user_error), error), 2
+    first = next(iter(str(error).splitlines()), "")  # a printed tensor may follow
     return f"internal error: {type(error).__name__}: {first}. Run again with --debug for the traceback.", 1
 
 
 @functools.cache
 def _commands() -> Any:
-    """What typer makes of the commands' signatures, once a process: each time it would be longer than many commands."""
+    """Typer's commands, built once per process: building takes longer than many commands."""
     return typer.main.get_command(app)
 
 
-def _called(given: list[str]) -> int:
+def _called(words: list[str]) -> int:
     try:
-        code: object = _commands()(args=given, standalone_mode=False, prog_name="hypogoal")
+        code: object = _commands()(args=words, standalone_mode=False, prog_name="hypogoal")
     except Complete as complete:
         say(complete, err=True)
         give(complete.path)
@@ -135,8 +135,8 @@ def _called(given: list[str]) -> int:
 
 
 def _refused(error: OSError) -> tuple[str, int]:
-    """What to tell, and the exit code, when the system will not read or write a file."""
-    known = {
+    """Message and exit code if the system refuses to read or write a file."""
+    remedies = {
         errno.EMFILE: "Allow more open files (ulimit -n).",
         errno.ENFILE: "Close some programs: the system has as many files open as it can.",
         errno.ENOMEM: NO_MEMORY,
@@ -151,14 +151,14 @@ def _refused(error: OSError) -> tuple[str, int]:
     }
     if not _homed():
         return "the current folder no longer exists. Change to another one.", 2
-    # HDF5 tells the number in its text only: "... errno = 28, error message = ..."
-    told = re.search(r"errno = (\d+)", str(error))
-    code = error.errno or (int(told[1]) if told else 0)
+    # HDF5 has the number only in its text: "... errno = 28, error message = ..."
+    match = re.search(r"errno = (\d+)", str(error))
+    code = error.errno or (int(match[1]) if match else 0)
     where = f": {error.filename}" if error.filename else ""
     if code in (errno.EACCES, errno.EPERM) and error.filename and not _may_read(error.filename):
         return f"{os.strerror(code)}{where}. Ask for permission to read it.", 2
-    if code in known:
-        return f"{os.strerror(code)}{where}. Nothing was half-written. {known[code]}", 2
+    if code in remedies:
+        return f"{os.strerror(code)}{where}. Nothing was half-written. {remedies[code]}", 2
     return _internal(error)
 
 
@@ -170,17 +170,17 @@ def _homed() -> bool:
 
 
 def _may_read(name: str | bytes) -> bool:
-    """Whether the system refused something else: what is there can be read, or nothing is there yet."""
+    """Whether the file can be read or does not exist, so that the system refused something else."""
     return os.access(name, os.R_OK) or not os.path.lexists(name)
 
 
 def with_notes(message: str, error: BaseException) -> str:
-    """A message, and what those whom its error passed had to add."""
+    """A message with the notes that were added to its error."""
     return "; ".join([message.rstrip("."), *notes_of(error)]) if notes_of(error) else message
 
 
 def notes_of(error: BaseException) -> list[str]:
-    """What those whom an error passed had to add, each once."""
+    """The notes that were added to an error, each once."""
     return list(dict.fromkeys(getattr(error, "__notes__", [])))
 
 

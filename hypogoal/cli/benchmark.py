@@ -1,4 +1,4 @@
-"""Benchmarks of hypothesis learning: what an objective finds where the answer is known (Spec H1)."""
+"""Benchmarks of hypothesis learning: which features an objective finds when the answer is known (Spec H1)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ cli.app.add_typer(benchmark, name="benchmark", rich_help_panel=cli.MANY)
 
 @benchmark.callback()
 def _group() -> None:
-    """Score diversity objectives where the answer is known."""
+    """Score diversity objectives when the answer is known."""
 
 
 @cli.command(cli.MANY, "benchmark which-feature --out runs/which", "which-feature", benchmark)
@@ -30,20 +30,20 @@ def which_feature(
     members: Annotated[int, Option(help="Hypotheses (K) of an entry.")] = 4,
     seeds: Annotated[str, Option(help="0-4, or 0,3,7.")] = "0-4",
     factors: Annotated[
-        str, Option(help="Planted features; another is moved, of two frames.")
+        str, Option(help="Planted features; another one is moved, with two frames.")
     ] = "colour,shape,place,count",
     high: Annotated[float, Option(help="A member owns a feature that it ranks at least this well,")] = 0.95,
     low: Annotated[float, Option(help="if it ranks every other at most this well, either way round.")] = 0.6,
     set_: cli.Set = None,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Which features do members find, of several that fit?
+    """Which of several features that fit do members find?
 
     Small scenes have planted features (--factors): colour, shape and place of
-    an object, and how many boxes there are. In the labelled ones all say the
-    same; in a share of the unlabelled ones (--mix) each is drawn independently.
-    Members are trained as by train-ensemble (--set takes its settings) and
-    scored on scenes in which all features are crossed:
+    an object, and the number of boxes. In labelled scenes all of them agree; in
+    a share of the unlabelled ones (--mix) each is drawn independently. Members
+    are trained as by train-ensemble (--set takes its settings) and scored on
+    scenes in which all features are crossed:
 
     - coverage: the share of features that some member ranks by (area under the
     ROC curve of at least --high) while it ranks by no other, neither way round
@@ -51,8 +51,7 @@ def which_feature(
     - best: the highest ranking of a feature by a member, mean over features
     - same: the share of pairs of members that rank most by the same feature
     - gap: what the threshold of 0.5 costs in balanced accuracy
-    - labels: how many it takes to find the right member, for the features
-    that are covered
+    - labels: how many it takes to find the right member, for covered features
 
     Writes results.csv: a line for each entry, mix, seed, member and feature.
     """

@@ -1,4 +1,4 @@
-"""What all commands share: the application, its options, and how outcomes are printed."""
+"""Shared by all commands: the application, its options, and how results are printed."""
 
 import contextlib
 import inspect
@@ -25,7 +25,7 @@ KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 
 class Interrupted(Exception):
-    """Ctrl-C or SIGTERM; its cause is the ``KeyboardInterrupt``, of which typer would make an exit code."""
+    """Ctrl-C or SIGTERM; its cause is the ``KeyboardInterrupt``, which typer would turn into an exit code."""
 
 
 @contextlib.contextmanager
@@ -41,7 +41,7 @@ class Commands(TyperGroup):
     invoke = _interruptible()(TyperGroup.invoke)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """By their groups, within one as they were made."""
+        """By group, then in order of definition."""
         groups: Any = self.commands
         return sorted(groups, key=lambda name: GROUPS.index(groups[name].rich_help_panel))
 
@@ -55,13 +55,13 @@ class Commands(TyperGroup):
 
 
 def _short_types(options: Any) -> Any:
-    """Options with short types for ``--help``: none of a switch, ``<int>`` of a range or a list."""
+    """Options with short types for ``--help``: none for a switch, ``<int>`` for a range or a list."""
     for option in options:
         if getattr(option, "is_flag", False):
             option.metavar = ""
         elif option.param_type_name == "option" and option.metavar is None:
             option.metavar = f"<{option.bare_type().lower().removeprefix('list[').rstrip(']')}>"
-            option._get_number_range_help_str = lambda: ""  # of up to sixteen digits
+            option._get_number_range_help_str = lambda: ""  # ranges have up to sixteen digits
     return options
 
 
@@ -76,13 +76,13 @@ app = typer.Typer(
 )
 
 
-def command(panel: str, example: str, name: str | None = None, of: typer.Typer = app) -> Any:
-    """Makes a function a command of a group, whose ``--help`` ends with an example."""
-    return of.command(name, rich_help_panel=panel, epilog=f"Example: [bold]hypogoal {example}[/bold]")
+def command(panel: str, example: str, name: str | None = None, parent: typer.Typer = app) -> Any:
+    """Make a function a command of a group; its ``--help`` ends with an example."""
+    return parent.command(name, rich_help_panel=panel, epilog=f"Example: [bold]hypogoal {example}[/bold]")
 
 
 def offer(kind: str) -> Any:
-    """For a shell's completion: the domains, presets, experiments or settings that begin like the word so far."""
+    """For shell completion: domains, presets, experiments or settings that begin with the typed text."""
 
     def offered(ctx: typer.Context, incomplete: str) -> list[str]:
         presets, stage = Path(__file__).parents[1] / "presets", ctx.info_name or ""
@@ -90,31 +90,31 @@ def offer(kind: str) -> Any:
         if kind == "experiment":
             named = {path.stem for path in presets.glob("*.toml")} | {name for name in named if "figure" in name}
         elif kind == "setting":
-            own = {"": CONFIGS[stage]} if stage in CONFIGS else {f"{name}.": of for name, of in CONFIGS.items()}
-            named = {f"{prefix}{field.name}=" for prefix, of in own.items() for field in fields(of)}
+            prefixed = {"": CONFIGS[stage]} if stage in CONFIGS else {f"{name}.": CONFIGS[name] for name in CONFIGS}
+            named = {f"{prefix}{field.name}=" for prefix, config in prefixed.items() for field in fields(config)}
         elif kind == "stage":
             named = {*TABLES}
         elif kind == "domain":
             from hypogoal.domains.base import BUILT_IN, ENTRY_POINTS
 
-            named = {*BUILT_IN, *(found.name for found in entry_points(group=ENTRY_POINTS))}
+            named = {*BUILT_IN, *(entry.name for entry in entry_points(group=ENTRY_POINTS))}
         return sorted(name for name in named if name.startswith(incomplete))
 
     return offered
 
 
 Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
-OWN_PRESET = "demo, paper, or a .toml file of your own."
+OWN_PRESET = "demo, paper, or your .toml file."
 Preset = Annotated[str | None, Option("--preset", help=OWN_PRESET, autocompletion=offer("preset"))]
 DOMAINS = "doorkey, montezuma, which-feature, or module:object."
 DomainName = Annotated[str, Argument(help=DOMAINS, autocompletion=offer("domain"))]
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET, autocompletion=offer("setting"))]
-PLAYED = "Also take states from this recorded play, a JSON file or a Minari dataset; own domains. Repeatable."
+PLAYED = "Also take states from recorded play, a JSON file or a Minari dataset; your domains only. Repeatable."
 Play = Annotated[list[str] | None, Option("--play", metavar="FILE", help=PLAYED)]
-Seed = Annotated[int, Option("--seed", min=0, max=MOST_INTEGER, help="Seed of everything that is random.")]
+Seed = Annotated[int, Option("--seed", min=0, max=MOST_INTEGER, help="Seed of all randomness.")]
 Force = Annotated[bool, Option("--force", help="Replace what is at --out.")]
-Resume = Annotated[bool, Option("--resume", help="Continue what was begun; keep what is complete.")]
+Resume = Annotated[bool, Option("--resume", help="Continue an unfinished output; keep a complete one.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Show no progress.")]
 Device = Annotated[str, Option("--device", help="Where to train: auto (the CPU), cpu or cuda.")]
 AsJson = Annotated[bool, Option("--json", help="Machine-readable output.")]
@@ -134,71 +134,71 @@ def _shared(
 
 
 @dataclass(frozen=True)
-class Given:
-    """What a command that trains or collects was told besides its own."""
+class StageCall:
+    """The options that all commands that train or collect share, with their values."""
 
     stage: str
     out: Path
     preset: str | None
-    settings: Mapping[str, Any]  # of options, and of --set, which counts more
-    how: Mapping[str, Any]  # of every stage: seed, device, force, resume, quiet
+    settings: Mapping[str, Any]  # from options and --set; --set wins
+    how: Mapping[str, Any]  # seed, device, force, resume, quiet
 
-    def make(self, source: str | Path, **own: Any) -> Any:
+    def make(self, source: str | Path, **inputs: Any) -> Any:
         """Run the stage, see :func:`hypogoal.stages.make`."""
-        return make(self.stage, source, self.out, self.settings, self.preset, **own, **self.how)
+        return make(self.stage, source, self.out, self.settings, self.preset, **inputs, **self.how)
 
-    def config(self, domain: str, *, given: bool = False) -> Any:
+    def config(self, domain: str, *, by_user: bool = False) -> Any:
         """The stage's settings, see :func:`hypogoal.settings.configuration`."""
-        return configuration(self.stage, domain, self.preset, (), self.settings, given=given)
+        return configuration(self.stage, domain, self.preset, (), self.settings, by_user=by_user)
 
     def end(self, numbers: Mapping[str, Any], *then: object) -> None:
-        """Say what it came to and which command follows, and print where it is."""
+        """Print the result, the next command and the output's path."""
         print_outcome(numbers, self.how["quiet"])
         print_next(self.how["quiet"], *then)
         give(self.out)
 
 
 def stage(panel: str, name: str, example: str) -> Callable[[Callable[..., None]], None]:
-    """Makes a function a command that trains or collects: it gets a :class:`Given` of what all have, then its own."""
+    """Make a function a command that trains or collects: it gets a :class:`StageCall`, then its own arguments."""
     signature = inspect.signature(_shared)
-    shared = [one for one in signature.parameters.values() if name != "collect" or one.name != "device"]
+    shared = [each for each in signature.parameters.values() if name != "collect" or each.name != "device"]
     panel_of_settings = f"Settings, with doorkey's defaults (all: hypogoal config {name})"
     settings = []
-    for flag, row in options_of(name).items():  # what is typed is what --set would be told
+    for flag, row in options_of(name).items():  # values stay text, parsed as --set parses them
         choices = f" ({row['allowed']})" if "|" in row["allowed"] else ""
-        told = f"{row['meaning'][0].upper()}{row['meaning'][1:]}{choices}. [dim]\\[default: {row['default']}][/dim]"
-        option: Any = Option(flag, metavar=f"<{row['type']}>", help=told, rich_help_panel=panel_of_settings)
+        text = f"{row['meaning'][0].upper()}{row['meaning'][1:]}{choices}. [dim]\\[default: {row['default']}][/dim]"
+        option: Any = Option(flag, metavar=f"<{row['type']}>", help=text, rich_help_panel=panel_of_settings)
         settings.append(inspect.Parameter(row["name"], KEYWORD, default=None, annotation=Annotated[str | None, option]))
 
-    def made(function: Callable[..., None]) -> None:
+    def register(function: Callable[..., None]) -> None:
         def called(**values: Any) -> None:
-            chosen = {of.name: value for of in settings if (value := values.pop(of.name)) is not None}
-            told = {of.name: values.pop(of.name) for of in shared}
-            out, preset, assignments = (told.pop(key) for key in ("out", "preset", "set_"))
-            function(Given(name, out, preset, chosen | parse_assignments(assignments or ()), told), **values)
+            chosen = {each.name: value for each in settings if (value := values.pop(each.name)) is not None}
+            how = {each.name: values.pop(each.name) for each in shared}
+            out, preset, assignments = (how.pop(key) for key in ("out", "preset", "set_"))
+            function(StageCall(name, out, preset, chosen | parse_assignments(assignments or ()), how), **values)
 
-        _, *own = inspect.signature(function).parameters.values()
-        every = [one.replace(kind=KEYWORD) for one in (*own, *shared, *settings)]
-        called.__signature__ = signature.replace(parameters=every)  # type: ignore[attr-defined]
+        _, *particular = inspect.signature(function).parameters.values()
+        parameters = [each.replace(kind=KEYWORD) for each in (*particular, *shared, *settings)]
+        called.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         called.__doc__ = function.__doc__
         command(panel, example, name)(called)
 
-    return made
+    return register
 
 
 def values_of(assignments: Iterable[str] | None) -> list[str]:
-    """What the user typed behind the ``=`` of each ``--set``: one value, or several with commas between."""
+    """The values that the user typed after the ``=`` of each ``--set``, split at commas."""
     texts = parse_assignments(assignments or ()).values()
     return [value.strip() for text in texts for value in text.split(",")]
 
 
 def run_of(data: Path) -> Path:
-    """The run that a data file is of: the folder of a ``data.h5``, else a new one that is called as the file is."""
+    """The run of a data file: the folder of a ``data.h5``, else a new folder named after the file."""
     return data.parent if data.name == "data.h5" else Path("runs", data.stem)
 
 
 def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
-    """The numbers of states of a data file; nothing where there are none."""
+    """Print the numbers of states of a data file; nothing if there are none."""
     from hypogoal.inspection import count_lines
 
     for line in [] if quiet or not counts else count_lines(counts):
@@ -206,14 +206,14 @@ def print_counts(counts: Mapping[str, Any], quiet: bool) -> None:
 
 
 def print_outcome(numbers: Mapping[str, Any], quiet: bool) -> None:
-    """What training came to; what NaN says, that no episode has ended, the number of episodes says too."""
+    """Print the results of training. NaN (no episode has ended) is left out: the number of episodes says it too."""
     if numbers and not quiet:
         texts = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in numbers.items()}
         say(", ".join(f"{key} {text}" for key, text in texts.items() if text != "nan"))
 
 
 def print_next(quiet: bool, *words: object) -> None:
-    """The command that follows, as one would type it; nothing where none does."""
+    """Print the next command as one would type it; nothing if there is none."""
     if words and not quiet:
         from hypogoal.core.commands import command as typed
 
@@ -221,7 +221,7 @@ def print_next(quiet: bool, *words: object) -> None:
 
 
 def command_again(context: typer.Context, **changes: object) -> str:
-    """The command that runs, as one would type it, with other values of some options."""
+    """The current command as one would type it, with some options changed."""
     from hypogoal.core.commands import command as typed
 
     words: list[object] = [context.info_name]

@@ -25,19 +25,19 @@ def show(
     as_json: cli.AsJson = False,
     pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
-    """Say what this is: its result, configuration and inputs."""
+    """Show its kind, result, configuration and inputs."""
     from hypogoal.inspection import describe_path, lines, numbers_of, summary_of, write_contact_sheets
 
-    about, numbers = describe_path(path), None
+    details, numbers = describe_path(path), None
     try:
         numbers = numbers_of(path)
-    except UserError as error:  # what it is can be told all the same
+    except UserError as error:  # the rest can be shown all the same
         say(f"hypogoal: {error}", err=True)
     if numbers is not None and not as_json:
         draw(summary_of(numbers, path), 100)
-    cli.print_counts(about.get("counts", {}), as_json)
-    told = about if numbers is None else {**about, "metrics": numbers}
-    cli.echo(told, as_json, lines({key: value for key, value in about.items() if key != "counts"}))
+    cli.print_counts(details.get("counts", {}), as_json)
+    shown = details if numbers is None else {**details, "metrics": numbers}
+    cli.echo(shown, as_json, lines({key: value for key, value in details.items() if key != "counts"}))
     if pictures is not None:
         for sheet in write_contact_sheets(path, pictures):
             give(sheet, err=as_json)
@@ -83,11 +83,11 @@ def config(
 ) -> None:
     """List every setting of a stage: default, unit, meaning, source."""
     if stage is None:
-        known: Any = context.parent and context.parent.command
-        cli.echo(list(TABLES), as_json, [f"{name:15}{known.commands[name].get_short_help_str(64)}" for name in TABLES])
+        group: Any = context.parent and context.parent.command
+        cli.echo(list(TABLES), as_json, [f"{name:15}{group.commands[name].get_short_help_str(64)}" for name in TABLES])
         return
     config_class = CONFIGS.get(stage)
-    if config_class is None:  # slower: a domain's or an experiment's
+    if config_class is None:  # a domain's or an experiment's, slower to load
         from hypogoal.stages.sweep import config_class_of
 
         config_class = config_class_of(stage, domain)
@@ -104,6 +104,6 @@ def config(
             default = ",".join(map(str, row["default"])) if isinstance(row["default"], tuple | list) else row["default"]
             allowed = f"   ({row['allowed']})" if row["allowed"] else ""
             say(f"  {row['name']} = {default} {row['unit']}".rstrip() + allowed)
-            told = row["meaning"] + (f" [{row['source']}]" if row["source"] else "")
-            for line in textwrap.wrap(told, width, initial_indent=" " * 6, subsequent_indent=" " * 6):
+            text = row["meaning"] + (f" [{row['source']}]" if row["source"] else "")
+            for line in textwrap.wrap(text, width, initial_indent=" " * 6, subsequent_indent=" " * 6):
                 say(line)

@@ -29,15 +29,15 @@ def import_(
     source: Annotated[Path, Argument(help="A .npz file, or a folder of .npy files, of images or of a Minari dataset.")],
     out: cli.Out,
     sub_goal: Annotated[
-        list[str] | None, Option(help="Its name; one for each of the labels' columns, in order.")
+        list[str] | None, Option(help="The sub-goal's name; one per column of the labels, in order.")
     ] = None,
     label: Annotated[
         list[str] | None, Option(metavar="NAME=MODULE:FUNCTION", help="Minari: a function that labels.")
     ] = None,
     key: Annotated[str, Option(help="Which part to take, if a Minari dataset has dictionaries.")] = "",
     heldout: Annotated[float, Option(min=0.01, max=0.9, help="Share of labelled states to hold out.")] = 0.2,
-    resize: Annotated[int, Option(min=0, help="Longer side of pictures, in pixels, at most; 0: as it is.")] = 0,
-    stack: Annotated[bool, Option("--stack", help="Frames and colours in other places become channels.")] = False,
+    resize: Annotated[int, Option(min=0, help="Most pixels on the longer side of pictures; 0: unchanged.")] = 0,
+    stack: Annotated[bool, Option("--stack", help="Axes of frames and colours become channels.")] = False,
     domain: Annotated[str, Option(help="Where the states come from, for train-options.")] = "imported",
     seed: cli.Seed = 0,
     force: cli.Force = False,
@@ -63,7 +63,7 @@ def import_(
 
 
 def _print_observations(context: typer.Context, data: Path, resize: int, quiet: bool) -> None:
-    """What the states of a data file were taken for; of large pictures the command that imports them smaller."""
+    """Say how states were read, as pictures or numbers; of large pictures, how to import them smaller."""
     from hypogoal.dataset import PICTURE, open_dataset
     from hypogoal.needs import LARGE
 
@@ -82,7 +82,7 @@ def export(
     source: Annotated[Path, Argument(help="A data file, or the folder of a meta artefact.")],
     out: Annotated[Path, Option("--out", help="The .npz file, or the Minari dataset's folder NAME-v0.")],
     episodes: Annotated[int, Option(min=1, help="How many episodes an agent plays.")] = 20,
-    seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Seed of the agent's draws of options.")] = 0,
+    seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="Seed of the agent's choices.")] = 0,
     force: cli.Force = False,
     quiet: cli.Quiet = False,
 ) -> None:
@@ -110,14 +110,14 @@ def label(
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play first.")] = 0,
     arg: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="For the environment: start=2-6.")] = None,
     heldout: Annotated[bool, Option("--heldout", help="The states are for evaluation.")] = False,
-    fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps a second; 0: a step for each key.")] = 0,
+    fps: Annotated[int, Option(min=0, max=60, help="Play in real time: steps per second; 0: a step for each key.")] = 0,
     resume: Annotated[bool, Option("--resume", help="Continue with an existing folder.")] = False,
     record: Annotated[Path | None, Option(help="Write what you play into this file, for 'collect --play'.")] = None,
 ) -> None:
     """Mark states by hand, in a window; 'import' reads them.
 
     Keys: p positive, n negative, u unlabelled. Every mark is saved at once.
-    --heldout adds states of other layouts to the folder, to judge members by.
+    --heldout adds states of other layouts to the folder, to score members on.
     """
     from hypogoal.core import own_code
     from hypogoal.stages.label import label as stage
@@ -134,17 +134,17 @@ def label(
 
 
 def _arguments(assignments: Iterable[str]) -> dict[str, Any]:
-    """``KEY=VALUE``, the value as JSON where it is some, else as text."""
-    found: dict[str, Any] = {}
+    """``KEY=VALUE`` by key; the value is parsed as JSON if it is valid JSON, else it is text."""
+    values: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
         if not (equals and name.isidentifier()):
             raise UserError("--arg needs KEY=VALUE", assignment, "For example --arg layout_seed=3.")
         try:
-            found[name] = json.loads(value)
+            values[name] = json.loads(value)
         except (ValueError, RecursionError):
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
 @cli.command(cli.OWN, "check mine:DOMAIN")
@@ -156,33 +156,33 @@ def check(
     play: cli.Play = None,
     seed: cli.Seed = 0,
     layout_seed: Annotated[int, Option(min=0, max=MOST_INTEGER, help="The layout to play.")] = 0,
-    minutes: Annotated[float, Option(min=0.01, help="A slow domain plays less, so that it takes about so long.")] = 2.0,
+    minutes: Annotated[float, Option(min=0.01, help="About how long it may take: a slow domain plays less.")] = 2.0,
 ) -> None:
     """Check that your domain, objective or network keeps its contract.
 
-    Exit code 2 if not. It collects a few states of the domain, twice; --set and
+    Exit code 2 if not. It collects a few states of the domain twice; --set and
     --play change how, as for 'collect'.
     """
     from hypogoal.core import own_code
 
     if domain is None and diversity is None and network is None:
         raise UserError("nothing to check", None, "Give a domain, --diversity or --network.")
-    kept = True
+    passed = True
     with own_code.given(*(name for name in (domain, diversity, network) if name)):
-        config = configuration("collect", domain, None, set_, {"play": play}, given=True) if domain else None
+        config = configuration("collect", domain, None, set_, {"play": play}, by_user=True) if domain else None
         with Progress("check", total=1, quiet=domain is None) as progress:
-            told = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
-            for verdict in _verdicts(domain, diversity, network, config, told):
+            options = {"layout_seed": layout_seed, "seed": seed, "seconds": 60 * minutes, "progress": progress}
+            for verdict in _verdicts(domain, diversity, network, config, options):
                 with progress.paused():
                     for line in verdict.lines:
                         say(line)
-                kept &= verdict.ok
-    if not kept:
+                passed &= verdict.ok
+    if not passed:
         raise typer.Exit(2)
 
 
 def _verdicts(
-    domain: str | None, diversity: str | None, network: str | None, config: Any, told: dict[str, Any]
+    domain: str | None, diversity: str | None, network: str | None, config: Any, options: dict[str, Any]
 ) -> Iterator[Verdict]:
     from hypogoal.testing import check_domain, check_network, check_objective
 
@@ -190,9 +190,9 @@ def _verdicts(
     if domain is not None:
         from hypogoal.domains.base import load_domain
 
-        found = load_domain(domain, given=True)
-        yield from check_domain(found, config, name=domain, **told)
-        seen = tuple(found.observation_shape), found.observation_dtype
+        loaded = load_domain(domain, given=True)
+        yield from check_domain(loaded, config, name=domain, **options)
+        seen = tuple(loaded.observation_shape), loaded.observation_dtype
     if diversity is not None:
         from hypogoal.diversity import load_objective
 

@@ -1,4 +1,4 @@
-"""The commands that make something: one stage each."""
+"""The commands that make something, one stage each."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,20 +13,20 @@ from hypogoal.stages import domain_of
 
 ENSEMBLE = Argument(help="The folder that 'train-ensemble' wrote.")
 VISITED = "a data file, or options or a meta-policy with save_visited; repeatable."
-FILMS = "RUN/report/videos/*.gif; the page shows the first. By default one, if possible."
+FILMS = "RUN/report/videos/*.gif; the page shows the first. Default: one, if possible."
 
 
 @cli.stage(cli.MAKE, "collect", "collect doorkey --out data/doorkey.h5")
-def collect(given: cli.Given, domain: cli.DomainName, play: cli.Play = None) -> None:
+def collect(call: cli.StageCall, domain: cli.DomainName, play: cli.Play = None) -> None:
     """Collect labelled, unlabelled and held-out states."""
-    told = replace(given, settings={"play": play, **given.settings}) if play else given
-    cli.print_counts(told.make(domain), given.how["quiet"])
-    given.end({}, "train-ensemble", given.out, "--out", cli.run_of(given.out) / "ensemble")
+    call = replace(call, settings={"play": play, **call.settings}) if play else call
+    cli.print_counts(call.make(domain), call.how["quiet"])
+    call.end({}, "train-ensemble", call.out, "--out", cli.run_of(call.out) / "ensemble")
 
 
 @cli.stage(cli.MAKE, "train-ensemble", "train-ensemble data/doorkey.h5 --out runs/mine/ensemble")
 def train_ensemble(
-    given: cli.Given,
+    call: cli.StageCall,
     data: Annotated[Path, Argument(help="The HDF5 file that 'collect' wrote.")],
     unlabelled: Annotated[list[Path] | None, Option(help=f"Take unlabelled states from elsewhere: {VISITED}")] = None,
 ) -> None:
@@ -34,63 +34,64 @@ def train_ensemble(
     from hypogoal.domains.base import installed_domain
     from hypogoal.inspection import result_of
 
-    given.make(data, unlabelled=tuple(unlabelled or ()))
+    call.make(data, unlabelled=tuple(unlabelled or ()))
     installed = installed_domain(domain_of(data, "train-ensemble"))
     defaults = installed.defaults if installed else {}
-    run, practised = given.out.parent, "train-options" in defaults or "train-meta" not in defaults
-    then = ("train-options", given.out, "--out", run / "options")
-    then = then if practised else ("train-meta", given.out, "--out", run / "meta")
-    given.end(result_of(given.out), *(then if installed else ("evaluate", run)))
+    run, practised = call.out.parent, "train-options" in defaults or "train-meta" not in defaults
+    then = ("train-options", call.out, "--out", run / "options")
+    then = then if practised else ("train-meta", call.out, "--out", run / "meta")
+    call.end(result_of(call.out), *(then if installed else ("evaluate", run)))
 
 
 @cli.stage(cli.MAKE, "train-options", "train-options runs/mine/ensemble --out runs/mine/options")
 def train_options(
-    given: cli.Given,
+    call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
-    options: Annotated[Path | None, Option(help="Continue these options, perhaps in another place.")] = None,
+    options: Annotated[Path | None, Option(help="Continue these options, perhaps elsewhere.")] = None,
 ) -> None:
     """Learn an option (a policy) for every member."""
     from hypogoal.stages.train_meta import FIXED
 
-    numbers = given.make(ensemble, options=options)
+    numbers = call.make(ensemble, options=options)
     domain = domain_of(ensemble, "train-options")
-    config = given.config(domain)
-    plain = configuration("train-meta", domain, given.preset, ())
+    config = call.config(domain)
+    plain = configuration("train-meta", domain, call.preset, ())
     fixed = [f"--set={name}={getattr(config, name)}" for name in FIXED if getattr(config, name) != getattr(plain, name)]
-    preset, run = ["--preset", given.preset] if given.preset else [], given.out.parent
-    then = ("train-meta", ensemble, "--options", given.out, *preset, *fixed, "--out", run / "meta")
-    given.end(numbers, *(("evaluate", run) if config.restart_options else then))  # which leave no episodes to choose in
+    preset, run = ["--preset", call.preset] if call.preset else [], call.out.parent
+    then = ("train-meta", ensemble, "--options", call.out, *preset, *fixed, "--out", run / "meta")
+    # With restart_options no episodes are left to choose in.
+    call.end(numbers, *(("evaluate", run) if config.restart_options else then))
 
 
 @cli.stage(cli.MAKE, "train-meta", "train-meta runs/mine/ensemble --options runs/mine/options --out runs/mine/meta")
 def train_meta(
-    given: cli.Given,
+    call: cli.StageCall,
     ensemble: Annotated[Path, ENSEMBLE],
     options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
 ) -> None:
     """Learn from the reward which options to choose."""
-    given.end(given.make(ensemble, options=options), "evaluate", given.out.parent)
+    call.end(call.make(ensemble, options=options), "evaluate", call.out.parent)
 
 
 @cli.stage(cli.MAKE, "train-baseline", "train-baseline doorkey --agent ppo --out runs/mine/ppo")
 def train_baseline(
-    given: cli.Given,
+    call: cli.StageCall,
     domain: cli.DomainName,
-    data: Annotated[Path | None, Option(help="Play in the world that these states were collected in.")] = None,
+    data: Annotated[Path | None, Option(help="Play in the world where these states were collected.")] = None,
     ensemble: Annotated[
-        Path | None, Option(help="Pay --set bonus=X for its members' first yeses in an episode.")
+        Path | None, Option(help="Pay --set bonus=X for a member's first positive prediction in an episode.")
     ] = None,
 ) -> None:
     """Train PPO or DQN on primitive actions, to compare."""
-    given.end(given.make(domain, data=data, ensemble=ensemble), "evaluate", given.out.parent)
+    call.end(call.make(domain, data=data, ensemble=ensemble), "evaluate", call.out.parent)
 
 
 @cli.stage(cli.OWN, "audit", "audit runs/mine/ensemble --domain doorkey --sub-goal go-to-goal --out audit")
 def audit(
-    given: cli.Given,
+    call: cli.StageCall,
     classifier: Annotated[str, Argument(help="An ensemble's folder, or module:function (docs/audit.md).")],
     domain: Annotated[str, Option(help=f"Where to play: {cli.DOMAINS}", autocompletion=cli.offer("domain"))],
-    sub_goal: Annotated[str, Option(help="The domain's sub-goal whose truth counts.")],
+    sub_goal: Annotated[str, Option(help="The domain's sub-goal that is the truth.")],
     member: Annotated[int, Option(min=0, help="Which member of the ensemble.")] = 0,
 ) -> None:
     """How often, and where, do policies fool a success classifier?"""
@@ -98,12 +99,12 @@ def audit(
     from hypogoal.evaluation.audit import lines_of
     from hypogoal.stages.audit import audit as audited
 
-    config = given.config(domain, given=True)
+    config = call.config(domain, by_user=True)
     with own_code.given(classifier, domain):
-        found = audited(classifier, config, given.out, domain=domain, sub_goal=sub_goal, member=member, **given.how)
-    for line in () if given.how["quiet"] else lines_of(found):
+        rates = audited(classifier, config, call.out, domain=domain, sub_goal=sub_goal, member=member, **call.how)
+    for line in () if call.how["quiet"] else lines_of(rates):
         say(line)
-    given.end({})
+    call.end({})
 
 
 @cli.command(cli.MAKE, "evaluate runs/mine")

@@ -1,7 +1,7 @@
 """Artefacts: folders with a ``manifest.json``, written beside their final name and renamed at the end.
 
-What has a manifest is complete (Spec A8). The manifest says what made the artefact: kind, format version, the full
-resolved configuration, the seed, the sha256 of every file and of every input's manifest, package versions.
+A folder with a manifest is complete (Spec A8). The manifest records kind, format version, the full resolved
+configuration, the seed, the sha256 of every file and of every input's manifest, and package versions.
 """
 
 import contextlib
@@ -25,19 +25,17 @@ from hypogoal.core.manifests import (
     FORMAT_VERSION,
     MANIFEST,
     MAX_MANIFEST_BYTES,
-    NUMBERS,
     check_writable,
-    files_of,
     read_manifest,
     sealed,
 )
 
-DATA, ARRAYS = "data", "arrays"  # the kinds of outputs that are files: HDF5 and .npz
+DATA, ARRAYS = "data", "arrays"  # kinds of outputs that are files: HDF5 and .npz
 HDF5 = b"\x89HDF\r\n\x1a\n"
-DEPTH = 3  # of folders, in which a run's artefacts lie
+DEPTH = 3  # levels of folders below a run that are searched for artefacts
 THE_FILE = "the file is"
-PIECE = 1 << 20  # bytes that are hashed at once
-FRONT = 1 << 16  # bytes in which the attributes of a file of ours begin
+PIECE = 1 << 20  # bytes hashed at once
+FRONT = 1 << 16  # the attributes of our HDF5 files begin within so many bytes
 AWAY = "Move it away, or choose another --out."
 PACKAGES = (
     "hypogoal", "torch", "numpy", "gymnasium", "minigrid", "ale-py", "opencv-python-headless", "captum", "h5py",
@@ -47,7 +45,7 @@ PACKAGES = (
 
 @dataclass(frozen=True)
 class Artefact:
-    """A complete artefact: its folder and what its manifest says."""
+    """A complete artefact: its folder and its manifest."""
 
     path: Path
     manifest: dict[str, Any]
@@ -59,7 +57,7 @@ class Artefact:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved configuration that made it; asking it for what it does not say is a ``UserError``."""
+        """The resolved configuration that made it; a missing key is a ``UserError``."""
         return Settings(self.manifest["config"], self.path)
 
     @property
@@ -68,13 +66,13 @@ class Artefact:
         return int(self.manifest["seed"])
 
     def whole(self) -> Self:
-        """This artefact; a ``UserError`` where its files are not as the manifest says. Costs some ms per MB."""
+        """This artefact; a ``UserError`` if a file is not as in the manifest. Takes some ms per MB."""
         if faults := check_files(self):
             raise UserError(f"the artefact is damaged ({faults[0]})", self.path, AGAIN)
         return self
 
     def input(self, kind: str) -> Path:
-        """The input of ``kind``, beside this artefact, else as recorded; gone or changed since, a ``UserError``."""
+        """The input of ``kind``, at its relative or its recorded path; a ``UserError`` if gone or changed."""
         for entry in self.manifest["inputs"]:
             if entry["kind"] == kind:
                 path, fault = find_input(self.path, entry)
@@ -86,7 +84,7 @@ class Artefact:
 
 
 class Settings(dict[str, Any]):
-    """A manifest's configuration: what it does not say is told in one line."""
+    """A manifest's configuration: a missing key is a ``UserError``."""
 
     def __init__(self, values: dict[str, Any], path: Path):
         super().__init__(values)
@@ -97,7 +95,7 @@ class Settings(dict[str, Any]):
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a regular file, as large as when it was opened, as hexadecimal digits; else a ``UserError``."""
+    """The sha256 of a regular file as hexadecimal digits, read up to its size when opened; else a ``UserError``."""
     digest = hashlib.sha256()
     with open_file(path, THE_FILE, AGAIN) as file:
         if is_hole(file):
@@ -110,20 +108,20 @@ def sha256_of(path: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that an artefact's numbers depend on."""
-    found = {"python": platform.python_version()}
+    """Versions of Python and of the packages that determine an artefact's numbers."""
+    installed = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
+            installed[name] = metadata.version(name)
+    return installed
 
 
 def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = False, resume: bool = False) -> Path:
-    """Check, before any work is done, that ``out`` may be written as a ``kind``: an artefact's, ``data`` or ``arrays``.
+    """Check, before any work, that ``out`` may be written as a ``kind``: an artefact's, ``data`` or ``arrays``.
 
-    A ``UserError``: its name is too long; it is an input, or has one in it; it exists and ``force`` is false, or it
-    exists and is of another kind; another process writes it; something unfinished is there and neither ``force`` nor
-    ``resume`` says what to do with it. What is there complete is with ``resume`` left to ``create_artefact``.
+    A ``UserError`` if its name is too long; it is or contains an input; it exists without ``force`` or is of another
+    kind; another process writes it; or it is unfinished and neither ``force`` nor ``resume`` is given. With ``resume``
+    a complete output passes: ``create_artefact`` compares it.
     """
     place = out.resolve()
     if len(os.fsencode(place.name)) > MAX_NAME_BYTES:  # the draft's name is longer
@@ -132,7 +130,7 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
         if path.resolve().is_relative_to(place):
             raise UserError("the output would replace an input", path, "Choose another --out.")
     if out.exists():
-        if not resume:  # of what is complete only the stage knows whether it was made as asked
+        if not resume:  # only the stage knows whether a complete output was made with the requested settings
             drafts.check_replaceable(out, force=force)
         check_kind(out, kind)
     out = drafts.place_of(out)
@@ -143,26 +141,25 @@ def claim(out: Path, *, kind: str, inputs: Iterable[Path] = (), force: bool = Fa
 
 
 def check_kind(out: Path, kind: str) -> None:
-    """Refuse (``UserError``) what is neither an empty folder nor of the kind that is to be made, whole or damaged.
+    """Refuse (``UserError``) to replace anything but an empty folder or an output, whole or damaged, of the same kind.
 
-    ``--force`` replaces only what the stage itself makes there. A wrong ``--out`` is one slip of the hand; what it hits
-    may be months of work, or nothing of ours.
+    A mistyped ``--out`` with ``--force`` may hit months of work, or files that are not hypogoal's.
     """
     if out.is_dir():
         if not any(out.iterdir()):
             return
         if not (out / MANIFEST).is_file():
-            raise UserError(f"what stands there is not of kind {kind!r}: a folder that has no manifest", out, AWAY)
-        found = _manifest_kind(out)
-        if found != kind:
-            what = f"it is of kind {found!r}" if found else "its manifest cannot be read"
-            raise UserError(f"what stands there is not of kind {kind!r}: {what}", out, AWAY)
+            raise UserError(f"the existing output is not of kind {kind!r}: a folder without a manifest", out, AWAY)
+        existing = _manifest_kind(out)
+        if existing != kind:
+            what = f"it is of kind {existing!r}" if existing else "its manifest cannot be read"
+            raise UserError(f"the existing output is not of kind {kind!r}: {what}", out, AWAY)
     elif not (out.is_file() and {DATA: _is_data, ARRAYS: _is_arrays}.get(kind, lambda path: False)(out)):
-        raise UserError(f"what stands there is not of kind {kind!r}: another file", out, AWAY)
+        raise UserError(f"the existing output is not of kind {kind!r}: another file", out, AWAY)
 
 
 def _manifest_kind(folder: Path) -> str:
-    """The kind that a manifest says, whatever else is wrong with it; empty where it cannot be read."""
+    """The kind in a manifest, whatever else is wrong with it; empty if it cannot be read."""
     with contextlib.suppress(UserError):
         manifest = read_json(folder / MANIFEST, "the manifest is", "", MAX_MANIFEST_BYTES)
         if isinstance(manifest, dict) and "format" in manifest and isinstance(manifest.get("kind"), str):
@@ -171,8 +168,8 @@ def _manifest_kind(folder: Path) -> str:
 
 
 def _is_data(path: Path) -> bool:
-    """Whether a file is one of collected states: HDF5 with names of sub-goals, which are in front if it is cut off."""
-    with open_file(path, "what stands there is", AWAY) as raw:
+    """Whether a file holds collected states: HDF5 with sub-goals' names, which come first in a truncated file."""
+    with open_file(path, "the existing output is", AWAY) as raw:
         begin = raw.read(FRONT)
     if not begin.startswith(HDF5):
         return False
@@ -187,14 +184,14 @@ def _is_data(path: Path) -> bool:
 
 def _is_arrays(path: Path) -> bool:
     try:
-        with open_file(path, "what stands there is", AWAY) as raw, zipfile.ZipFile(raw) as file:
+        with open_file(path, "the existing output is", AWAY) as raw, zipfile.ZipFile(raw) as file:
             return "observations.npy" in file.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
 
 
 def check_parent(out: Path) -> None:
-    """Refuse (``UserError``) an output whose folder is not there and cannot be made, or cannot be written to."""
+    """Refuse (``UserError``) an output whose folder cannot be made or written to."""
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir():
         raise UserError("the output's folder cannot be made, a file is in the way", parent, "Choose another --out.")
@@ -212,36 +209,36 @@ def create_artefact(
     inputs: Sequence[Path] = (),
     force: bool = False,
     resume: bool = False,
-    card: Callable[[dict[str, Any], Path], str] = lambda about, folder: "",
+    card: Callable[[dict[str, Any], Path], str] = lambda header, folder: "",
 ) -> Iterator[Path]:
-    """A folder to fill; at the end its ``card`` and its manifest are written and it is renamed to ``out``.
+    """A folder to fill; at the end its ``card`` and manifest are written and it is renamed to ``out``.
 
-    ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are artefact folders or data files that
-    were read. ``checkpoints_of`` knows where the checkpoints beside the folder are. When the block raises, ``out`` is
-    as it was, and the folder is removed unless it has a checkpoint.
+    ``config`` is the resolved configuration, a dataclass or a dict; ``inputs`` are the artefact folders or data files
+    that were read. ``checkpoints_of`` finds the checkpoints beside the folder. If the block raises, ``out`` stays as it
+    was, and the folder is removed unless it has a checkpoint.
 
     Raises:
-        UserError: see :func:`claim`, or what is there was begun with another configuration, seed or inputs.
-        Complete: with ``resume``, it was made with these.
+        UserError: see :func:`claim`, or the unfinished output has another configuration, seed or inputs.
+        Complete: with ``resume``, the output is complete and was made with the same ones.
     """
     inputs = [Path(path) for path in inputs]
-    given, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
+    requested, out = out, claim(out, kind=kind, inputs=inputs, force=force, resume=resume)
     config = config if isinstance(config, dict) else as_dict(config)
-    about = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
+    header = {"kind": kind, "format": FORMAT_VERSION, "config": config, "seed": seed}
     entries = [_input_entry(path, out) for path in inputs]
-    check_writable({**about, "inputs": entries, "files": {}}, out)
-    identity = {**about, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
+    check_writable({**header, "inputs": entries, "files": {}}, out)
+    identity = {**header, "inputs": [entry["sha256"] for entry in entries], "versions": versions()}
     if resume and out.exists() and not drafts.unfinished(out):
         manifest = open_artefact(out, kind).manifest
         hashes = [entry["sha256"] for entry in manifest["inputs"]]
-        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, given)
+        raise drafts.check_complete({**manifest, "inputs": hashes}, identity, requested)
     with drafts.draft(out, identity, force=force, resume=resume) as work:
         yield work.files
-        if text := card({**about, "inputs": entries}, work.files):
+        if text := card({**header, "inputs": entries}, work.files):
             (work.files / "README.md").write_bytes(text.encode())
-        made = sorted(file for file in work.files.rglob("*") if file.is_file())
-        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in made}
-        manifest = {**about, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
+        written = sorted(file for file in work.files.rglob("*") if file.is_file())
+        files = {file.relative_to(work.files).as_posix(): sha256_of(file) for file in written}
+        manifest = {**header, "inputs": entries, "files": files, "versions": versions(), "command": work.command}
         (work.files / MANIFEST).write_bytes(sealed(manifest))
         drafts.put_in_place(work.files, out)
 
@@ -258,7 +255,7 @@ def _input_entry(path: Path, out: Path) -> dict[str, str]:
 def open_artefact(path: Path, kind: str | Sequence[str] | None = None) -> Artefact:
     """A complete artefact of ``kind`` (one, several, or None for any).
 
-    Missing, no artefact, damaged, of another kind or of a newer format is a ``UserError``.
+    A path that is missing or no artefact, a damaged manifest, another kind or a newer format is a ``UserError``.
     """
     manifest_path = path / MANIFEST
     if not path.exists():
@@ -282,35 +279,30 @@ def find_artefacts(run: Path, kind: str) -> list[Artefact]:
 
 
 def check_files(artefact: Artefact) -> list[str]:
-    """One line for each file of the artefact that is missing or changed; none when it is whole."""
+    """One line for each file of the artefact that is missing or changed."""
     return [f"{name}: {fault}" for name, fault in file_faults(artefact).items()]
 
 
 def file_faults(artefact: Artefact) -> dict[str, str]:
-    """What is wrong with an artefact's files, by name: its manifest says which it has, its kind which it must have."""
-    listed, wanted = artefact.manifest["files"], files_of(artefact.kind, artefact.manifest["config"])
-    if wanted is None:
-        return {MANIFEST: f"of a kind that this hypogoal does not know ({artefact.kind!r})"}
-    wanted -= {NUMBERS} if artefact.manifest["format"] == 1 else set()
-    faults = dict.fromkeys(sorted(wanted - listed.keys()), "missing, and not in the manifest")
-    faults |= {name: file_fault(artefact.path, name, digest) for name, digest in listed.items()}
-    return {name: fault for name, fault in faults.items() if fault}
+    """What is wrong with the files that an artefact's manifest lists, by name."""
+    listed = artefact.manifest["files"].items()
+    return {name: fault for name, digest in listed if (fault := file_fault(artefact.path, name, digest))}
 
 
 def extra_files(artefact: Artefact) -> list[str]:
-    """What lies in the artefact's folder and is none of its files; artefacts and drafts within are no part of it."""
-    known, found = {MANIFEST, *artefact.manifest["files"]}, []
+    """Files in the artefact's folder that its manifest does not list; artefacts and drafts within are ignored."""
+    listed, present = {MANIFEST, *artefact.manifest["files"]}, []
     for place, folders, names in os.walk(artefact.path):
         inner = [Path(place, name) for name in folders if not name.endswith(drafts.PARTIAL)]
         inner = [path for path in inner if not (path / MANIFEST).exists()]
         folders[:] = sorted(path.name for path in inner if not path.is_symlink())
         files = [*(Path(place, name) for name in names), *(path for path in inner if path.is_symlink())]
-        found += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
-    return [name for name in found if name not in known]
+        present += [path.relative_to(artefact.path).as_posix() for path in sorted(files)]
+    return [name for name in present if name not in listed]
 
 
 def file_fault(folder: Path, name: str, digest: str) -> str:
-    """What is wrong with a file of an artefact; empty when it is whole."""
+    """What is wrong with a file of an artefact; empty if it is whole."""
     path = inside(folder, name)
     if path is None:
         return "outside the artefact"
@@ -323,10 +315,10 @@ def file_fault(folder: Path, name: str, digest: str) -> str:
 
 
 def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> tuple[Path | None, str]:
-    """Where an input is that a manifest in ``folder`` records, or None and what is wrong.
+    """The path of an input recorded in ``folder``'s manifest, and ""; or None and what is wrong.
 
-    It is looked for beside the artefact, and unless it is to be there (``beside``) where it was once.
-    The path is a stranger's word: it is only ever read from, and nothing is looked at but what has the sha256 recorded.
+    It is looked for at its relative path, then, unless ``beside``, at its recorded path. A stranger may have written
+    these paths: they are only read from, and only a file with the recorded sha256 is accepted.
     """
     fault = "gone"
     for candidate in (folder / entry["relative"], *(() if beside else (Path(entry["path"]),))):
@@ -345,5 +337,5 @@ def find_input(folder: Path, entry: dict[str, str], *, beside: bool = False) -> 
 
 
 def _of_file(error: UserError) -> str:
-    """What is wrong with a file that :func:`sha256_of` does not read."""
+    """What is wrong with a file that :func:`sha256_of` refuses."""
     return error.what.removeprefix(f"{THE_FILE} ")

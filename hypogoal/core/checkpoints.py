@@ -1,9 +1,8 @@
-"""Checkpoints: all that a stage needs to go on where it was, saved while it works (Spec G1, G3).
+"""Checkpoints: all that a stage needs to resume, saved while it works (Spec G1, G3).
 
-A state is nested dicts and lists of arrays, tensors and plain JSON values; what has a state gives it as ``snapshot()``
-and takes it back as ``restore(snapshot)``. One state is one safetensors file, its JSON part in it as bytes; no pickle.
-Such a file is private to its stage and to the version that wrote it: what is read must be built like the state of what
-is to go on (:func:`require_alike`).
+A state is nested dicts and lists of arrays, tensors and plain JSON values; objects give it as ``snapshot()`` and take
+it back with ``restore(snapshot)``. One state is one safetensors file with its JSON part as bytes; no pickle. It is
+private to its stage and version: a loaded state must have the structure of a fresh one (:func:`require_alike`).
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ if TYPE_CHECKING:
 State = dict[str, Any]
 
 FEWEST_SECONDS = 10.0  # between two checkpoints
-WAIT_PER_COST = 30.0  # and at least so many times as long as one took: 3 % of a run at most
+WAIT_PER_COST = 30.0  # and at least 30 times as long as saving took: at most 3 % of a run
 PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment: the seconds between two instead, for tests
 FOLDER = "checkpoint"  # beside the folder that a stage fills
-JSON_PART, SUM_PART = "json-5", "crc32"  # the number rises with what stages keep
+JSON_PART, SUM_PART = "json-5", "crc32"  # raise the number when the contents of states change
 ARRAY, TENSOR = "$array", "$tensor"
 ANEW = "Give --force and no --resume to begin anew."
 
@@ -49,10 +48,10 @@ def checkpoints_of(folder: Path, name: str = "stage") -> Checkpoints:
 
 
 class Checkpoints:
-    """One state on disk, replaced by a later one now and then; the earlier stays until the later is whole.
+    """One state on disk, replaced from time to time; the old file stays until the new one is whole.
 
     As a context, Ctrl-C and SIGTERM wait for the next :meth:`offer`, which saves and raises ``KeyboardInterrupt`` with
-    the signal's number. A second Ctrl-C does not wait. Where the ``path`` is None, nothing is ever saved.
+    the signal's number. A second Ctrl-C does not wait. With ``path`` None nothing is ever saved.
     """
 
     def __init__(self, path: Path | None):
@@ -66,7 +65,7 @@ class Checkpoints:
 
     def __enter__(self) -> Checkpoints:
         self._signal, self._interrupted, self._handlers = None, False, {}
-        if threading.current_thread() is threading.main_thread():  # no other may have handlers
+        if threading.current_thread() is threading.main_thread():  # other threads cannot set handlers
             for number in SIGNALS:
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     self._handlers[number] = signal.signal(number, self._note)
@@ -80,21 +79,21 @@ class Checkpoints:
         if self._signal is None or isinstance(error, KeyboardInterrupt):
             return
         if self._handlers.get(self._signal) is signal.SIG_DFL:
-            signal.raise_signal(self._signal)  # a pool's process that fails and is told to end, or it would never
+            signal.raise_signal(self._signal)  # a pool's process that failed must still obey the signal
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and self._interrupted:
             stop(number, frame)
-        self._interrupted |= number == signal.SIGINT  # the first; a run sends SIGTERM on
+        self._interrupted |= number == signal.SIGINT  # the first Ctrl-C; a run forwards SIGTERM
         self._signal = self._signal or number
 
     @property
     def saved(self) -> bool:
-        """Whether there is one."""
+        """Whether a checkpoint exists."""
         return self.path is not None and self.path.is_file()
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Where the state is whole: save it if it is time to, or if a signal came: then a ``KeyboardInterrupt``."""
+        """Save ``state()`` if it is due or a signal came; after a signal raise ``KeyboardInterrupt``."""
         if self._signal is None and time.monotonic() < self._next:
             return
         begun = time.monotonic()
@@ -107,9 +106,9 @@ class Checkpoints:
             raise KeyboardInterrupt(self._signal)
 
     def save(self, state: State) -> None:
-        """Write ``state``, or raise a ``UserError``; the one before is still there then.
+        """Write ``state``. If that fails, a ``UserError``; the previous checkpoint stays.
 
-        One with a tensor that holds NaN or Inf is not written: the last good one stays (Spec G3).
+        A state with NaN or Inf in a tensor is not written: the last good one stays (Spec G3).
         """
         from safetensors import SafetensorError
         from safetensors.numpy import save_file
@@ -131,10 +130,10 @@ class Checkpoints:
         except (OSError, SafetensorError) as error:
             fresh.unlink(missing_ok=True)
             what = f"a checkpoint cannot be written ({error})"
-            raise UserError(what, self.path, "Make room, then give --resume to go on.") from None
+            raise UserError(what, self.path, "Free some disk space, then continue with --resume.") from None
 
     def load(self) -> State | None:
-        """The state last saved; None where none was. A damaged file is a ``UserError``."""
+        """The saved state, or None. A damaged file is a ``UserError``."""
         from safetensors import SafetensorError
         from safetensors.numpy import load_file
 
@@ -152,9 +151,9 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def restoring(self) -> Iterator[None]:
-        """Take back a state in the block; one that does not fit is a ``UserError``, whatever it makes the block raise.
+        """Restore a state in the block; any error that a state which does not fit raises becomes a ``UserError``.
 
-        Its checksum was right, so that it is another stage's or version's, or was written by somebody else.
+        Its checksum was right, so it is from another stage, version or author.
         """
         from hypogoal.core.own_code import users_own
 
@@ -164,11 +163,11 @@ class Checkpoints:
             if users_own(error) is not None:
                 raise
             fault = str(error).partition("\n")[0] if isinstance(error, Unlike) else "at its values"
-            raise UserError(f"the checkpoint does not fit what is to go on ({fault})", self.path, ANEW) from error
+            raise UserError(f"the checkpoint does not fit this stage ({fault})", self.path, ANEW) from error
 
 
 def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
-    """The CRC-32 of all that is saved: a byte that a disk changed would be other weights, and not be noticed."""
+    """The CRC-32 of all parts: without it, a byte changed on disk would silently change weights."""
     value = 0
     for place, values in sorted(parts.items()):
         value = zlib.crc32(f"{place} {values.dtype} {values.shape}".encode(), value)
@@ -177,7 +176,7 @@ def _checksum(parts: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
 
 
 def _taken_apart(value: Any, place: str, arrays: State, tensors: State) -> Any:
-    """``value`` as plain JSON values, its arrays and tensors put aside by their place."""
+    """``value`` as plain JSON values; its arrays and tensors go into ``arrays`` and ``tensors`` by place."""
     if isinstance(value, dict):
         return {key: _taken_apart(item, f"{place}/{key}", arrays, tensors) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -208,33 +207,33 @@ def _put_together(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
 
 
 class Unlike(ValueError):
-    """A state is not built like that of what is to go on from it."""
+    """A saved state does not have the structure of a fresh one."""
 
 
 class _Rows(np.ndarray[Any, Any]):
-    """An array of which a later snapshot may have more or fewer rows."""
+    """An array whose number of rows may change between snapshots."""
 
 
 class _List(list[Any]):
-    """A list of which a later snapshot may have more or fewer items, each like ``item``."""
+    """A list whose length may change between snapshots; each item is like ``item``."""
 
     item: Any
 
 
 class _Dict(dict[str, Any]):
-    """A dict of which a later snapshot may have more or fewer keys, each value like ``item``."""
+    """A dict whose keys may change between snapshots; each value is like ``item``."""
 
     item: Any
 
 
 class Unknown(dict[str, Any]):
-    """A part of a state of which only its owner knows how it is built, such as that of an own domain's engine."""
+    """A part of a state whose structure only its owner knows, such as that of a user's engine."""
 
 
 def growing(values: Any, item: Any = None) -> Any:
-    """The same array (n, ...), list or dict, marked for :func:`require_alike`: its length changes, its items do not.
+    """The same array (n, ...), list or dict, marked for :func:`require_alike`: only its length may change.
 
-    ``item`` is like one of a list or dict, which may have none yet.
+    ``item`` is an example item of a list or dict, which may be empty.
     """
     if isinstance(values, np.ndarray):
         return values.view(_Rows)
@@ -244,10 +243,10 @@ def growing(values: Any, item: Any = None) -> Any:
 
 
 def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
-    """Refuse (``Unlike``) a state with other keys, types, dtypes or shapes than that of what is to go on, ``fresh``.
+    """Refuse (``Unlike``) a saved state whose keys, types, dtypes or shapes differ from those of a ``fresh`` one.
 
-    Only what is marked as :func:`growing` may have another length; a number may stand where None does. Texts, such as
-    the kind of a generator, never change.
+    Only parts marked as :func:`growing` may differ in length; a number may replace None. Texts, such as the kind of a
+    generator, never change.
     """
     fresh = fresh.item() if isinstance(fresh, np.generic) else fresh
     where = place or "/"
@@ -271,9 +270,9 @@ def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
             require_alike(value, like, f"{place}/{number}")
     elif hasattr(fresh, "dtype"):
         kind, shape = str(fresh.dtype), tuple(fresh.shape)
-        found = tuple(getattr(saved, "shape", ()))
-        grows = isinstance(fresh, _Rows) and len(found) == len(shape)
-        if str(getattr(saved, "dtype", "")) != kind or found[grows:] != shape[grows:]:
+        saved_shape = tuple(getattr(saved, "shape", ()))
+        grows = isinstance(fresh, _Rows) and len(saved_shape) == len(shape)
+        if str(getattr(saved, "dtype", "")) != kind or saved_shape[grows:] != shape[grows:]:
             raise Unlike(f"not {kind} {shape} at {where}")
     elif not (
         (saved == fresh if isinstance(fresh, str) else type(saved) is type(fresh))
@@ -281,12 +280,12 @@ def require_alike(saved: Any, fresh: Any, place: str = "") -> None:
         or (type(saved) in (int, float) and fresh is None)
     ):
         raise Unlike(f"not {type(fresh).__name__} at {where}")
-    elif type(saved) is int and abs(saved) > MOST_INTEGER >= abs(fresh or 0):  # a generator's own are as large
+    elif type(saved) is int and abs(saved) > MOST_INTEGER >= abs(fresh or 0):  # a generator's state is as large
         raise Unlike(f"no such count at {where}")
 
 
 def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:
-    """What Adam knows of each parameter that has moved, step counts included; its settings are the configuration's."""
+    """Adam's moments and step counts of each parameter that was updated; its settings come from the configuration."""
     import torch
 
     state = optimiser.state
@@ -297,35 +296,35 @@ def optimiser_snapshot(optimiser: torch.optim.Optimizer) -> State:
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, snapshot: State) -> None:
-    """Continue from an ``optimiser_snapshot`` of one of the same parameters."""
-    state = {int(number): known[0] for number, known in snapshot.items() if known}
+    """Continue from an ``optimiser_snapshot`` of an optimiser of the same parameters."""
+    state = {int(number): moments[0] for number, moments in snapshot.items() if moments}
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
 class Resumable:
-    """What goes on after a break as if there had been none: it gives what changes as a snapshot, and takes it back.
+    """An object that continues after a break as if there had been none, from a snapshot of what changes.
 
     Attributes:
-        CHANGING: the names of the attributes that do. Each is a network, an optimiser, a generator of random numbers, a
+        CHANGING: the names of the attributes that change. Each is a network, an optimiser, a random generator, a
             tensor, a deque, itself resumable, a list of such, or of arrays, numbers, lists, dicts by name and None.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ()
 
     def items(self) -> Mapping[str, Any]:
-        """What an item is like of those in ``CHANGING`` whose length changes: a deque, a list, an array's rows.
+        """An example item of each attribute in ``CHANGING`` whose length changes: a deque, a list, an array's rows.
 
-        Of a list of lists or deques, one for each option or environment, an item of each of these.
+        For a list of lists or deques, one per option or environment, an item of the inner ones.
         """
         return {}
 
     def snapshot(self) -> State:
-        """What a resumed run needs to go on exactly; valid until the next step."""
+        """All that a resumed run needs to continue exactly; valid until the next step."""
         items = self.items()
         return {name: _taken(getattr(self, name), items.get(name)) for name in self.CHANGING}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of one made with the same arguments."""
+        """Continue from a ``snapshot`` of an object made with the same arguments."""
         for name in self.CHANGING:
             setattr(self, name, _restored(getattr(self, name), snapshot[name]))
 
@@ -350,7 +349,7 @@ def _taken(value: Any, item: Any = None) -> Any:
 
 
 def _restored(value: Any, saved: Any) -> Any:
-    """``value`` as it was; changed in place where others hold it too."""
+    """``value`` with the saved contents, changed in place where other objects share it."""
     import torch
 
     if isinstance(value, Resumable):
@@ -359,8 +358,8 @@ def _restored(value: Any, saved: Any) -> Any:
         value.clear()
         value.extend(saved)
     elif isinstance(value, list) and value and isinstance(value[0], Resumable | deque | np.random.Generator):
-        for item, known in zip(value, saved, strict=True):
-            _restored(item, known)
+        for item, saved_item in zip(value, saved, strict=True):
+            _restored(item, saved_item)
     elif isinstance(value, torch.nn.Module):
         value.load_state_dict(saved)
     elif isinstance(value, torch.optim.Optimizer):

@@ -1,8 +1,8 @@
-"""Commands as we print them: what is printed can be typed in a shell, and works.
+"""Printed commands: they can be pasted into a shell and work.
 
-Words are quoted. Where a file that the command reads names code of the user's own, ``HYPOGOAL_TRUST`` stands in front,
-for what the user allowed in this process; of other code, a stranger's perhaps, it is asked whether the user trusts it.
-It stands there even if the environment has it now: perhaps for this command only.
+Words are quoted. If a file that the command reads names user code, ``HYPOGOAL_TRUST`` is put in front for code that the
+user allowed in this process; about other code, perhaps a stranger's, the text asks whether the user trusts it. The
+variable is put in front even if it is set now, since it may be set for this command only.
 """
 
 import re
@@ -18,16 +18,16 @@ from hypogoal.core.hdf5 import attribute, open_hdf5
 from hypogoal.core.own_code import allowed_before, permission
 
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")  # module:object
-GENERATIONS = 3  # of artefacts that one was made from: ensemble, options, options that these continue
+GENERATIONS = 3  # of inputs that are followed: options, the options that these continue, their ensemble
 
 
 def command(*words: object) -> str:
-    """A command of ours, ``words`` without ``hypogoal``, as one types it after what this process did."""
+    """The command ``hypogoal *words`` as one would type it next."""
     return _typed(words, [name for name in _named(words) if name in allowed_before()])
 
 
 def advice(lead: str, *words: object) -> str:
-    """``lead`` and a command that an error advises: 'First run: hypogoal evaluate runs/mine'."""
+    """``lead`` and the command that an error advises: 'First run: hypogoal evaluate runs/mine'."""
     names = _named(words)
     unsure = [name for name in names if name not in allowed_before()]
     lead += f", if you trust {' and '.join(unsure)}" if unsure else ""
@@ -40,12 +40,12 @@ def _typed(words: tuple[object, ...], names: list[str]) -> str:
 
 
 def _named(words: tuple[object, ...]) -> list[str]:
-    """Own code that files among the words name."""
+    """User code named in the files among the words."""
     return [*dict.fromkeys(name for word in words[1:] for name in _named_at(Path(str(word))))]
 
 
 def _named_at(path: Path) -> Iterator[str]:
-    """Own code that a data file, an artefact or the artefacts of a run name."""
+    """User code named in a data file, an artefact or the artefacts of a run."""
     try:
         if path.suffix == ".h5" and path.is_file():
             with open_hdf5(path, "the data file", "") as file:
@@ -53,7 +53,7 @@ def _named_at(path: Path) -> Iterator[str]:
         elif path.is_dir():
             for manifest in [path / MANIFEST] if (path / MANIFEST).is_file() else visible(path, MANIFEST):
                 yield from _named_by(manifest.parent, GENERATIONS)
-    except (UserError, OSError, ValueError):  # who reads it is told
+    except (UserError, OSError, ValueError):  # reported by whoever reads the file
         return
 
 

@@ -1,8 +1,7 @@
-"""Settings: one home for each default, with unit, meaning and source; presets and ``--set`` resolve here.
+"""Settings: each default in one place, with unit, meaning and source; presets and ``--set`` are resolved here.
 
-A stage's configuration is a frozen dataclass whose every field is a :func:`setting`. ``hypogoal config STAGE``
-and the manifests are made from the same fields. Precedence: ``--set`` > option > preset > the domain's
-default > default.
+A stage's configuration is a frozen dataclass of :func:`setting` fields; ``hypogoal config STAGE`` and the manifests
+use them too. Precedence: ``--set`` > option > preset > the domain's default > default.
 """
 
 import dataclasses
@@ -24,7 +23,7 @@ from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
 MAX_RANGE = 10_000  # integers that one range may stand for
-DOMAIN = "doorkey"  # whose presets and defaults hold where no domain is said
+DOMAIN = "doorkey"  # its presets and defaults hold if no domain is named
 
 
 def setting(
@@ -43,25 +42,25 @@ def setting(
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
-    """The differences from the defaults that preset ``name`` asks for in ``stage``, a command: its table ``[stage]``.
+    """The settings that preset ``name`` changes in ``stage``, a command: its table ``[stage]``.
 
-    The name is that of a preset of the package (``demo``, ``paper``), of ``domain`` or, if it has none, of DoorKey, or
-    the path of an own TOML file. An unknown preset, one that is not TOML, or with other tables than ``tables`` (none:
-    any) is a ``UserError``.
+    The name is a preset of the package (``demo``, ``paper``), of ``domain`` or, if it has none, of DoorKey, or the path
+    of the user's TOML file. An unknown preset, invalid TOML, and tables not in ``tables`` (empty: any) are a
+    ``UserError``.
     """
     if name is None:
         return {}
     every = resources.files("hypogoal") / "presets"
     folder = every / domain if domain.replace("-", "_").isidentifier() and (every / domain).is_dir() else every / DOMAIN
-    known = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    available = sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml"))
     if name.endswith(".toml"):
         if not Path(name).exists():
-            raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(known)}.")
+            raise UserError("no such preset file", name, f"Presets that come with hypogoal: {', '.join(available)}.")
         text = read_text(Path(name), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
-    elif name in known:
+    elif name in available:
         text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     else:
-        raise UserError("unknown preset", name, f"Choose one of {', '.join(known)}, or give a .toml file.")
+        raise UserError("unknown preset", name, f"Choose one of {', '.join(available)}, or give a .toml file.")
     table = parse_toml(text, name, "the preset is", "Mend the file.")
     for key in table:
         if tables and key not in (*tables, stage):
@@ -74,9 +73,9 @@ def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Coll
 
 
 def preset_digest(path: str) -> str:
-    """The sha256 of what a preset file says of stages, whichever way it is written; empty where it cannot be read.
+    """The sha256 of a preset file's settings of stages, however they are written; empty if it cannot be read.
 
-    Its ``[run]`` is left out: that says which cells there are, and a sweep may be given more.
+    ``[run]`` is left out: it determines the cells, and a sweep may get more of them.
     """
     try:
         text = read_text(Path(path), "the preset is", "Give a .toml file.", MAX_PRESET_BYTES)
@@ -111,9 +110,9 @@ def resolve(
 ) -> T:
     """The configuration of a stage, a frozen dataclass of :func:`setting` fields.
 
-    From its preset (see :func:`load_preset`), the command line's ``options``, those that are not None, its ``--set``
-    ``assignments`` and the domain's own ``defaults``, before which the class's stand back. An unknown key, a wrong
-    type, or a value out of range is a ``UserError``.
+    From the preset (see :func:`load_preset`), the ``options`` of the command line that are not None, its ``--set``
+    ``assignments`` and the domain's ``defaults``, which override the class's. An unknown key, a wrong type, or a value
+    out of range is a ``UserError``.
     """
     values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})
@@ -128,7 +127,7 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
     checked: dict[str, Any] = {}
     for key, value in values.items():
         if key not in fields:
-            from hypogoal.core.commands import advice  # which needs more than this module may load
+            from hypogoal.core.commands import advice  # loads more than this module may
 
             do = advice("All of them", "config", stage, *([] if domain == DOMAIN else ["--domain", domain]))
             raise UserError(f"{stage} has no setting", key, f"{meant(key, fields)}{do}")
@@ -136,9 +135,9 @@ def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, do
     return config_class(**checked)
 
 
-def meant(word: str, known: Iterable[str]) -> str:
-    """A question for whoever wrote ``word`` and may have meant a known one; else empty."""
-    near = difflib.get_close_matches(word, [*known], n=1)
+def meant(word: str, candidates: Iterable[str]) -> str:
+    """'Did you mean ...?' if a candidate is like ``word``; else empty."""
+    near = difflib.get_close_matches(word, [*candidates], n=1)
     return f"Did you mean {near[0]!r}? " if near else ""
 
 
@@ -151,18 +150,18 @@ def as_dict(config: Any) -> dict[str, Any]:
 
 
 def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> list[dict[str, Any]]:
-    """Every setting with default (of the last of ``instead``, values and source, that has one), meaning and so on."""
+    """Every setting with default, meaning and so on; the last of ``instead``, (defaults, source), overrides."""
     kinds = typing.get_type_hints(config_class)
     rows = []
     for field in dataclasses.fields(config_class):
-        kind, default, about = kinds[field.name], field.default, dict(field.metadata)
+        kind, default, details = kinds[field.name], field.default, dict(field.metadata)
         for values, source in instead:
             if field.name in values:
-                default, about["source"] = values[field.name], source
+                default, details["source"] = values[field.name], source
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
-        rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source")})
+        rows.append(row | {key: details.get(key) for key in ("unit", "meaning", "source")})
         home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))
-        rows[-1] |= {"allowed": _allowed(about), "part": (home.__doc__ or "").partition(".")[0]}
+        rows[-1] |= {"allowed": _allowed(details), "part": (home.__doc__ or "").partition(".")[0]}
     return rows
 
 
@@ -180,7 +179,7 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
         parsed = _parse(kind, value)
     except (TypeError, ValueError, KeyError, OverflowError):
         name = "true or false" if kind is bool else getattr(kind, "__name__", str(kind))
-        raise UserError("wrong kind of value", where, f"It must be {name}.") from None
+        raise UserError("wrong type of value", where, f"It must be {name}.") from None
     meta = field.metadata
     for item in parsed if isinstance(parsed, tuple) else (parsed,):
         if isinstance(item, float) and not math.isfinite(item):
@@ -200,7 +199,7 @@ def parse_integers(text: str) -> list[int]:
     try:
         return [int(number) for item in text.split(",") for number in _range(item)]
     except ValueError:
-        raise UserError("these are not integers", repr(text[:200]), "Write them as 0-3,7.") from None
+        raise UserError("not integers", repr(text[:200]), "Write them as 0-3,7.") from None
 
 
 def _range(item: Any) -> Iterable[Any]:
@@ -225,7 +224,7 @@ def _parse(kind: Any, value: Any) -> Any:
         if isinstance(value, bool):
             return value
         return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[str(value).lower()]
-    if isinstance(value, bool):  # to Python an int
+    if isinstance(value, bool):  # an int in Python
         raise TypeError
     if kind is int:
         if isinstance(value, str):

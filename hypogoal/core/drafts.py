@@ -1,8 +1,7 @@
 """Drafts: the hidden folder beside an output in which a stage works until the output is whole (Spec A8, G1).
 
-``.NAME.partial/`` has ``files/`` (what will be the output), ``checkpoint/`` (see ``core.checkpoints``), ``begun.json``
-(settings, seed, inputs, versions) and ``lock``, which the kernel holds for the process that works there and lets go of
-when that process dies, however it does.
+``.NAME.partial/`` has ``files/`` (the future output), ``checkpoint/`` (see ``core.checkpoints``), ``begun.json``
+(settings, seed, inputs, versions) and ``lock``, a kernel lock of the working process that ends when the process does.
 """
 
 import contextlib
@@ -26,38 +25,38 @@ from hypogoal.core.locks import is_there, remove_left_over, try_lock
 
 PARTIAL = ".partial"
 FILES, BEGUN, LOCK, OLD = "files", "begun.json", "lock", ".old"
-PATIENCE_SECONDS = 2.0  # for whoever is just letting go
-COMMAND: ContextVar[tuple[str, ...]] = ContextVar("COMMAND", default=())  # a program's call, where it was no command
-GO_ON = "give the same command with --resume to go on"
+PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
+COMMAND: ContextVar[tuple[str, ...]] = ContextVar("COMMAND", default=())  # a program's call in place of a command
+GO_ON = "give the same command with --resume to continue"
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A draft that this process works on: the folder to fill, and the command line that began it, without --resume."""
+    """This process's draft: the folder to fill, and the command line that began it, without ``--resume``."""
 
     files: Path
     command: list[str]
 
 
 def place_of(out: Path) -> Path:
-    """An output by a name of its own, also where it was called ``.`` or is a link: the work goes where that leads."""
+    """The output's path with a proper name, links followed, also for ``.`` and ``..``."""
     return out.resolve() if out.is_symlink() or not out.name or ".." in out.parts else out
 
 
 def draft_folder(out: Path) -> Path:
-    """Where the draft of an output lies."""
+    """The folder of an output's draft."""
     out = place_of(out)
     return out.with_name(f".{out.name}{PARTIAL}")
 
 
 def check_replaceable(out: Path, *, force: bool, resume: bool = False) -> None:
-    """Refuse (``UserError``) to replace what is there, unless what is unfinished beside it was begun with ``force``."""
+    """Refuse (``UserError``) to replace an existing output, unless a draft that replaces it is resumed."""
     if out.exists() and not force and not (resume and unfinished(out)):
         raise UserError("the output exists already", out, "Choose another --out, or give --force to replace it.")
 
 
 def check_free(out: Path, *, force: bool, resume: bool) -> None:
-    """Refuse (``UserError``), before any work, to write what another process writes, or to lose what is unfinished."""
+    """Refuse (``UserError``), before any work, an output that another process writes or that would lose a draft."""
     folder = draft_folder(out)
     if folder.is_dir() and os.access(folder, os.W_OK):
         with sole_writer(out):
@@ -65,7 +64,7 @@ def check_free(out: Path, *, force: bool, resume: bool) -> None:
 
 
 def unfinished(out: Path) -> bool:
-    """Whether something was begun for ``out`` that can be gone on with."""
+    """Whether ``out`` has a draft that can be resumed."""
     folder = draft_folder(out)
     checkpoints = (folder / FOLDER).glob("*.safetensors")
     return (folder / BEGUN).is_file() and (folder / FILES).is_dir() and any(checkpoints)
@@ -73,29 +72,28 @@ def unfinished(out: Path) -> bool:
 
 @contextlib.contextmanager
 def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: bool = False) -> Iterator[Draft]:
-    """Work on ``out``: a fresh draft, or with ``resume``, which ``force`` does not undo, the one begun before with a
-    checkpoint.
+    """Work on ``out`` in a fresh draft or, with ``resume``, in one that has a checkpoint, even if ``force`` is given.
 
-    ``identity`` is what makes it what it is; a draft begun with another is not gone on with. When the block raises, the
-    draft stays where it has a checkpoint and is removed otherwise. Another process at work on ``out``, or something
-    unfinished that was begun otherwise, or of which it was not said what to do with it, is a ``UserError``.
+    ``identity`` determines the output; a draft of another identity is not resumed. If the block raises, the draft stays
+    if it has a checkpoint and is removed otherwise. A ``UserError`` if another process works on ``out``, or if a draft
+    exists that has another identity, or neither ``resume`` nor ``force`` is given.
     """
     folder = draft_folder(out)
     called = Path(sys.argv[0]).name
     words = COMMAND.get() or ("hypogoal" if called == "__main__.py" else called, *sys.argv[1:])
-    told = [word for word in words if word != "--resume"]  # of which nothing depends
-    fresh = {"identity": identity, "command": told}
+    command = [word for word in words if word != "--resume"]  # which changes no result
+    fresh = {"identity": identity, "command": command}
     fresh = parse_json(
         json.dumps(fresh), out, "the command, settings and names are", "Give names in UTF-8, and finite numbers."
     )
     with sole_writer(out):
         _settle(out)
-        check_replaceable(out, force=force, resume=resume)  # by now: another process may have made it since
+        check_replaceable(out, force=force, resume=resume)  # again: another process may have made it since
         _check_unfinished(out, force=force, resume=resume)
         if resume and unfinished(out):
             begun = _begun(folder)
-            do = "Resume it with what it was begun with, or give --force and no --resume to begin anew."
-            check_same(begun["identity"], fresh["identity"], out, "what is unfinished there was begun", do)
+            do = "Resume it with the same settings, or give --force and no --resume to begin anew."
+            check_same(begun["identity"], fresh["identity"], out, "the unfinished output was begun", do)
         else:
             begun = fresh
         try:
@@ -113,23 +111,23 @@ def draft(out: Path, identity: dict[str, Any], *, force: bool = False, resume: b
         _clear(folder)
 
 
-def put_in_place(made: Path, out: Path) -> None:
-    """Rename what was made, a folder or a file, to ``out``; what stood there is moved aside first and removed last."""
-    for path in [made, *made.rglob("*")]:
+def put_in_place(finished: Path, out: Path) -> None:
+    """Rename a finished folder or file to ``out``; what ``out`` was is moved aside first and removed last."""
+    for path in [finished, *finished.rglob("*")]:
         sync(path)
     out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if out.exists():
         out.rename(old)
     try:
-        made.rename(out)
+        finished.rename(out)
         sync(out.parent)
     finally:
         _settle(out)
 
 
 def _settle(out: Path) -> None:
-    """Finish what :func:`put_in_place` had begun: what was moved aside comes back where nothing took its place."""
+    """Finish an interrupted :func:`put_in_place`: the old output comes back if nothing took its place."""
     out = place_of(out)
     old = out.with_name(f".{out.name}{OLD}")
     if old.exists() and not out.exists():
@@ -138,12 +136,12 @@ def _settle(out: Path) -> None:
 
 
 def sweep_up(folder: Path) -> None:
-    """Remove from a folder what processes left that were killed while they wrote: files that had no name yet, and
-    drafts without a checkpoint, behind which what was moved aside comes back. Whoever writes there next does so.
+    """Remove what killed processes left in a folder: temporary files, and drafts without a checkpoint, whose old
+    outputs come back. Every writer calls this first.
 
-    What a living process writes it has locked; where the system cannot lock, all of it stays.
+    Files of living processes are locked and stay; on systems without locks all files stay.
     """
-    with contextlib.suppress(OSError):  # it may not be there, or not be read
+    with contextlib.suppress(OSError):  # missing or unreadable
         for name in filter(lambda name: name.startswith("."), os.listdir(folder)):
             with contextlib.suppress(OSError):  # another process removes it, or only another user may
                 if FRESH.fullmatch(name):
@@ -153,12 +151,12 @@ def sweep_up(folder: Path) -> None:
 
 
 def _sweep_draft(folder: Path, out: Path) -> None:
-    known = {FILES, FOLDER, BEGUN, LOCK}
+    expected = {FILES, FOLDER, BEGUN, LOCK}
     lock = folder / LOCK
     if any(path.is_symlink() for path in (folder, lock)) or not lock.is_file():
         return
-    if not all(name in known or FRESH.fullmatch(name) for name in os.listdir(folder)):
-        return  # it is no draft
+    if not all(name in expected or FRESH.fullmatch(name) for name in os.listdir(folder)):
+        return  # not a draft
     with lock.open("r+b") as file:
         if try_lock(file) and is_there(file, lock) and not unfinished(out):
             _settle(out)
@@ -166,7 +164,7 @@ def _sweep_draft(folder: Path, out: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Remove a draft, its lock last: whoever gets that finds nothing of this one, and loses nothing to it."""
+    """Remove a draft, its lock last, so that the next owner of the lock finds an empty folder."""
     with contextlib.suppress(OSError):
         for path in sorted(folder.iterdir(), key=lambda path: path.name == LOCK):
             _remove(path)
@@ -197,15 +195,13 @@ def _begun(folder: Path) -> dict[str, Any]:
 
 def _check_unfinished(out: Path, *, force: bool, resume: bool) -> None:
     if unfinished(out) and not (force or resume):
-        raise UserError(
-            "an unfinished output is there", out, "Give --resume to go on with it, or --force to begin anew."
-        )
+        raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
 
 
 def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str, do: str) -> None:
-    """Refuse (``UserError``) to go on with what was made of something else, naming the first thing that differs.
+    """Refuse (``UserError``) to continue another identity, naming the first difference.
 
-    ``what`` was done with the former, for the message ("what is there was made"); ``do`` is what to do about it.
+    ``what`` begins the message ("the complete output was made"); ``do`` is what to do about it.
     """
     before, now = _that_matters(before), _that_matters(now)
     for key in {**before, **now}:
@@ -219,33 +215,32 @@ def check_same(before: dict[str, Any], now: dict[str, Any], out: Path, what: str
         raise UserError(f"{what} with {other}", out, do)
 
 
-def _that_matters(about: dict[str, Any]) -> dict[str, Any]:
-    """What results depend on: not on how many processes there are, nor on how their manifest is written."""
-    about, config = {key: value for key, value in about.items() if key != "format"}, about.get("config")
-    return about if not isinstance(config, dict) else {**about, "config": {**config, "workers": None}}
+def _that_matters(identity: dict[str, Any]) -> dict[str, Any]:
+    """The part of an identity that results depend on: without the number of processes and the manifest's format."""
+    identity, config = {key: value for key, value in identity.items() if key != "format"}, identity.get("config")
+    return identity if not isinstance(config, dict) else {**identity, "config": {**config, "workers": None}}
 
 
 def check_complete(before: Mapping[str, Any], now: Mapping[str, Any], out: Path) -> Complete:
-    """What to raise where ``--resume`` finds ``out`` complete; a ``UserError`` where it was made of something else.
+    """What to raise if ``--resume`` finds ``out`` complete; a ``UserError`` if its identity is another.
 
-    ``before`` and ``now`` have ``config``, ``versions`` and whatever else makes it, such as a manifest. Settings that
-    only one of the two has are those of another hypogoal; other versions are said and no more, since nothing is gone on
-    with.
+    ``before`` and ``now`` have ``config``, ``versions`` and the rest of an identity. Settings that only one of them has
+    are from another version of hypogoal and are ignored. Other versions are only mentioned, since nothing is resumed.
     """
     now = json.loads(json.dumps(now))
     keys = [key for key in now if key not in ("config", "versions")]
     settings = sorted(before["config"].keys() & now["config"].keys())
-    one, other = (
-        {"config": {key: about["config"][key] for key in settings}, **{key: about[key] for key in keys}}
-        for about in (before, now)
+    old, new = (
+        {"config": {key: identity["config"][key] for key in settings}, **{key: identity[key] for key in keys}}
+        for identity in (before, now)
     )
     do = "Give --force and no --resume, or write elsewhere."
-    check_same(one, other, out, "what is complete there was made", do)
+    check_same(old, new, out, "the complete output was made", do)
     if now["config"] and not settings:
-        raise UserError("what is complete there was made with other settings", out, do)
+        raise UserError("the complete output was made with other settings", out, do)
     versions = before.get("versions")
-    known = versions.items() if isinstance(versions, dict) else ()
-    others = [f"{name} {version}" for name, version in known if now["versions"].get(name) != version]
+    recorded = versions.items() if isinstance(versions, dict) else ()
+    others = [f"{name} {version}" for name, version in recorded if now["versions"].get(name) != version]
     return Complete(out, f"made with {', '.join(others)}" if others else "")
 
 
@@ -256,9 +251,9 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def sole_writer(out: Path) -> Iterator[None]:
-    """Write ``out`` as the only process that does (else a ``UserError``): the lock on its draft is held.
+    """Hold the lock on the draft of ``out``; a ``UserError`` if another process does.
 
-    The draft's folder is made where there is none and removed if it stays empty.
+    The draft's folder is made if needed and removed if it stays empty.
     """
     folder = draft_folder(out)
     until = time.monotonic() + PATIENCE_SECONDS
@@ -275,14 +270,14 @@ def sole_writer(out: Path) -> Iterator[None]:
             raise
         with file:
             if try_lock(file) is not False and is_there(file, folder / LOCK):
-                with contextlib.suppress(OSError):  # a full disk: it is for others to read, and stays empty
+                with contextlib.suppress(OSError):  # a full disk: only others read it
                     file.truncate(0)
                     file.write(f"process {os.getpid()} on {socket.gethostname()}".encode())
                 try:
                     sweep_up(folder.parent)
                     yield
                 finally:
-                    with contextlib.suppress(OSError):  # unless it is another's by now, who made it anew
+                    with contextlib.suppress(OSError):  # another process may have made it anew
                         if is_there(file, folder / LOCK) and os.listdir(folder) == [LOCK]:
                             _clear(folder)
                 return
@@ -294,10 +289,10 @@ def sole_writer(out: Path) -> Iterator[None]:
 
 
 def _check_own(folder: Path) -> None:
-    """Refuse a draft with links, pipes or devices in it: no stage makes any, and writing would go where they lead."""
+    """Refuse a draft with links, pipes or devices: no stage makes any, and writing would follow them."""
     inside = ((place, name) for place, folders, names in os.walk(folder) for name in (*folders, *names))
     for path in (folder, *(Path(place, name) for place, name in inside)):
-        with contextlib.suppress(FileNotFoundError):  # its owner removes it
+        with contextlib.suppress(FileNotFoundError):  # removed by its owner meanwhile
             mode = path.lstat().st_mode
             if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
                 raise UserError(

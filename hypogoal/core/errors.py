@@ -1,10 +1,10 @@
-"""Errors that a user reads: one line saying what, where and what to do next (Spec G2, G3)."""
+"""Errors for users: one line that says what is wrong, where and what to do (Spec G2, G3)."""
 
 from hypogoal.core.terminal import printable
 
 
 def one_line(text: str) -> str:
-    """A text without its ends of lines; spaces within one stay, since a path may have them."""
+    """A text as one line; spaces within a line stay, since a path may have them."""
     return " ".join(line.strip() for line in text.expandtabs(1).splitlines() if line.strip())
 
 
@@ -24,13 +24,13 @@ class UserError(Exception):
 
 
 class Killed(UserError):
-    """A process of a stage was killed from outside, which no stage can catch."""
+    """A process of a stage was killed from outside."""
 
 
 class Complete(UserError):
-    """What is to be resumed is complete, made as asked: the command line says so and exits with code 0.
+    """The output to resume is complete and as requested: the command line says so and exits with code 0.
 
-    ``path`` is what the command would have made, ``note`` what else there is to say about it.
+    ``path`` is the output, ``note`` a remark on it.
     """
 
     def __init__(self, path: object, note: str = ""):
@@ -39,4 +39,4 @@ class Complete(UserError):
 
 
 class NumericalError(Exception):
-    """NaN or Inf where a number was needed (Spec G3): names the member and the step; nothing was overwritten."""
+    """NaN or Inf in training (Spec G3): names the member and the step; nothing was overwritten."""

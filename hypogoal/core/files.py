@@ -1,12 +1,11 @@
-"""Files that others wrote: what they hold is data to check, never to trust (Spec G2).
+"""Files that others wrote: their contents are checked, never trusted (Spec G2).
 
-Sizes are looked at before anything is read, names before anything is opened. Devices, pipes and folders are no files:
-all that is not read by a library of its own is opened with :func:`open_file`, which never waits.
+Sizes are checked before reading, names before opening. Devices, pipes and folders are refused: everything that is not
+read by a library is opened with :func:`open_file`, which never waits.
 """
 
 import contextlib
 import csv
-import functools
 import io
 import json
 import os
@@ -23,61 +22,38 @@ from hypogoal.core.locks import fresh_file
 
 T = TypeVar("T")
 MAX_TEXT_BYTES = 64 * 2**20
-END_BYTES = 8 * 2**20  # of a log, to follow it: some 80,000 lines
+END_BYTES = 8 * 2**20  # of a log that is followed: some 80,000 lines
 MOST_DEPTH = 32  # of JSON and TOML
-MOST_HOLE, HOLE_RATIO = 2**30, 1000  # a larger file that stores less than a thousandth of its bytes is no data
-# File systems on which the kernel makes up a file as it is read: its size is none, and some never end.
-KERNEL = frozenset([
-    "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "efivarfs", "fusectl", "mqueue", "nsfs", "proc",
-    "pstore", "rpc_pipefs", "securityfs", "selinuxfs", "sysfs", "tracefs",
-])  # fmt: skip
+MOST_HOLE, HOLE_RATIO = 2**30, 1000  # a larger file that stores less than a thousandth of its bytes is refused
 MAX_NAME_BYTES = 200
 MOST_DOTS = 256  # in a line of TOML
-MOST_INTEGER = (1 << 53) - 1  # other readers of JSON take numbers for floats of 64 bits
+MOST_INTEGER = (1 << 53) - 1  # many readers of JSON treat numbers as 64-bit floats
 FRESH = re.compile(r"\..+\.\d+\.new", re.DOTALL)  # the name of a file while :func:`replacing` writes it
-NO_FILE_NAME = '<>:"|?*'  # signs that Windows has in no file's name
-FORMULA = "=+-@＝＋－＠"  # signs with which a spreadsheet begins to compute, of full width too
+NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
+FORMULA = "=+-@＝＋－＠"  # a cell that begins with one is a formula to a spreadsheet; full-width ones too
 
 
 def require_file(path: Path, what: str, do: str) -> int:
-    """The size in bytes of a regular file; what is missing, or a folder, device or pipe, is a ``UserError``.
+    """The size in bytes of a regular file; a missing one, a folder, device or pipe is a ``UserError``.
 
-    ``what`` it is stands in the message with its verb ("the weights are"), ``do`` is what to do about it.
+    ``what`` begins the message, with its verb ("the weights are"); ``do`` is what to do.
     """
     try:
         state = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"{what} missing", path, do) from None
-    except (OSError, ValueError) as error:  # a name too long or with a zero, a folder that may not be entered
+    except (OSError, ValueError) as error:  # a name too long or with a null character, a folder without permission
         raise UserError(f"{what} not readable ({getattr(error, 'strerror', error)})", path, do) from None
-    if not is_regular(state):
+    if not stat.S_ISREG(state.st_mode):
         raise UserError(f"{what} not a regular file", path, do)
     return state.st_size
-
-
-def is_regular(state: os.stat_result) -> bool:
-    """Whether it is a file on a disk, of as many bytes as it says; one of the kernel's (``/proc``, ``/sys``) is not."""
-    return stat.S_ISREG(state.st_mode) and state.st_dev not in _kernel_devices()
-
-
-@functools.cache
-def _kernel_devices() -> frozenset[int]:
-    """The numbers of the file systems in ``KERNEL`` that are mounted; none where the system does not say."""
-    devices = set()
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="replace").splitlines():
-            place, _, kind = line.partition(" - ")
-            if kind.split(" ")[0] in KERNEL:
-                major, minor = place.split()[2].split(":")
-                devices.add(os.makedev(int(major), int(minor)))
-    return frozenset(devices)
 
 
 def open_file(path: Path, what: str, do: str) -> BufferedReader:
     """A regular file, or a link to one, opened for reading bytes; see :func:`require_file`.
 
-    What lies there may be exchanged for a pipe at any time: opening does not wait for its other end, and what was
-    opened is looked at once more.
+    The file may be replaced by a pipe at any time: opening does not wait for the pipe's other end, and the opened file
+    is checked again.
     """
     require_file(path, what, do)
     flags = [getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY", "O_NOINHERIT")]
@@ -85,17 +61,14 @@ def open_file(path: Path, what: str, do: str) -> BufferedReader:
         file = os.fdopen(os.open(path, os.O_RDONLY | sum(flags)), "rb")
     except OSError as error:
         raise UserError(f"{what} not readable ({error.strerror})", path, do) from None
-    if not is_regular(os.fstat(file.fileno())):
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise UserError(f"{what} not a regular file", path, do)
     return file
 
 
 def is_hole(file: BufferedReader) -> bool:
-    """Whether a file declares a thousand times what it stores, as its file system says, which says where holes are.
-
-    To read such a one from its beginning to its end would take for ever.
-    """
+    """Whether a sparse file declares over a thousand times the bytes it stores; reading it would never end."""
     state = os.fstat(file.fileno())
     stored = 512 * getattr(state, "st_blocks", state.st_size)
     if state.st_size <= max(MOST_HOLE, HOLE_RATIO * stored) or not hasattr(os, "SEEK_HOLE"):
@@ -106,8 +79,7 @@ def is_hole(file: BufferedReader) -> bool:
 
 
 def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> bytes:
-    """A regular file, as many bytes as it had when it was opened; of more than ``limit``, or not readable, a
-    ``UserError``."""
+    """The bytes of a regular file, up to its size when opened; over ``limit`` or unreadable, a ``UserError``."""
     with open_file(path, what, do) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
@@ -119,7 +91,7 @@ def read_bytes(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> b
 
 
 def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file, see :func:`read_bytes`, in UTF-8 (else a ``UserError``), its lines ended by a line feed."""
+    """The text of a file in UTF-8 (else a ``UserError``) with line feeds as line ends; see :func:`read_bytes`."""
     try:
         text = read_bytes(path, what, do, limit).decode()
     except UnicodeDecodeError:
@@ -128,7 +100,7 @@ def read_text(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> st
 
 
 def read_end(path: Path, limit: int = END_BYTES) -> list[str]:
-    """The last lines of a log that may still be written, ``limit`` bytes at most; none where it cannot be read."""
+    """The last lines of a log that may still be growing, at most ``limit`` bytes; none if it cannot be read."""
     try:
         with open_file(path, "the log is", "") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - limit - 1))
@@ -140,12 +112,12 @@ def read_end(path: Path, limit: int = END_BYTES) -> list[str]:
 
 
 def read_json(path: Path, what: str, do: str, limit: int = MAX_TEXT_BYTES) -> Any:
-    """What a JSON file holds; see :func:`read_text` and :func:`parse_json`."""
+    """The contents of a JSON file; see :func:`read_text` and :func:`parse_json`."""
     return parse_json(read_text(path, what, do, limit), path, what, do)
 
 
 def parse_json(text: str, where: object, what: str, do: str) -> Any:
-    """JSON as of :func:`_parsed` whose numbers are finite and texts can be written; else a ``UserError``."""
+    """JSON whose values are :func:`_bounded`, finite and valid UTF-8; else a ``UserError``."""
     try:
         value = _parsed(text)
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # half a surrogate pair, NaN, 1e999
@@ -155,7 +127,7 @@ def parse_json(text: str, where: object, what: str, do: str) -> Any:
 
 
 def json_lines(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """The objects in lines of a log; what is only half written yet, damaged or none is left out."""
+    """The objects in a log's lines; half-written, damaged and other lines are left out."""
     for line in lines:
         with contextlib.suppress(ValueError):
             if isinstance(value := _parsed(line), dict):
@@ -171,7 +143,7 @@ def _parsed(text: str) -> Any:
 
 
 def _bounded(value: T) -> T:
-    """A value of JSON or TOML: at most ``MOST_DEPTH`` deep, its integers exact in a float; else a ``ValueError``."""
+    """A value at most ``MOST_DEPTH`` deep whose integers are exact as floats; else a ``ValueError``."""
     level: list[Any] = [value]
     for _ in range(MOST_DEPTH):
         if any(isinstance(item, int) and abs(item) > MOST_INTEGER for item in level):
@@ -184,27 +156,27 @@ def _bounded(value: T) -> T:
 
 
 def parse_toml(text: str, where: object, what: str, do: str) -> dict[str, Any]:
-    """TOML, else a ``UserError``; so are keys in hundreds of parts (``a.a.a``), whose time is their number squared."""
+    """Valid TOML, else a ``UserError``; keys of hundreds of parts (``a.a.a``) take quadratic time and are refused."""
     try:
         for number, line in enumerate(text.split("\n"), 1):
             if line.count(".") > MOST_DOTS:
                 raise ValueError(f"more than {MOST_DOTS} dots in line {number}")
         table = tomllib.loads(text)
-        repr(table)  # hexadecimals of any length are read, and not printed
+        repr(table)  # raises for hexadecimals too long to print
         return _bounded(table)
     except (ValueError, RecursionError) as error:  # a number of 5,000 digits, brackets within each other
         raise UserError(f"{what} not valid TOML ({str(error)[:200]})", where, do) from None
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all: a reader finds what was there before, or ``text``."""
+    """Write a file atomically: a reader sees the old contents or ``text``."""
     with replacing(path) as fresh:
         fresh.write_text(text, encoding="utf-8")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write, called ``path`` when the block ends; gone when it raises, and left over when it is killed."""
+    """A temporary file, renamed to ``path`` when the block ends; removed if it raises, left over if it is killed."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     with fresh_file(fresh):
         yield fresh
@@ -212,16 +184,16 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def replace_file(fresh: Path, path: Path) -> None:
-    """Give a file its name when all of it is on the disk: a power failure leaves it, or what was there before."""
+    """Rename a file once it is on the disk: after a power failure ``path`` is the old file or the new one."""
     sync(fresh)
     fresh.replace(path)
     sync(path.parent)
 
 
 def sync(path: Path) -> None:
-    """Have what was written to a file, or to a folder's list of files, on the disk itself.
+    """Flush a file, or a folder's list of files, to the disk.
 
-    Windows opens no folders, and syncs only what was opened for writing.
+    Windows cannot open folders and syncs only files opened for writing.
     """
     if os.name == "nt" and path.is_dir():
         return
@@ -233,14 +205,14 @@ def sync(path: Path) -> None:
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """A CSV file with a header, whole or not at all; numbers stay numbers, no text is a formula to a spreadsheet."""
+    """Write a CSV file with a header atomically; numbers stay numbers, no text becomes a spreadsheet's formula."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(map(_harmless, row) for row in (columns, *rows))
     replace_text(path, text.getvalue())
 
 
 def _harmless(value: Any) -> Any:
-    """A cell: in a text an apostrophe in front of what would begin a formula, there or after another separator."""
+    """A cell; in a text, an apostrophe precedes what would begin a formula, also after another separator."""
     if not isinstance(value, str):
         return value
     try:
@@ -251,9 +223,9 @@ def _harmless(value: Any) -> Any:
 
 
 def path_part(name: object) -> TypeGuard[str]:
-    """Whether a text can be a part of a path and of a message: no separators, no control characters, no dot first.
+    """Whether a name can be part of a path and of a message: no separators, control characters or leading dot.
 
-    What a file says is in a folder must not be ``../../x``.
+    A name read from a file must not be ``../../x``.
     """
     return (
         isinstance(name, str)
@@ -266,22 +238,22 @@ def path_part(name: object) -> TypeGuard[str]:
 
 
 def plain_name(name: object) -> TypeGuard[str]:
-    """Whether a text can be the name of a sub-goal or the like: one rule, where names are written and where read.
+    """Whether a text can name a sub-goal or the like; the same rule for writing and reading.
 
-    Names become those of files, on every system, words of commands, cells of tables. Letters of any script are fine.
+    Names become file names on every system, words of commands and cells of tables. Letters of any script are fine.
     """
     return path_part(name) and not name.endswith(".") and name[0] not in FORMULA and not set(name) & set(NO_FILE_NAME)
 
 
 def plain_names(names: object) -> bool:
-    """Whether this is a list of plain names, two of which are not the same where upper and lower case are one."""
+    """Whether this is a list of plain names that differ even if case is ignored."""
     if not (isinstance(names, list | tuple) and names and all(map(plain_name, names))):
         return False
     return len({name.casefold() for name in names}) == len(names)
 
 
 def inside(folder: Path, name: object) -> Path | None:
-    """The file called ``name`` (``a/b.csv``) in ``folder``; None where it would lie outside, links followed."""
+    """The path of ``name`` (``a/b.csv``) in ``folder``; None if it would lie outside, links followed."""
     if not isinstance(name, str) or not name or not all(path_part(part) for part in name.split("/")):
         return None
     path = folder / PurePosixPath(name)
@@ -292,11 +264,11 @@ def lies_in(folder: Path, path: Path) -> bool:
     """Whether a path lies in a folder, links followed."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # links that lead in a circle
+    except (OSError, RuntimeError):  # circular links
         return False
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:
-    """The paths below a folder that fit a pattern, sorted, but for what is hidden, as drafts are."""
-    found = ((path, path.relative_to(folder).parts) for path in folder.rglob(pattern))
-    return sorted(path for path, parts in found if not any(part.startswith(".") for part in parts))
+    """The paths below a folder that match a pattern, sorted; hidden ones, such as drafts, are left out."""
+    candidates = ((path, path.relative_to(folder).parts) for path in folder.rglob(pattern))
+    return sorted(path for path, parts in candidates if not any(part.startswith(".") for part in parts))

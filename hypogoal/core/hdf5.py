@@ -1,7 +1,7 @@
-"""HDF5 files that others wrote: what a file declares is held against what it stores before anything is read (Spec G2).
+"""HDF5 files that others wrote: declared sizes are compared with stored ones before anything is read (Spec G2).
 
-HDF5 can point out of its file (external links, external storage, virtual datasets), load code (filters that are
-plugins) and declare terabytes in a kilobyte. None of it is needed here, and all of it is refused.
+HDF5 can point out of its file (external links, external storage, virtual datasets), load code (plugin filters) and
+declare terabytes in a kilobyte. None of this is needed, and all of it is refused.
 """
 
 import contextlib
@@ -19,23 +19,23 @@ from hypogoal.core.files import path_part, require_file
 from hypogoal.core.preflight import free_memory, human
 
 FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # all of them built into h5py
-MOST_RATIO = 1032  # bytes that one compressed byte can stand for, at most: deflate's limit, the highest of these
+MOST_RATIO = 1032  # bytes from one compressed byte: deflate's limit, the highest of these filters
 MAX_CHUNK_BYTES = 256 * 2**20
 MAX_ATTRIBUTE_BYTES = 8 * 2**20
-MAX_CHUNKS = 100_000  # of a dataset: HDF5 takes about 4 kB of memory for each, stored or not
-MAX_ENTRIES = 100_000  # of a group
+MAX_CHUNKS = 100_000  # per dataset: each takes about 4 kB of memory, stored or not
+MAX_ENTRIES = 100_000  # per group
 
 
 class Busy(UserError):
-    """A file that may be whole, and cannot be read now."""
+    """A file that may be whole but cannot be read now."""
 
 
 @contextlib.contextmanager
 def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
-    """An HDF5 file opened for reading, locked where the file system can.
+    """An HDF5 file opened for reading, locked if the file system can.
 
-    Missing, truncated or another file, or what is found ``Foreign`` in it, is a ``UserError``; open in another program
-    to write, or not to be read, ``Busy``.
+    A file that is missing, truncated, not HDF5, or in which something is ``Foreign`` is a ``UserError``; one that is
+    open for writing elsewhere or may not be read is ``Busy``.
     """
     import h5py
 
@@ -59,8 +59,8 @@ def open_hdf5(path: Path, what: str, do: str) -> Iterator[Any]:
 def create_hdf5(path: Path) -> Iterator[Any]:
     """A fresh HDF5 file to fill, built in memory and written when the block ends.
 
-    Where the disk is full the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished
-    bytes ourselves is an ``OSError`` like any other.
+    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished bytes
+    ourselves raises a normal ``OSError``.
     """
     import h5py
 
@@ -72,11 +72,11 @@ def create_hdf5(path: Path) -> Iterator[Any]:
 
 
 class Foreign(Exception):
-    """Something in an HDF5 file that is refused; the caller says where and what to do."""
+    """Refused contents of an HDF5 file; the caller adds where and what to do."""
 
 
 def fixed(text: str) -> NDArray[np.bytes_]:
-    """A text as HDF5 stores it in place, in fixed length (UTF-8): one of variable length lies in its global heap."""
+    """A text as a fixed-length UTF-8 string, stored in place; variable-length ones lie in HDF5's global heap."""
     import h5py
 
     data = text.encode()
@@ -84,15 +84,15 @@ def fixed(text: str) -> NDArray[np.bytes_]:
 
 
 def set_attribute(file: Any, name: str, value: str | int | float | bool) -> None:
-    """An attribute of the root; a text in fixed length."""
+    """Set an attribute of the root; a text as a fixed-length string."""
     stored = fixed(value) if isinstance(value, str) else np.asarray(value)
     file.attrs.create(name, stored, dtype=stored.dtype)
 
 
 def attribute(file: Any, name: str) -> Any:
-    """An attribute of the root: a text, an int, a float or a bool; None where there is none.
+    """An attribute of the root: a text, int, float, bool, or None if there is none.
 
-    Anything else (a text of variable length: HDF5 2.0 may read one from a damaged heap for ever) is ``Foreign``.
+    Anything else is ``Foreign``; reading a variable-length text from a damaged heap may never end (HDF5 2.0).
     """
     try:
         if name not in file.attrs:
@@ -110,10 +110,10 @@ def attribute(file: Any, name: str) -> Any:
 
 
 def members(group: Any) -> list[str]:
-    """The names in a group, sorted; ``Foreign`` where it is no group, has too many, or names that are no plain ones."""
+    """The names in a group, sorted; ``Foreign`` if it is not a group, has too many, or a name is not plain."""
     import h5py
 
-    if not isinstance(group, h5py.Group):  # the names in a dataset would be its values, of which there may be 2^62
+    if not isinstance(group, h5py.Group):  # iterating over a dataset would yield its values, perhaps 2^62
         raise Foreign("a dataset is where a group should be")
     try:
         count = len(group)
@@ -126,10 +126,7 @@ def members(group: Any) -> list[str]:
 
 
 def find(file: Any, name: str) -> Any:
-    """The group or dataset called ``name`` (``a/b``); None where it is missing.
-
-    ``Foreign`` where a soft or external link leads to it, or it is not readable.
-    """
+    """The group or dataset called ``name`` (``a/b``); None if missing, ``Foreign`` if unreadable or behind a link."""
     import h5py
 
     place = file
@@ -147,11 +144,11 @@ def find(file: Any, name: str) -> Any:
 
 
 def check_dataset(dataset: Any, kinds: str) -> int:
-    """The size in bytes that reading a dataset takes, found not to be more than its file can hold.
+    """The size in bytes of a dataset's values, checked against what the file can hold.
 
-    ``kinds`` are letters of NumPy's ``dtype.kind``; ``S`` for texts of fixed length. Another type (references and texts
-    of variable length among them), data outside the file, a filter that is a plugin, or more bytes declared than what
-    is stored can stand for is ``Foreign``.
+    ``kinds`` are letters of NumPy's ``dtype.kind``; ``S`` for fixed-length texts. Other types (such as references and
+    variable-length texts), data outside the file, plugin filters, and more declared bytes than the stored ones can
+    stand for are ``Foreign``.
     """
     import h5py
 
@@ -176,14 +173,14 @@ def check_dataset(dataset: Any, kinds: str) -> int:
         raise Foreign("a dataset is not readable") from None
     ratio = MOST_RATIO if settings.get_nfilters() else 1
     if stored > whole or size > ratio * stored or chunk > MAX_CHUNK_BYTES:
-        raise Foreign(f"{name!r} declares {human(size)}, of which {human(stored)} are stored in {human(whole)}")
-    if chunks > min(MAX_CHUNKS, max(stored, 1)):  # what is stored may be a lie
-        raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks, of which {human(stored)} are stored")
+        raise Foreign(f"{name!r} declares {human(size)} but stores {human(stored)} in a file of {human(whole)}")
+    if chunks > min(MAX_CHUNKS, max(stored, 1)):  # ``stored`` may be a lie
+        raise Foreign(f"{name!r} declares {human(size)} in {chunks} chunks but stores {human(stored)}")
     return size
 
 
 def size_of(file: Any, name: str, kinds: str) -> int:
-    """What :func:`check_dataset` says of the dataset called ``name``; ``Foreign`` where there is none."""
+    """The size of the dataset called ``name``, see :func:`check_dataset`; ``Foreign`` if there is none."""
     dataset = find(file, name)
     if dataset is None:
         raise Foreign(f"no readable {name!r}")
@@ -191,8 +188,7 @@ def size_of(file: Any, name: str, kinds: str) -> int:
 
 
 def read_array(file: Any, name: str, kinds: str, rows: slice | None = None) -> NDArray[Any]:
-    """A dataset's values, or ``rows`` of them, after :func:`check_dataset`; ``Foreign`` where it is damaged, or is
-    read whole and larger than free memory."""
+    """A dataset's values, or ``rows`` of them; ``Foreign`` if damaged, or read whole and larger than free memory."""
     size = size_of(file, name, kinds)
     free = free_memory()
     if rows is None and free is not None and size > free:
@@ -204,9 +200,9 @@ def read_array(file: Any, name: str, kinds: str, rows: slice | None = None) -> N
 
 
 def walk(group: Any, prefix: str = "", depth: int = 8, seen: set[int] | None = None) -> Iterator[str]:
-    """The names of all datasets below a group; ``Foreign``: links, unreadable parts, groups more than ``depth`` deep.
+    """The names of all datasets below a group; links, unreadable parts and over ``depth`` levels are ``Foreign``.
 
-    Of a dataset that has several names, of which there may be millions, only the first.
+    A dataset with several names (there may be millions) is listed once.
     """
     import h5py
 

@@ -1,4 +1,4 @@
-"""Locks that the kernel lets go of when their process ends, however it does; files that nobody holds are left over."""
+"""Kernel locks, which end with their process; temporary files that nobody locks are left over."""
 
 import contextlib
 import errno
@@ -18,9 +18,9 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # file systems that c
 
 
 def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
-    """Take the kernel's lock on a file, which whoever inherits the file holds too, until the last of them closes it.
+    """Take the kernel's lock on a file; processes that inherit the file share it until the last one closes it.
 
-    Whether it was free; None where the system cannot lock, and nobody is kept out.
+    Returns whether it was free; None if the system cannot lock, so that nobody is kept out.
     """
     if fcntl is None:
         return None if shared else _try_lock_byte(file)
@@ -36,7 +36,7 @@ def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
 
 
 def _try_lock_byte(file: IO[Any]) -> bool | None:
-    """On Windows: a byte far behind the text, so that others can read who has the lock."""
+    """On Windows: lock a byte far behind the text, so that others can read who has the lock."""
     try:
         import msvcrt
     except ImportError:
@@ -50,7 +50,7 @@ def _try_lock_byte(file: IO[Any]) -> bool | None:
 
 
 def is_there(file: IO[Any], path: Path) -> bool:
-    """Whether ``path`` still is the file that was opened: its owner removes it at the end."""
+    """Whether ``path`` is still the opened file; its owner removes it at the end."""
     with contextlib.suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     return False
@@ -58,9 +58,9 @@ def is_there(file: IO[Any], path: Path) -> bool:
 
 @contextlib.contextmanager
 def fresh_file(path: Path) -> Iterator[None]:
-    """An empty file, locked while the block writes it by its name; gone when the block leaves it there.
+    """An empty file, locked during the block; removed at its end if still there.
 
-    Windows renames no open files: there it is not locked.
+    Windows cannot rename open files: there it is not locked.
     """
     try:
         while True:
@@ -68,7 +68,7 @@ def fresh_file(path: Path) -> Iterator[None]:
                 if fcntl is None:
                     file.close()
                 elif try_lock(file) is False or not is_there(file, path):
-                    continue  # someone takes it for left over, and removes it
+                    continue  # another process took it for left over and removes it
                 yield
                 return
     finally:
@@ -76,7 +76,7 @@ def fresh_file(path: Path) -> Iterator[None]:
 
 
 def remove_left_over(path: Path) -> None:
-    """Remove a :func:`fresh_file` whose process has ended; where the system cannot lock, nobody knows, and it stays."""
+    """Remove a :func:`fresh_file` whose process has ended; on systems without locks it stays."""
     if fcntl is None or path.is_symlink() or not path.is_file():
         return
     with path.open("r+b") as file:

@@ -1,4 +1,4 @@
-"""What a ``manifest.json`` must look like before anything in it is believed (Spec A8, G2)."""
+"""Manifests: the schema of ``manifest.json`` and its checksum, checked before anything in it is used (Spec A8, G2)."""
 
 import hashlib
 import json
@@ -10,21 +10,20 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import parse_json, plain_name, plain_names, read_bytes
 from hypogoal.core.schemas import Schema, is_count, is_list, is_object, is_table, is_text, misfit
 
-FORMAT_VERSION, UNSEALED = 2, 1  # the latter had no checksum
+FORMAT_VERSION, UNSEALED = 2, 1  # format 1 had no checksum
 CHECKSUM = "sha256"
 MANIFEST = "manifest.json"
 MAX_MANIFEST_BYTES = 16 * 2**20
 AGAIN = "Make the artefact again."
-LOG, EPISODES, LAYOUT, OPTIONS = "metrics.jsonl", "episodes.csv", "layout.json", "options.safetensors"
-SCORES = "scores.jsonl"
+LOG, SCORES = "metrics.jsonl", "scores.jsonl"
 INPUT = ("path", "relative", "kind", "sha256")
-NUMBERS = "numbers.csv"  # which evaluations of format 1 have not
+NUMBERS_CSV = "numbers.csv"  # not in evaluations of format 1
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """The manifest in a file: every key that all artefacts have and the settings that other stages read are checked.
+    """The manifest in a file, with all common keys and the settings that other stages read checked.
 
-    Not JSON, malformed, of a newer format or changed since it was written, it is a ``UserError``.
+    One that is not JSON, malformed, of a newer format or changed since it was written is a ``UserError``.
     """
     data = read_bytes(path, "the manifest is", AGAIN, MAX_MANIFEST_BYTES)
     manifest = parse_json(data.decode(errors="surrogateescape"), path, "the manifest is", AGAIN)
@@ -41,9 +40,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 
 def sealed(manifest: Mapping[str, Any]) -> bytes:
-    """What a manifest's file holds: one text for each content, its last key the checksum of the text without that key.
+    """The bytes of a manifest's file; the last key is the checksum of the text without that key.
 
-    Against accidents, not against forgers: who writes another manifest can seal it, too.
+    It detects accidents, not forgers: whoever writes another manifest can seal it, too.
     """
     bare = {key: value for key, value in manifest.items() if key != CHECKSUM}
     return _text({**bare, CHECKSUM: hashlib.sha256(_text(bare)).hexdigest()})
@@ -54,7 +53,7 @@ def _text(manifest: Mapping[str, Any]) -> bytes:
 
 
 def check_writable(manifest: dict[str, Any], out: Path) -> None:
-    """Refuse (``UserError``), before anything is made, a manifest that :func:`read_manifest` could not read again."""
+    """Refuse (``UserError``), before any work, a manifest that :func:`read_manifest` would refuse."""
     do = "Choose another value, or a name in UTF-8."
     text = json.dumps(manifest)
     try:
@@ -76,7 +75,7 @@ def _size(value: Any) -> bool:
     return is_count(value) and 0 < value < 1 << 16
 
 
-# What must be in a manifest, and what settings that other stages read must look like where they are there.
+# WANTED must be in every manifest; SETTINGS, read by other stages, are checked if present.
 WANTED: Schema = {
     "kind": plain_name,
     "format": lambda value: type(value) is int,
@@ -98,26 +97,3 @@ SETTINGS: Schema = {
     **dict.fromkeys(("domain", "network", "setting", "agent", "termination", "chooser", "start"), is_text),
     **dict.fromkeys(("view", "localiser", "diversity", "encoder", "layouts"), is_text),
 }
-
-
-def files_of(kind: str, config: Mapping[str, Any]) -> set[str] | None:
-    """The files that an artefact must have by its kind and settings, besides its manifest; None of an unknown kind.
-
-    What it may have and its settings do not say (figures, videos, ``executions.csv``, ``exploits.csv``) only its
-    manifest knows.
-    """
-    if kind in ("options", "meta", "audit"):
-        played = {LOG, EPISODES, LAYOUT, OPTIONS, "choices.csv", "terminations.h5"}
-        played |= {"initiation.safetensors"} if config.get("initiation") == "learned" else set()
-        played |= {"visited.h5"} if config.get("save_visited") else set()
-        chooses = kind == "meta" and config.get("chooser") in ("ppo", "thompson", "exp3")
-        played |= {"audit.json", "exploits.csv"} if kind == "audit" else set()
-        return played | ({"meta.safetensors"} if chooses else set())
-    scored = {SCORES} if config.get("score_every") else set()
-    return {
-        "ensemble": {LOG, *scored, *(f"{sub_goal}.safetensors" for sub_goal in config.get("sub_goals", ()))},
-        "baseline": {LOG, EPISODES, LAYOUT, "policy.safetensors"},
-        "evaluation": {"metrics.json", NUMBERS, "arrays.h5"},
-        "report": {"index.html"},
-        "comparison": {"index.html", "metrics.json"},
-    }.get(kind)

@@ -1,13 +1,13 @@
-"""Code of the user's own, named as ``module:object``, and code that others installed, named by an entry point.
+"""User code, named ``module:object``, and installed code, named by an entry point.
 
-``module:object`` is code that will run. It is loaded where the user gave that name, not because a data file, a manifest
-or a preset, which may be a stranger's, has it in it: then the user allows it by the environment variable
-``HYPOGOAL_TRUST`` (several names with commas between). What is installed needs no permission.
+``module:object`` is code that will run. It is loaded if the user typed the name. If a data file, a manifest or a
+preset, perhaps a stranger's, has the name, the user must allow it with the environment variable ``HYPOGOAL_TRUST``
+(names separated by commas). Installed code needs no permission.
 
-Here alone is it decided whose word a name is. The command of a sweep's cell comes from a file, however it is spelt: the
-process that runs it is told so (:func:`environment_of_children`), and in it nothing is the user's but what is allowed.
+Only this module decides whether a name is the user's. The command of a sweep's cell comes from a file: its process is
+marked so (:func:`environment_of_children`), and there only allowed names are the user's.
 
-Whatever such code does, raises or gives back ends as one line that says where it is: :class:`UsersCode`.
+:class:`UsersCode` turns every error and wrong result of such code into one line that says where the code is.
 """
 
 import contextlib
@@ -19,7 +19,6 @@ import os
 import shlex
 import sys
 import sysconfig
-import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
@@ -32,21 +31,21 @@ from hypogoal.core.errors import Complete, NumericalError, UserError
 
 TRUST = "HYPOGOAL_TRUST"
 OF_FILE = "HYPOGOAL_COMMAND_OF_FILE"  # in the environment: this process runs a command that the user did not type
-MOST = 3.4028234663852886e38  # float32's: rewards are kept as such
-LONGEST = 200  # signs of what own code says that are quoted
+MAX_FLOAT32 = 3.4028234663852886e38  # rewards are stored as float32
+MOST_QUOTED = 200  # characters of a value or an error of user code
 _given: ContextVar[frozenset[str]] = ContextVar("_given", default=frozenset())
-_before: set[str] = set()  # all that were ever given in this process
+_before: set[str] = set()  # all names ever given in this process
 _own: set[str] = set()  # top-level modules that were loaded by name and are not hypogoal's
 
 
 def given(*names: str) -> contextlib.AbstractContextManager[None]:
-    """Within the block ``module:object`` among these names may be loaded: the user's own words, if no file's."""
+    """Within the block these ``module:object`` may be loaded: the user typed them, unless a file did."""
     return vouched(*([] if os.environ.get(OF_FILE) else names))
 
 
 @contextlib.contextmanager
 def vouched(*names: str) -> Iterator[None]:
-    """Within the block these names may be loaded: code that runs already says them, such as a domain its network."""
+    """Within the block these names may be loaded: code that runs already names them, as a domain names its network."""
     token = _given.set(_given.get() | set(names))
     _before.update(names)
     try:
@@ -56,34 +55,34 @@ def vouched(*names: str) -> Iterator[None]:
 
 
 def allowed() -> frozenset[str]:
-    """The ``module:object`` that may be loaded here: what the user gave, and what ``HYPOGOAL_TRUST`` names."""
+    """The ``module:object`` that may be loaded now: typed by the user or in ``HYPOGOAL_TRUST``."""
     return frozenset(name.strip() for name in (*_given.get(), *in_environment()) if ":" in name)
 
 
 def allowed_before() -> frozenset[str]:
-    """The ``module:object`` that the user allowed at some time in this process."""
+    """Every ``module:object`` that the user has allowed in this process."""
     return frozenset({*_before, *in_environment()})
 
 
 def in_environment() -> list[str]:
-    """What ``HYPOGOAL_TRUST`` names."""
+    """The names in ``HYPOGOAL_TRUST``."""
     return [name for text in os.environ.get(TRUST, "").split(",") if ":" in (name := text.strip())]
 
 
 def permission(names: Iterable[str]) -> str:
-    """``HYPOGOAL_TRUST`` as one sets it in a shell to allow these names."""
+    """``HYPOGOAL_TRUST=...`` as typed in a shell to allow these names."""
     return f"{TRUST}={shlex.quote(','.join(dict.fromkeys(names)))}"
 
 
 def environment_of_children() -> dict[str, str]:
-    """For a process whose command is a file's: what is allowed here is allowed there, whatever its own words are."""
+    """For a process that runs a file's command: it may load what is allowed here and nothing else."""
     return {TRUST: ",".join(sorted(allowed())), OF_FILE: "1"}
 
 
 def require_trust(name: str, what: str) -> None:
-    """Refuse (``UserError``) to load ``module:object`` that the user neither gave nor allowed; other names pass.
+    """Refuse (``UserError``) to load ``module:object`` that the user neither typed nor allowed; other names pass.
 
-    ``what`` it is to be ("domain") stands in the message.
+    ``what`` it is used as ("domain") is for the message.
     """
     if ":" in name and name not in allowed():
         do = f"Do you trust it? Set {permission([name, *in_environment()])}"
@@ -91,11 +90,11 @@ def require_trust(name: str, what: str) -> None:
 
 
 def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> Any:
-    """What ``name`` stands for: one of ``built_in``, an installed entry point of ``group``, or ``module:object``.
+    """The object called ``name``: one of ``built_in``, an installed entry point of ``group``, or ``module:object``.
 
-    Modules of the current folder can be loaded too, whichever way hypogoal was started; installed ones come first. No
-    such name, one that cannot be loaded, or code that the user did not allow is a ``UserError``; ``what`` it is
-    ("domain") stands in the message.
+    Modules in the current folder can be loaded too, however hypogoal was started; installed ones come first. An unknown
+    name, one that cannot be loaded, and code that the user did not allow are a ``UserError``; ``what`` it is ("domain")
+    is for the message.
     """
     entries = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     target = built_in.get(name) or entries.get(name)
@@ -105,109 +104,84 @@ def load_own(name: str, what: str, group: str, built_in: Mapping[str, str]) -> A
             sys.path.append(os.getcwd())
         target = name
     if target is None:
-        known = ", ".join(sorted({*built_in, *entries}))
-        raise UserError(f"unknown {what}", name, f"Choose one of {known}, or give module:object.")
+        names = ", ".join(sorted({*built_in, *entries}))
+        raise UserError(f"unknown {what}", name, f"Choose one of {names}, or give module:object.")
     module, _, attribute = target.partition(":")
     if name not in built_in and not target.startswith("hypogoal."):
         _own.add(module.partition(".")[0])
     with UsersCode(f"the {what}", name, failed="cannot be loaded:"):
-        found = importlib.import_module(module)
-        return getattr(found, attribute) if attribute else found
-
-
-class _Running(threading.local):
-    blocks = 0  # of UsersCode that this thread is in
-
-
-_running = _Running()
-_exit = os._exit
-
-
-def _stay(status: int) -> NoReturn:
-    """``os._exit``, which as a call of own code would end a stage without a word and, with 0, as a success.
-
-    Nothing can be told after it, so it is replaced while own code may call it; multiprocessing, our own workers and a
-    child that own code forked end by the real one. C code that ends the process is beyond this.
-    """
-    if _running.blocks or _module(sys._getframe(1)) in _own:
-        raise SystemExit(status)
-    _exit(status)
-
-
-os._exit = _stay
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=lambda: setattr(os, "_exit", _exit))
+        loaded = importlib.import_module(module)
+        return getattr(loaded, attribute) if attribute else loaded
 
 
 class UsersCode:
-    """A block in which own code runs, and the one place where what it gives back becomes what hypogoal needs.
+    """A block in which user code runs; its methods check the values that the code returns.
 
-    Whatever it raises (``SystemExit`` too, but not Ctrl-C) and whatever it gives that is not as promised is told as one
-    line with its place, as the user's to mend. The block is around every step of an environment: keep it cheap.
+    Every exception (``SystemExit`` too, but not Ctrl-C) and every wrong value becomes a ``UserError`` of one line with
+    the code's place. The block is around every step of an environment: keep it cheap.
 
-    ``what`` says whose code it is ("the label function of won"), ``of`` is the function, or the object that has
-    ``method``, or a text, what the user calls it; ``failed`` stands between ``what`` and the exception.
+    ``title`` names the code ("the label function of won"); ``target`` is the function, or the object that has
+    ``method``, or a text, the user's name for it. ``failed`` is the verb between ``title`` and the exception.
     """
 
-    __slots__ = ("failed", "method", "of", "what")
+    __slots__ = ("failed", "method", "target", "title")
 
-    def __init__(self, what: str, of: object = None, method: str = "", *, failed: str = "raised"):
-        self.what, self.of, self.method, self.failed = what, of, method, failed
+    def __init__(self, title: str, target: object = None, method: str = "", *, failed: str = "raised"):
+        self.title, self.target, self.method, self.failed = title, target, method, failed
 
     def __enter__(self) -> Self:
-        _running.blocks += 1
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        _running.blocks -= 1
         if error is None or isinstance(error, KeyboardInterrupt):
             return
-        if not isinstance(error, UserError) or isinstance(error, Complete):  # which would say that all is well
-            raise self._told(error) from error
+        if not isinstance(error, UserError) or isinstance(error, Complete):  # which would exit with 0
+            raise self.error_for(error) from error
 
-    def _told(self, error: BaseException) -> UserError:
+    def error_for(self, error: BaseException) -> UserError:
+        """An exception of the code as a ``UserError`` with its place."""
         do = "Mend it; --debug shows how it was called."
-        if isinstance(self.of, str):
+        if isinstance(self.target, str):
             do = "Check the module and the object; --debug shows where."
         text = f"{type(error).__name__}: {_quoted(str, error)}"
         if isinstance(error, SystemExit):
             text, do = f"{_quoted(repr, error)}, to end the program", "Have it raise an error that says what is wrong."
         frames = traceback.extract_tb(error.__traceback__)
         theirs = [frame for frame in frames if not frame.filename.startswith(_libraries())]
-        if inspect.isclass(self.of) and not any(self._in_it(frame) for frame in theirs):
-            theirs = []  # it raised in what called it, since it cannot be called so, or gave what it should not
+        if inspect.isclass(self.target) and not any(self._in_it(frame) for frame in theirs):
+            theirs = []  # the caller raised: the class cannot be called so, or returned a wrong value
         place = _place(theirs[-1].filename, theirs[-1].lineno) if theirs else ""
-        if isinstance(self.of, str):
-            place = f"{self.of} ({place})" if place else self.of
-        return UserError(f"{self.what} {self.failed} {text}", place or self._place() or None, do)
+        if isinstance(self.target, str):
+            place = f"{self.target} ({place})" if place else self.target
+        return UserError(f"{self.title} {self.failed} {text}", place or self._place() or None, do)
 
     def refuse(self, gave: str, do: str) -> NoReturn:
-        """Tell (``UserError``) that what it gave is not what it promised to, with the place where the code begins."""
-        raise UserError(f"{self.what} {gave}", self._place() or None, do)
+        """Raise a ``UserError``: the code ``gave`` a wrong value; with the place where the code begins."""
+        raise UserError(f"{self.title} {gave}", self._place() or None, do)
 
     def _place(self) -> str:
-        """Where the code begins; of an environment the user's own layers, the outermost first, else the innermost."""
-        spans = [span for layer in layers(self.of) if (span := self._span(layer))]
+        """Where the code begins; for an environment the user's layers, the outermost first, else the innermost."""
+        spans = [span for layer in layers(self.target) if (span := self._span(layer))]
         theirs = [span for span in spans if not span[0].startswith(_libraries())]
         return ", around ".join(dict.fromkeys(_place(*span[:2]) for span in theirs or spans[-1:]))
 
-    def _span(self, of: Any) -> tuple[str, int, int] | None:
-        """File, first line and number of lines of the method, function or class; None where Python does not know."""
+    def _span(self, target: Any) -> tuple[str, int, int] | None:
+        """File, first line and number of lines of the method, function or class; None if Python does not know."""
         try:
-            of = inspect.unwrap(getattr(of, self.method) if self.method else getattr(of, "func", of))
-            of = of if inspect.isroutine(of) or inspect.isclass(of) else type(of)
-            source, first = inspect.getsourcelines(of)
-            return inspect.getsourcefile(of) or "", first, len(source)
-        except Exception:  # noqa: BLE001 - whatever own objects do when they are asked
+            target = inspect.unwrap(getattr(target, self.method) if self.method else getattr(target, "func", target))
+            target = target if inspect.isroutine(target) or inspect.isclass(target) else type(target)
+            source, first = inspect.getsourcelines(target)
+            return inspect.getsourcefile(target) or "", first, len(source)
+        except Exception:  # noqa: BLE001 - user objects may raise anything
             return None
 
     def _in_it(self, frame: traceback.FrameSummary) -> bool:
         """Whether a frame is one of the method, function or class."""
-        file, first, count = self._span(self.of) or ("", 0, 0)
+        file, first, count = self._span(self.target) or ("", 0, 0)
         return frame.filename == file and first <= (frame.lineno or 0) < first + count
 
     def truth(self, value: Any, name: str) -> bool:
-        """A truth value, or a number that is 0 or 1, of Python's or of any array library's."""
+        """A truth value, or 0 or 1, from Python or any array library."""
         if value is True or value is False:
             return value
         plain = _plain(value)
@@ -216,9 +190,9 @@ class UsersCode:
         return bool(plain)
 
     def number(self, value: Any, name: str) -> float:
-        """A finite number that float32 holds, of Python's or of any array library's."""
+        """A finite number within float32's range, from Python or any array library."""
         plain = value if type(value) is float else _plain(value)
-        if not isinstance(plain, float | int) or not -MOST <= plain <= MOST:
+        if not isinstance(plain, float | int) or not -MAX_FLOAT32 <= plain <= MAX_FLOAT32:
             self.refuse(f"gave {name} {_quoted(repr, value)}", "Give a finite number.")
         return float(plain)
 
@@ -231,18 +205,18 @@ class UsersCode:
 
 
 def users_own(error: BaseException) -> UserError | None:
-    """An error that came from or through own code outside all blocks, told as the user's; None where it did not."""
+    """An error raised in or through user code outside all blocks, as a ``UserError``; None for other errors."""
     if isinstance(error, UserError | NumericalError):
         return None
     passed = [_module(frame) for frame, _ in traceback.walk_tb(error.__traceback__)]
-    own = next((module for module in passed if module in _own), None)
-    return UsersCode(f"own code of {own}")._told(error) if own else None
+    culprit = next((module for module in passed if module in _own), None)
+    return UsersCode(f"user code in {culprit}").error_for(error) if culprit else None
 
 
 def as_number(value: Any) -> int | None:
-    """An integer of Python's or of any array library's; None where it is something else, a truth value among it.
+    """An integer from Python or any array library; None for anything else, also for a truth value.
 
-    An array of one integer is that integer: agents of one environment give such.
+    An array of one integer counts: agents of one environment return such.
     """
     if getattr(value, "size", None) == 1:
         value = value.item()
@@ -255,21 +229,21 @@ def as_number(value: Any) -> int | None:
 
 
 def _plain(value: Any) -> Any:
-    """Python's number of a scalar of any array library's; anything else as it is."""
+    """A scalar of any array library as Python's number; anything else unchanged."""
     return value.item() if getattr(value, "shape", None) == () else value
 
 
-def layers(of: Any) -> list[Any]:
-    """An environment's wrappers and itself, the outermost first; anything else alone."""
-    found = [of]
-    while hasattr(type(of), "unwrapped") and (of := getattr(of, "__dict__", {}).get("env")) is not None:
-        found.append(of)
-    return found
+def layers(env: Any) -> list[Any]:
+    """An environment's wrappers and itself, the outermost first; for any other object a list of it alone."""
+    wrappers = [env]
+    while hasattr(type(env), "unwrapped") and (env := getattr(env, "__dict__", {}).get("env")) is not None:
+        wrappers.append(env)
+    return wrappers
 
 
 @functools.cache
 def _libraries() -> tuple[str, ...]:
-    """What the names of files begin with that are nobody's own code: Python's, installed packages' and ours."""
+    """Prefixes of the files that are not user code: Python's, installed packages' and hypogoal's."""
     folders = (*(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")), Path(__file__).parents[1])
     return (*(f"{folder}{os.sep}" for folder in folders), "<")
 
@@ -283,9 +257,9 @@ def _place(file: str, line: int | None) -> str:
 
 
 def _quoted(how: Callable[[object], str], value: object) -> str:
-    """What a value or an error of own code says of itself, which may be long, or may fail as well."""
+    """The text of a value or an error of user code, shortened; its type's name if the text itself raises."""
     try:
         text = " ".join(how(value).split())
     except Exception:  # noqa: BLE001 - see above
         text = f"a {type(value).__name__}"
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return text if len(text) <= MOST_QUOTED else f"{text[:MOST_QUOTED]}..."

@@ -14,9 +14,9 @@ from typing import Any, Self
 
 from hypogoal.core.terminal import printable, say, screen
 
-FIRST_SECONDS, PLAIN_INTERVAL_SECONDS = 2.0, 10.0  # until the first line says how long it will take, and the next
+FIRST_SECONDS, PLAIN_INTERVAL_SECONDS = 2.0, 10.0  # until the first line, and between lines
 LOOK_SECONDS = 1.0
-UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86400.0}  # of time, and their seconds
+UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86400.0}  # seconds of each unit
 
 
 class Progress:
@@ -54,7 +54,7 @@ class Progress:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Within the block something else is printed: no bar is in its way."""
+        """Hide the bar within the block, in which something else is printed."""
         if self._bar is not None:
             self._bar.stop()
         yield
@@ -62,7 +62,7 @@ class Progress:
             self._bar.start()
 
     def expect(self, total: int) -> None:
-        """How many units there will be, where that is known only now."""
+        """Set the total number of units, if it becomes known only now."""
         self.total = total
         if self._bar is not None:
             self._bar.update(self._task, total=total)
@@ -74,11 +74,11 @@ class Progress:
         self.update(done)
 
     def advance(self, n: int = 1, **numbers: float) -> None:
-        """``n`` more units are done; ``numbers`` are shown beside the bar, but for NaN: not known yet."""
+        """``n`` more units are done; ``numbers`` are shown beside the bar, except NaN (not known yet)."""
         self.update(self.done + n, **numbers)
 
     def update(self, done: int, **numbers: float) -> None:
-        """``done`` units are done in all."""
+        """``done`` units are done in total."""
         self.done = done
         if self.quiet:
             return
@@ -86,13 +86,13 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, completed=done, numbers=text)
         elif done < self.total:
-            first = done > self._before and not self._said  # it says how long all will take
+            first = done > self._before and not self._said  # the first line estimates the time left
             if time.monotonic() - self._last >= (FIRST_SECONDS if first else PLAIN_INTERVAL_SECONDS):
                 self._line(text)
 
     @contextmanager
     def following(self, count: Callable[[], int]) -> Iterator[None]:
-        """Within the block ``count`` is asked each second how much is done: by other processes, whose logs it reads."""
+        """Within the block call ``count`` each second for the units done by other processes."""
         over = threading.Event()
 
         def look() -> None:
@@ -118,12 +118,12 @@ class Progress:
         rate = max(self.done - self._before, 0) / seconds
         speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each" if rate else ""
         left = self.total - self.done
-        known = f" ({speed}, {duration(left / rate)} left)" if rate and left > 0 else ""
-        say(f"{self.title}: {self.done}/{self.total}{known}{f', {text}' if text else ''}", err=True)
+        estimate = f" ({speed}, {duration(left / rate)} left)" if rate and left > 0 else ""
+        say(f"{self.title}: {self.done}/{self.total}{estimate}{f', {text}' if text else ''}", err=True)
 
 
 def duration(seconds: float) -> str:
-    """As a person says it: 12 min, 3.4 h."""
+    """Seconds in readable units: 12 min, 3.4 h."""
     if seconds < 90:
         return f"{max(1, round(seconds))} s"
     if seconds < 90 * 60:
@@ -132,13 +132,13 @@ def duration(seconds: float) -> str:
 
 
 def said_left(text: str) -> float | None:
-    """Seconds that a line of :class:`Progress` says are left; None where it says none."""
-    found = re.search(rf", ([0-9]{{1,9}}(?:\.[0-9]+)?) ({'|'.join(UNITS)}) left\)", text)
-    return float(found[1]) * UNITS[found[2]] if found else None
+    """The seconds left according to a line of :class:`Progress`; None if it does not say."""
+    match = re.search(rf", ([0-9]{{1,9}}(?:\.[0-9]+)?) ({'|'.join(UNITS)}) left\)", text)
+    return float(match[1]) * UNITS[match[2]] if match else None
 
 
 class MetricsLog:
-    """``metrics.jsonl``: one JSON object a line; no open file is left behind by whatever ends a stage."""
+    """``metrics.jsonl``: one JSON object per line; the file is not kept open."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -150,13 +150,13 @@ class MetricsLog:
             file.write(json.dumps(numbers) + "\n")
 
     def snapshot(self) -> int:
-        """How long the file is, in bytes, all of them on the disk."""
+        """Flush the file to disk and return its length in bytes."""
         with self._path.open("a") as file:
             os.fsync(file.fileno())
             return os.fstat(file.fileno()).st_size
 
     def restore(self, snapshot: int) -> None:
-        """Forget what was written after the ``snapshot``; 0, all of it."""
+        """Truncate the file to the length of a ``snapshot``."""
         if not 0 <= snapshot <= self._path.stat().st_size:
             raise ValueError(f"the log has fewer bytes than {snapshot}")
         os.truncate(self._path, snapshot)

@@ -1,4 +1,4 @@
-"""Randomness is passed in: every consumer gets its own stream, named after what it is for."""
+"""Randomness is passed in: every consumer gets its own stream, named after its purpose."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def torch_generator(seed: int, *names: str | int) -> torch.Generator:
 
 
 def global_state(device: torch.device) -> list[torch.Tensor]:
-    """Where torch's global generators are, the CPU's and a CUDA ``device``'s, for what cannot be passed another."""
+    """The states of torch's global generators (CPU and a CUDA ``device``), for code that cannot be passed another."""
     import torch
 
     return [torch.get_rng_state(), *([torch.cuda.get_rng_state(device)] if device.type == "cuda" else [])]
 
 
 def restore_global(state: Sequence[torch.Tensor], device: torch.device) -> None:
-    """Undo what was drawn since :func:`global_state`."""
+    """Restore torch's global generators to a :func:`global_state`."""
     import torch
 
     torch.set_rng_state(state[0])

@@ -1,4 +1,4 @@
-"""What a signal that ends the process does: it raises ``KeyboardInterrupt`` wherever Python happens to be (Spec G1)."""
+"""Signals that end the process raise ``KeyboardInterrupt`` wherever Python happens to be (Spec G1)."""
 
 import _thread
 import math
@@ -10,13 +10,13 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
-TOGETHER = 0.5  # seconds within which signals are one: a second would interrupt the cleaning up after the first
+TOGETHER = 0.5  # seconds within which signals count as one: a second one would interrupt the clean-up
 
 _raised_at = -math.inf
 
 
 def stop(signum: int, _frame: FrameType | None) -> None:
-    """A signal's handler; what it raises has the signal's number as its argument."""
+    """The signals' handler; the ``KeyboardInterrupt`` has the signal's number as its argument."""
     global _raised_at
     now = time.monotonic()
     if now - _raised_at > TOGETHER:
@@ -24,15 +24,15 @@ def stop(signum: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt(signum)
 
 
-def unraised(what: Any) -> None:
-    """As ``sys.unraisablehook``: a signal that came while an object was torn down comes again.
+def unraised(unraisable: Any) -> None:
+    """For ``sys.unraisablehook``: repeat a signal that came while an object was torn down.
 
-    Python would drop it with a traceback.
+    Python would drop it and print a traceback.
     """
-    if isinstance(what.exc_value, KeyboardInterrupt):
-        _thread.start_new_thread(_again, what.exc_value.args or (signal.SIGINT,))
+    if isinstance(unraisable.exc_value, KeyboardInterrupt):
+        _thread.start_new_thread(_again, unraisable.exc_value.args or (signal.SIGINT,))
     else:
-        sys.__unraisablehook__(what)
+        sys.__unraisablehook__(unraisable)
 
 
 def _again(signum: int) -> None:

@@ -1,7 +1,7 @@
-"""What lies around configures nothing: libraries load the same in whichever folder and home a command is started.
+"""Isolation from the current folder and home: libraries load the same wherever a command is started.
 
-matplotlib obeys a ``matplotlibrc`` in the current folder, which may have it start LaTeX; OpenCV puts the current folder
-on the path where the system looks for the libraries of child processes, whose code would run.
+matplotlib obeys a ``matplotlibrc`` in the current folder, which may make it start LaTeX; OpenCV puts the current folder
+on the path where the system looks for libraries of child processes, so that code there would run.
 """
 
 import contextlib
@@ -17,15 +17,15 @@ Context = Callable[[ModuleType], contextlib.AbstractContextManager[object]]
 
 
 class Around:
-    """A finder, for ``sys.meta_path``, that has a module load within a context, whoever imports it first."""
+    """A finder for ``sys.meta_path``: a module is loaded within a context, whoever imports it first."""
 
-    asking = False  # the other finders
+    asking = False  # whether the other finders are being asked
 
     def __init__(self, name: str, context: Context):
         self.name, self.context = name, context
 
     def find_spec(self, name: str, *_: object) -> Any:
-        """The module's spec; None for every other module."""
+        """The module's spec; None for any other module."""
         if name != self.name or self.asking:
             return None
         self.asking = True
@@ -45,9 +45,9 @@ class Around:
 
 
 def shield() -> None:
-    """In a process of our own, before it loads libraries: have them load as if nothing were around.
+    """Isolate a process of hypogoal, before it loads libraries.
 
-    Not where hypogoal is a library: there matplotlib is also the user's, with the user's settings.
+    Not for hypogoal as a library: there matplotlib is also the user's, with the user's settings.
     """
     _drop_current_folder()
     if not any(isinstance(finder, Around) and finder.name == "matplotlib" for finder in sys.meta_path):
@@ -56,7 +56,7 @@ def shield() -> None:
 
 @contextlib.contextmanager
 def environment(**values: str) -> Iterator[None]:
-    """Within the block the environment has these values."""
+    """Set environment variables within the block."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -69,7 +69,7 @@ def environment(**values: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _plain_matplotlib(module: ModuleType) -> Iterator[None]:
-    """It looks for settings in the current folder first, so it loads in its own, and for styles beside them."""
+    """Load matplotlib in its own folder, since it looks for settings and styles in the current one first."""
     folder = os.path.dirname(str(module.__file__))
     with contextlib.chdir(folder), environment(MATPLOTLIBRC=os.devnull, MPLBACKEND="agg"):
         yield
@@ -78,12 +78,12 @@ def _plain_matplotlib(module: ModuleType) -> Iterator[None]:
 
 @contextlib.contextmanager
 def plain_opencv(_module: ModuleType) -> Iterator[None]:
-    """What it adds to the path of libraries ends with an empty part."""
+    """Undo the empty part that OpenCV adds to the path of libraries."""
     yield
     _drop_current_folder()
 
 
 def _drop_current_folder() -> None:
-    """An empty part of the path of libraries is the current folder to the system."""
+    """Remove empty parts of the path of libraries: they mean the current folder."""
     if parts := [part for part in os.environ.pop(LIBRARIES, "").split(":") if part]:
         os.environ[LIBRARIES] = ":".join(parts)

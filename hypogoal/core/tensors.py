@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, TypeVar
 
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.files import open_file
+from hypogoal.core.manifests import AGAIN as AGAIN
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
     M = TypeVar("M", bound=nn.Module)
 
-AGAIN = "Make the artefact again."
 KEPT = frozenset(f"torch.{name}" for name in ("float32", "float64", "int64", "int32", "uint8", "bool"))
-MAX_HEADER_BYTES = 16 * 2**20  # names and shapes: 100 bytes a tensor
+MAX_HEADER_BYTES = 16 * 2**20  # names and shapes take 100 bytes a tensor
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write tensors by name; a ``NumericalError``, and nothing is written, where a number is NaN or Inf (Spec G3).
+    """Write tensors by name. NaN or Inf is a ``NumericalError`` and nothing is written (Spec G3).
 
-    One of another type than ``KEPT`` is a ``UserError``.
+    Types other than ``KEPT`` are a ``UserError``.
     """
     import torch
     from safetensors.torch import save
@@ -36,9 +36,9 @@ def save_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
 
 
 def load_tensors(path: Path, only: str | None = None) -> dict[str, Tensor]:
-    """Read tensors by name, or ``only`` one of them: as many bytes as the file has, whatever its header declares.
+    """Read tensors by name, or ``only`` one; never more bytes than the file has, whatever its header declares.
 
-    Missing, truncated, not safetensors, of another type than ``KEPT``, NaN or Inf is a ``UserError``.
+    A file that is missing, truncated or not safetensors, types other than ``KEPT``, NaN and Inf are a ``UserError``.
     """
     import torch
     from safetensors import SafetensorError, safe_open
@@ -61,40 +61,40 @@ def load_tensors(path: Path, only: str | None = None) -> dict[str, Tensor]:
 
 
 def check_types(tensors: Mapping[str, Tensor], where: object, do: str) -> None:
-    """Refuse (``UserError``) tensors of another type than ``KEPT``: not all can be computed with, or compared."""
+    """Refuse (``UserError``) types other than ``KEPT``: not all of them can be computed with or compared."""
     for name, tensor in tensors.items():
         if str(tensor.dtype) not in KEPT:
             raise UserError(f"weights of type {tensor.dtype} are not kept (at {name})", where, do)
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose names begin with a prefix, by what follows it."""
+    """The tensors whose names begin with a prefix, by the rest of the name."""
     return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def check_fit(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], where: object, do: str) -> None:
-    """Refuse (``UserError``) weights that are not those of a network, by name, shape and kind of number."""
-    for name in sorted({*wanted, *given}):
-        one, other = wanted.get(name), given.get(name)
-        if one is None or other is None or one.shape != other.shape or one.dtype != other.dtype:
+def check_fit(expected: Mapping[str, Tensor], weights: Mapping[str, Tensor], where: object, do: str) -> None:
+    """Refuse (``UserError``) weights that differ from a network's in name, shape or dtype."""
+    for name in sorted({*expected, *weights}):
+        target, source = expected.get(name), weights.get(name)
+        if target is None or source is None or target.shape != source.shape or target.dtype != source.dtype:
             raise UserError(f"the weights do not fit the network (at {name})", where, do)
 
 
-def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object, *, own: bool = False) -> M:
-    """The module that ``make`` makes, with these weights; nothing is allocated before they are known to fit, unless
-    the user's ``own`` code makes it, which may need numbers.
+def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: object, *, custom: bool = False) -> M:
+    """The module built by ``make``, with these weights; a ``UserError`` if they do not fit it or it cannot be built.
 
-    Where they do not, or none can be made as the manifest says, it is a ``UserError``.
+    Nothing is allocated before the weights are known to fit, unless the network is ``custom``, the user's code, which
+    may need real numbers.
     """
     import torch
 
     try:
-        # Shapes without numbers: what a manifest asks for may be a thousand times too large.
-        with torch.device("cpu" if own else "meta"):
+        # Shapes without numbers: a manifest may ask for a network a thousand times too large.
+        with torch.device("cpu" if custom else "meta"):
             module = make()
     except (RuntimeError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         raise UserError("the weights do not fit the manifest", where, AGAIN) from None
     check_fit(module.state_dict(), weights, where, AGAIN)
-    module = module if own else make()
+    module = module if custom else make()
     module.load_state_dict(weights)
     return module

@@ -1,7 +1,7 @@
-"""What is printed: for people, who must see a stranger's text and not have their terminal obey it, and for programs.
+"""Printing: for people, whose terminals must not obey a stranger's text, and for programs.
 
-Whoever closed a stream wants nothing of it. An error of standard error ends nothing, a day of training least of all;
-one of standard output is told as what it is, since what was to be done is done by then.
+A closed stream is ignored. A failing standard error never ends a stage; a failing standard output raises
+:class:`Unprinted`, since the work is complete by then.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 class Unprinted(OSError):
-    """Standard output does not take what is printed: a full disk behind it, not below an output."""
+    """Standard output cannot be written, for example to a full disk; the stage's output is complete."""
 
 
 def printable(text: str) -> str:
-    """A line that may quote a stranger's file: no sign in it moves the cursor, hides, turns or colours anything."""
+    """A line that may quote a stranger's file, without control, invisible and bidirectional characters."""
     return "".join(sign if sign.isprintable() or unicodedata.category(sign) == "Zs" else "?" for sign in text)
 
 
@@ -32,7 +32,7 @@ def say(text: object, *, err: bool = False) -> None:
 
 
 def give(text: object, *, err: bool = False) -> None:
-    """What programs read, as it is: JSON, or the path of an output, of which they can make use only if it is exact."""
+    """Print text for programs exactly as it is: JSON or the path of an output."""
     stream = sys.stderr if err else sys.stdout
     try:
         if stream is not None:
@@ -44,7 +44,7 @@ def give(text: object, *, err: bool = False) -> None:
 
 
 def draw(table: Any, width: int) -> None:
-    """A table on standard output, as wide as the terminal, or ``width`` where there is none."""
+    """Print a table on standard output, as wide as the terminal, or ``width`` if there is none."""
     try:
         screen(width=None if sys.stdout.isatty() else width).print(table)
     except OSError as error:
@@ -53,14 +53,14 @@ def draw(table: Any, width: int) -> None:
 
 
 def drawn(table: Any, width: int) -> str:
-    """A table as plain text, the same wherever it is made."""
+    """A table as plain text, the same on every machine."""
     console = screen(width=width, record=True, file=io.StringIO())
     console.print(table)
     return console.export_text().rstrip("\n")
 
 
 def screen(*, err: bool = False, width: int | None = None, **more: Any) -> Console:
-    """Where tables and bars are drawn; brackets in a text are brackets, and it is made :func:`printable`."""
+    """A console for tables and bars; texts are made :func:`printable`, and brackets are no mark-up."""
     from rich.console import Console
     from rich.text import Text
 
@@ -72,22 +72,22 @@ def screen(*, err: bool = False, width: int | None = None, **more: Any) -> Conso
 
 
 def _silence(stream: TextIO) -> None:
-    """Have what is still to be written to a stream go nowhere: at the end Python tries to once more."""
+    """Redirect a stream to nowhere: Python flushes it once more at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def open_streams() -> None:
-    """Open what is closed of the three standard streams, on nothing.
+    """Open closed standard streams on nothing.
 
-    Otherwise the next file that is opened, of weights perhaps, becomes standard error, and gets what is written there.
-    Signs that a pipe or terminal does not take (cp1252 has no block of a curve) become '?' and end nothing.
+    Otherwise the next opened file, perhaps of weights, becomes standard error and receives its text. Characters that a
+    pipe or terminal cannot encode (cp1252 lacks the blocks of curves) become '?'.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # which takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))

@@ -1,4 +1,4 @@
-"""Tasks on several cores: each in a process of its own, none of which outlives the one that asked for it."""
+"""Tasks on several cores, each in its own process, none of which outlives its parent."""
 
 import ctypes
 import multiprocessing
@@ -16,56 +16,55 @@ from hypogoal.core.own_code import users_own
 from hypogoal.core.surroundings import environment, shield
 
 T = TypeVar("T")
-SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # a Python started with it is as ``PYTHON`` is
-CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use, where others use the rest
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # the same for a Python that multiprocessing starts
+CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use
 RESEND_SECONDS = 1.0
-KILLED = 9  # SIGKILL, which Windows has no name for
-PYTHON = (sys.executable, "-P")  # a Python that does not run a random.py of the current folder in place of its own
-PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that this process gets when its parent dies
+KILLED = 9  # SIGKILL, which has no name on Windows
+PYTHON = (sys.executable, "-P")  # does not import a random.py of the current folder in place of Python's
+PR_SET_PDEATHSIG = 1  # Linux's prctl: the signal that a process gets when its parent dies
 
 
 def cores() -> int:
-    """How many cores this process may use: those the system gives it, or fewer where ``HYPOGOAL_CORES`` says so."""
+    """How many cores this process may use: those the system allows, or fewer with ``HYPOGOAL_CORES``."""
     return allowed(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def allowed(wanted: int) -> int:
-    """How many processes a stage may use that was told to use ``wanted`` (0: all it can), no more than are allotted."""
+    """How many of ``wanted`` processes (0: one per core) a stage may use."""
     if not wanted:
         return cores()
-    told = os.environ.get(CORES, "")
-    return min(wanted, max(1, int(told))) if told.isdigit() else wanted
+    setting = os.environ.get(CORES, "")
+    return min(wanted, max(1, int(setting))) if setting.isdigit() else wanted
 
 
 def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[[int, T], None]) -> None:
-    """Run tasks, ``workers`` at once; where that is one, in this process; ``done`` is told each one's number and
-    result.
+    """Run tasks, ``workers`` at once, in this process if that is 1; ``done`` gets each task's number and result.
 
-    More than one at once, they and their results go from process to process; own code that is allowed here is allowed
-    there. When a task fails, or at Ctrl-C, those that run get SIGTERM and are waited for: who saves checkpoints saves
-    one. Where the system kills a process, it is ``Killed``.
+    In other processes tasks and results must be picklable, and user code allowed here is allowed there. If a task
+    fails, or at Ctrl-C, running ones get SIGTERM and are waited for, so that they can save a checkpoint. A process
+    killed by the system raises ``Killed``.
     """
     if min(workers, len(tasks)) <= 1:
         for number, task in enumerate(tasks):
             done(number, task())
         return
     before = set(multiprocessing.active_children())
-    # Started anew rather than forked: a fork takes along whatever threads and locks the caller has.
+    # Spawned, not forked: a fork would copy the caller's threads and locks.
     spawn = multiprocessing.get_context("spawn")
     with environment(**SAFE_PATH):
         pool = ProcessPoolExecutor(min(workers, len(tasks)), spawn, _begin, (os.getpid(),))
     try:
-        own = own_code.allowed()
+        trusted = own_code.allowed()
         with environment(**SAFE_PATH):
-            futures = {pool.submit(_guarded, task, own): number for number, task in enumerate(tasks)}
+            futures = {pool.submit(_guarded, task, trusted): number for number, task in enumerate(tasks)}
         for future in as_completed(list(futures)):
             done(futures.pop(future), future.result())
     except BrokenProcessPool:
         do = f"Run fewer at once: --set workers=1, or {CORES}=1 in the environment."
         raise Killed("a process was killed by the system, most likely for lack of memory", None, do) from None
     except BaseException:
-        # Again until none is left: one that fails of its own has kept the first for the checkpoint that never comes,
-        # and waits for the next task, behind a lock that a killed one may hold.
+        # Repeated until none is left: a process that fails holds the first signal back for a checkpoint that never
+        # comes, and then waits for the next task behind a lock that a killed process may hold.
         while left := set(multiprocessing.active_children()) - before:
             for process in left:
                 process.terminate()
@@ -76,7 +75,7 @@ def in_processes(tasks: Sequence[Callable[[], T]], workers: int, done: Callable[
 
 
 def _begin(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent alone, which sends SIGTERM on
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the parent handles Ctrl-C; it sends SIGTERM
     shield()
     die_with_parent()
     if os.getppid() != parent:
@@ -84,18 +83,18 @@ def _begin(parent: int) -> None:
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process when its parent dies: an orphan would go on writing beside its successor."""
+    """Have the kernel kill this process when its parent dies: an orphan would write beside its successor."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, KILLED)
 
 
-def _guarded(task: Callable[[], T], own: frozenset[str]) -> T:
+def _guarded(task: Callable[[], T], trusted: frozenset[str]) -> T:
     try:
-        with own_code.vouched(*own):
+        with own_code.vouched(*trusted):
             return task()
     except KeyboardInterrupt:  # the pool would give this process the next task
         os._exit(128 + signal.SIGTERM)
     except BaseException as error:
-        if (told := users_own(error)) is None:
+        if (user_error := users_own(error)) is None:
             raise
-        raise told from error  # where it came from is known here only: no traceback goes along
+        raise user_error from error  # its place is only known here: tracebacks are not sent to the parent

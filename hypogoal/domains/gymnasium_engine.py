@@ -157,10 +157,10 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         try:
             given: Any = env.reset(**arguments)
         except Exception:
-            code.of = _bad_reset(env, arguments)
+            code.target = _bad_reset(env, arguments)
             raise
         if not _complete(given, 2):
-            code.of = _bad_reset(env, arguments)
+            code.target = _bad_reset(env, arguments)
             code.refuse(f"gave {_kinds(given)}", "Give (observation, info), info a dict.")
         return given[0], given[1]
 
@@ -171,10 +171,10 @@ def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, di
         try:
             given: Any = env.step(action)
         except Exception:
-            code.of = _bad_step(env, action)
+            code.target = _bad_step(env, action)
             raise
         if not _complete(given, 5):
-            code.of = _bad_step(env, action)
+            code.target = _bad_step(env, action)
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_kinds(given)}", do)
         number, over = code.number(given[1], "the reward"), code.truth(given[2], "terminated")
@@ -274,7 +274,7 @@ class Labels:
         told = []
         with UsersCode("a sub-goal's function") as code:
             for label in self._each:
-                code.of = label
+                code.target = label
                 told.append(code.truth(label(env), "the label"))
         return np.array(told, dtype=np.bool_)
 

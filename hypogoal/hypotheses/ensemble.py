@@ -260,7 +260,7 @@ class Ensemble(nn.Module):
         def make() -> Ensemble:
             return cls(network, observation_shape, members, torch.Generator(), view, **settings)
 
-        return load_fitting(make, state, where, own=network not in NETWORKS).eval()
+        return load_fitting(make, state, where, custom=network not in NETWORKS).eval()
 
 
 def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:

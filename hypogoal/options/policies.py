@@ -71,7 +71,8 @@ class LightPolicies:
         shape = (shape[0] // 2, shape[1] // 2, *shape[2:]) if half else shape
         weights = below("online.", weights)
         make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape), embedding)
-        self.network = load_fitting(make, weights, "options.safetensors", own=embedding not in (AUTO, GRID, *NETWORKS))
+        custom = embedding not in (AUTO, GRID, *NETWORKS)
+        self.network = load_fitting(make, weights, "options.safetensors", custom=custom)
         self.actions = actions
 
     def __call__(self, option: int) -> Callable[[Observations], int]:

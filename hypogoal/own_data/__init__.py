@@ -1,1 +1,1 @@
-"""States that users bring: NumPy arrays, folders of images, Minari datasets; and out again (Spec B6)."""
+"""Import of users' states (NumPy arrays, folders of images, Minari datasets), and export (Spec B6)."""

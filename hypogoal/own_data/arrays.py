@@ -20,19 +20,19 @@ NEEDED = ("observations", "labels", "unlabelled")
 OPTIONAL = ("heldout_observations", "heldout_labels")
 NAMES = ("sub_goals", "features")
 KNOWN = (*NEEDED, *OPTIONAL, *NAMES)
-PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others make gigabytes of a kilobyte
-ENCRYPTED = 1  # among the flags of an entry
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # other methods make gigabytes of a kilobyte
+ENCRYPTED = 1  # a flag of an entry
 DAMAGED = (
     ValueError, TypeError, OverflowError, KeyError, EOFError, OSError, MemoryError, SyntaxError, tokenize.TokenError,
     zipfile.BadZipFile, zlib.error,
-)  # fmt: skip # of NumPy and zipfile: a text for a size, a size of thirty digits, an open bracket, an odd stream
+)  # fmt: skip # raised by NumPy and zipfile for malformed sizes, headers and streams
 
 
 def read_arrays(path: Path) -> Parts:
-    """Arrays by name, of a ``.npz`` file or a folder of ``.npy`` files: ``NEEDED``, where given ``OPTIONAL`` and
-    ``sub_goals`` (G texts) and ``features``.
+    """Arrays by name, of a ``.npz`` file or a folder of ``.npy`` files: ``NEEDED``, perhaps ``OPTIONAL``, ``sub_goals``
+    (G texts) and ``features``.
 
-    Missing, damaged, of other names, larger than memory, or Python objects, which would be code: a ``UserError``.
+    Missing, damaged or misnamed arrays, ones larger than memory, and pickled Python objects are a ``UserError``.
     """
     arrays = _folder(path) if path.is_dir() else _file(path, others=False)
     missing = [name for name in NEEDED if name not in arrays]
@@ -45,8 +45,8 @@ def read_arrays(path: Path) -> Parts:
         if name in arrays and arrays[name].dtype.kind != "U":
             raise UserError(f"{name} are {arrays[name].dtype}, not texts", path, "Give numpy.array of str.")
     named: dict[str, Any] = {name: tuple(map(str, arrays[name].ravel())) for name in NAMES if name in arrays}
-    given: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
-    return Parts(**given, **named)
+    values: dict[str, Any] = {name: arrays[name] for name in (*NEEDED, *OPTIONAL) if name in arrays}
+    return Parts(**values, **named)
 
 
 def read_states(path: Path) -> Observations:
@@ -59,15 +59,15 @@ def read_states(path: Path) -> Observations:
 
 
 def write_arrays(path: Path, dataset: Dataset) -> None:
-    """A data file's states as :func:`read_arrays` takes them; a ``UserError`` where its sub-goals do not share them."""
+    """Write a data file's states for :func:`read_arrays`; a ``UserError`` if its sub-goals do not share them."""
     columns: dict[str, list[NDArray[np.bool_]]] = {"labelled": [], "heldout": []}
     first: dict[str, Observations] = {}
     for split, labels in columns.items():
         for goal in dataset.sub_goals:
-            found = getattr(dataset, split)(goal)
-            if not np.array_equal(first.setdefault(split, found.observations), found.observations):
-                raise UserError("its sub-goals have states of their own", dataset.path, "Read it with h5py instead.")
-            labels.append(found.labels)
+            states = getattr(dataset, split)(goal)
+            if not np.array_equal(first.setdefault(split, states.observations), states.observations):
+                raise UserError("its sub-goals do not share their states", dataset.path, "Read it with h5py instead.")
+            labels.append(states.labels)
     arrays: dict[str, Any] = {
         "observations": first["labelled"],
         "labels": np.stack(columns["labelled"], axis=1),
@@ -82,7 +82,7 @@ def write_arrays(path: Path, dataset: Dataset) -> None:
 
 
 def _file(path: Path, *, others: bool = True) -> dict[str, NDArray[Any]]:
-    """The arrays of a file that have known names; ``others``: it may hold more."""
+    """The arrays of a file with known names; ``others``: it may hold more."""
     do = "Write it with numpy.savez."
     with open_file(path, "the arrays are", "Give a .npz file that numpy.savez wrote.") as raw:
         try:
@@ -107,9 +107,9 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
     arrays = {}
     _require_known(sorted(file.stem for file in path.glob("*.npy")), path)
     files = {name: path / f"{name}.npy" for name in KNOWN}
-    found = {name: file for name, file in files.items() if file.is_file()}
-    require_memory(sum(file.stat().st_size for file in found.values()), path)
-    for name, file in found.items():
+    existing = {name: file for name, file in files.items() if file.is_file()}
+    require_memory(sum(file.stat().st_size for file in existing.values()), path)
+    for name, file in existing.items():
         try:
             arrays[name] = np.load(file, allow_pickle=False)
         except DAMAGED as error:
@@ -118,7 +118,7 @@ def _folder(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _require_known(names: Iterable[str], path: Path) -> None:
-    """Refuse (``UserError``) a misspelt array: held-out states that are left out in silence are missed by nobody."""
+    """Refuse (``UserError``) a misspelt name: held-out states would be left out silently."""
     for name in names:
         if name not in KNOWN:
             do = meant(name, KNOWN) or f"Known are {', '.join(KNOWN)}; leave it out."

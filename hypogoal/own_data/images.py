@@ -1,4 +1,4 @@
-"""A folder of images: ``positive/``, ``negative/``, ``unlabelled/``, and ``heldout/`` with the first two in it."""
+"""A folder of images: ``positive/``, ``negative/``, ``unlabelled/``, and ``heldout/`` with the first two inside."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".webp")
-FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP")  # whatever a file is called: for PostScript a program would be run
-MOST_PIXELS = 4096 * 4096  # of a state; a kilobyte can stand for a thousand times as many
-ARRAY = ".npy"  # a state that no image file holds, such as a stack of four frames
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP")  # whatever a file's name: for PostScript, PIL would run a program
+MOST_PIXELS = 4096 * 4096  # of a state; a kilobyte can declare a thousand times as many
+ARRAY = ".npy"  # a state that no image format holds, such as a stack of four frames
 ORIENTATION = 0x0112  # the tag in EXIF
 DO = "Remove it, or write it again."
-GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", "PA", "RGBA")  # of 8 bits a channel
+GREY, COLOURED, TRANSPARENT = ("1", "L"), ("P", "RGB", "CMYK", "YCbCr"), ("LA", "PA", "RGBA")  # 8 bits per channel
 
 
 def read_images(folder: Path, *, resize: int = 0, stack: bool = False) -> Parts:
-    """The images of one sub-goal, in the order of their names; grey where all are, else red, green and blue.
+    """The images of one sub-goal, in the order of their names; grey if all are, else red, green and blue.
 
-    ``resize`` and ``stack``: see :func:`as_observations`; what was of several sizes may be of one then. A folder that
-    is missing (but for ``heldout``) or empty, an image that cannot be read, or different sizes are a ``UserError``.
+    ``resize`` and ``stack``: see :func:`as_observations`; resizing may make different sizes equal. A folder that is
+    missing (except ``heldout``) or empty, an unreadable image, and different sizes are a ``UserError``.
     """
     names = ["positive", "negative", "unlabelled"]
     if (folder / "heldout").is_dir():
@@ -54,8 +54,8 @@ def read_images(folder: Path, *, resize: int = 0, stack: bool = False) -> Parts:
         file = [file for kind in kinds for file in files[kind]][row]
         return file.relative_to(folder).as_posix()
 
-    heldout, known = _labelled(*read[3:]) if read[3:] else (None, None)
-    return Parts(*_labelled(*read[:2]), read[2], heldout, known, name=name)
+    heldout, heldout_labels = _labelled(*read[3:]) if read[3:] else (None, None)
+    return Parts(*_labelled(*read[:2]), read[2], heldout, heldout_labels, name=name)
 
 
 def _labelled(positive: NDArray[np.uint8], negative: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -70,7 +70,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Path]:
-    """The files of a folder for :func:`read_image`, by name; where there are none a ``UserError`` that says ``do``."""
+    """A folder's files for :func:`read_image`, by name; if there are none, a ``UserError`` with the advice ``do``."""
     files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in (*SUFFIXES, ARRAY))
     if not files:
         raise UserError(f"no images ({', '.join(SUFFIXES)})", folder, do)
@@ -78,9 +78,9 @@ def image_files(folder: Path, do: str = "Give a folder with images.") -> list[Pa
 
 
 def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
-    """One state, uint8 (H, W, C): of an image, upright, its grey or its three colours, of a ``.npy`` file its array.
+    """One state, uint8 (H, W, C): an upright image, grey or in three colours, or the array of a ``.npy`` file.
 
-    Too large, more than 8 bits a channel, several pictures, transparent in places, or not readable: a ``UserError``.
+    An image too large, of over 8 bits a channel, animated, partly transparent or unreadable is a ``UserError``.
     """
     import PIL.Image
 
@@ -102,7 +102,7 @@ def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
                 raise UserError(f"the image has {pixels:,} pixels, at most {MOST_PIXELS:,} are read", file, DO)
             if getattr(image, "is_animated", False):
                 raise UserError("one file holds several pictures", file, "Write each as a file of its own.")
-            image.load()  # of a PNG the orientation may stand behind the pixels
+            image.load()  # in a PNG the orientation may follow the pixels
             opaque = _opaque(image, file).convert("L" if image.mode in GREY else "RGB")
             values = np.asarray(_upright(opaque, image), dtype=np.uint8)
     except (*DAMAGED, LookupError, struct.error, PIL.Image.DecompressionBombError):
@@ -111,7 +111,7 @@ def read_image(file: Path, *, stack: bool = False) -> NDArray[np.uint8]:
 
 
 def _upright(image: Image, source: Image) -> Image:
-    """The image as viewers show it, turned or mirrored as the EXIF orientation of its ``source`` says."""
+    """The image as viewers show it, turned or mirrored by the EXIF orientation of its ``source``."""
     from PIL.Image import Transpose
 
     turns = {
@@ -131,7 +131,7 @@ def _upright(image: Image, source: Image) -> Image:
 
 
 def _opaque(image: Image, file: Path) -> Image:
-    """The image itself, where its colours are all that can be seen of it, and bytes hold them."""
+    """The image without an alpha channel; a ``UserError`` if it is partly transparent or not of 8 bits."""
     if image.mode not in (*GREY, *COLOURED, *TRANSPARENT):
         do = "Scale it to 0..255 and write it again."
         raise UserError(f"the image has the mode {image.mode}, not 8 bits a channel", file, do)
@@ -143,7 +143,7 @@ def _opaque(image: Image, file: Path) -> Image:
 
 
 def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArray[np.uint8]]:
-    """The images of one size in some files, of ``count`` that there are in all."""
+    """The images in some files, all of one size; ``count`` is the total in all folders."""
     images: list[NDArray[np.uint8]] = []
     for file in files:
         image = read_image(file, stack=stack)
@@ -157,7 +157,7 @@ def _read(files: list[Path], count: int, resize: int, stack: bool) -> list[NDArr
 
 
 def _size(image: NDArray[np.uint8]) -> str:
-    """Height and width, and the number of channels where it is not that of an image."""
+    """Height and width, and the number of channels unless it is 1 or 3."""
     return size_text(image.shape[: 2 if image.shape[2] in (1, 3) else 3])
 
 

@@ -1,5 +1,5 @@
-"""States that a person marks one by one: recorded ones, or those of an environment that is played; the window that
-shows them, and the folder of images, which ``import`` takes, whole at any moment (Spec B6).
+"""Marking states by hand, recorded ones or those of an environment that is played: the window that shows them, and the
+folder of images for ``import``, which is valid at any moment (Spec B6).
 """
 
 from __future__ import annotations
@@ -26,22 +26,21 @@ from hypogoal.own_data.arrays import read_states
 from hypogoal.own_data.images import image_files, read_image, size_text
 
 KINDS = ("positive", "negative", "unlabelled")
-PICTURE = 520  # pixels of a picture's height, about
+HEIGHT = 520  # pixels of a picture, about
 TEXT, LINE, WIDTH = 15, 20, 680
 BACKGROUND, INK, MUTED = (250, 250, 250), (34, 34, 34), (110, 110, 110)
 COLOURS = {"positive": (0, 120, 80), "negative": (190, 70, 0), "unlabelled": (0, 100, 170)}
-UNSEEN = ("offscreen", "dummy")  # what pygame takes where there is no screen, and says nothing
-WAIT_MS = 100  # so long a key is waited for before Ctrl-C in the terminal is noticed
-REPEAT_MS = (300, 80)  # a key that stays down
+UNSEEN = ("offscreen", "dummy")  # drivers that pygame silently uses without a screen
+WAIT_MS = 100  # waiting for a key, before Ctrl-C in the terminal is noticed
+REPEAT_MS = (300, 80)  # of a key held down: delay, interval
 HELD = ("up", "down", "left", "right", "w", "a", "s", "d", "space")  # keys that may be held together
 
 
 class Marks:
-    """One file a state, ``folder/KIND/DIGEST.png`` (``.npy`` where a state is no grey or colour image).
+    """One file per state, ``folder/KIND/DIGEST.png`` (``.npy`` for a state that is no grey or colour image).
 
-    Each mark is on the disk before the next key is read: a crash loses none. A state is marked once, the last word
-    counts. The folder is made with the first mark; what is in it already is gone on with. A link that leads out of it
-    is a ``UserError``.
+    Each mark is on the disk before the next key is read: a crash loses none. The last mark of a state counts. The
+    folder is made with the first mark; existing marks are kept. A link that leads out of it is a ``UserError``.
     """
 
     def __init__(self, folder: Path, kinds: Sequence[str] = KINDS):
@@ -57,12 +56,12 @@ class Marks:
                     self._files[file.stem] = file
 
     def of(self, state: NDArray[np.uint8]) -> str | None:
-        """How a state (H, W, C) is marked."""
+        """The mark of a state (H, W, C), or None."""
         file = self._files.get(_name(state))
         return file.parent.name if file else None
 
     def mark(self, state: NDArray[np.uint8], kind: str) -> None:
-        """Mark a state, uint8 (H, W, C), or mark it anew; a ``UserError`` where those before have another shape."""
+        """Mark a state, uint8 (H, W, C), or change its mark; a ``UserError`` if earlier states have another shape."""
         name, before = _name(state), self.of(state)
         if before is not None:
             self._move(name, kind)
@@ -81,7 +80,7 @@ class Marks:
         self._before.append((name, None))
 
     def undo(self) -> bool:
-        """Take back the last mark made since this was opened; false where there is none."""
+        """Take back the last mark of this session; false if there is none."""
         if not self._before:
             return False
         name, kind = self._before.pop()
@@ -92,9 +91,9 @@ class Marks:
         return True
 
     def counts(self) -> dict[str, int]:
-        """States of each kind."""
-        found = [file.parent.name for file in self._files.values()]
-        return {kind: found.count(kind) for kind in self.kinds}
+        """The number of states of each kind."""
+        kinds = [file.parent.name for file in self._files.values()]
+        return {kind: kinds.count(kind) for kind in self.kinds}
 
     def _move(self, name: str, kind: str) -> None:
         before = self._files[name]
@@ -107,7 +106,7 @@ def _name(state: NDArray[np.uint8]) -> str:
 
 
 def _encoded(state: NDArray[np.uint8]) -> tuple[str, bytes]:
-    """Suffix and content of a file that holds exactly this state."""
+    """Suffix and contents of a file that holds exactly this state."""
     from PIL import Image
 
     file = io.BytesIO()
@@ -119,10 +118,10 @@ def _encoded(state: NDArray[np.uint8]) -> tuple[str, bytes]:
 
 
 def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) -> None:
-    """Show the states of ``source`` and mark them by keyboard, each at once, until the window is closed.
+    """Show the states of ``source`` and mark them by keyboard until the window is closed.
 
-    ``fps``: steps a second that are played whether a key is held or not; 0: one step for each key. Without a screen, or
-    pygame, it is a ``UserError``.
+    ``fps``: steps per second, played whether or not a key is held; 0: one step for each key. A missing screen or pygame
+    is a ``UserError``.
     """
     keys = {kind[0]: kind for kind in marks.kinds}  # p, n, u
     modes: list[str | None] = [None, *(kind for kind in ("negative", "unlabelled", "positive") if kind in marks.kinds)]
@@ -154,7 +153,7 @@ def mark_states(source: Source, marks: Marks, sub_goal: str, *, fps: int = 0) ->
 def _lines(
     source: Source, marks: Marks, sub_goal: str, mode: str | None, keys: dict[str, str], current: str | None
 ) -> list[tuple[str, tuple[int, int, int]]]:
-    """What is written below the picture, each line with its colour."""
+    """The lines below the picture, each with its colour."""
     counts = ", ".join(f"{count} {kind}" for kind, count in marks.counts().items())
     says = ", ".join(f"{key}: {kind}" for key, kind in keys.items())
     meanwhile = f"every new state is marked {mode}" if mode else "states are marked by hand only"
@@ -169,7 +168,7 @@ def _lines(
 
 
 def as_rgb(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A state (H, W, C) as a picture (H', W', 3): of a stack of frames the last one large, those before beside it."""
+    """A state (H, W, C) as a picture (H', W', 3); of a stack of frames the last is large, earlier ones beside it."""
     channels = state.shape[2]
     if channels == 3:
         return state
@@ -191,7 +190,7 @@ class _Window:
             raise UserError("the window needs pygame", None, "pip install pygame-ce") from None
         self._pygame, self._title = pygame, title
         self._surface: Any = None
-        self._tick = 0.0  # when the last one was, in real time
+        self._tick = 0.0  # time of the last tick, in real time
 
     def __enter__(self) -> _Window:
         pygame = self._pygame
@@ -203,7 +202,7 @@ class _Window:
             driver = pygame.display.get_driver()
             if driver in UNSEEN and os.environ.get("SDL_VIDEODRIVER") != driver:
                 raise pygame.error("no screen")
-            self._surface = pygame.display.set_mode((WIDTH, PICTURE))
+            self._surface = pygame.display.set_mode((WIDTH, HEIGHT))
         except pygame.error as error:
             pygame.quit()
             do = "Use a machine with a screen, or ssh -X."
@@ -218,7 +217,7 @@ class _Window:
         """The picture (H, W, 3), as large as fits by a whole factor, and the lines."""
         pygame: Any = self._pygame
         height, width = picture.shape[:2]
-        factor = max(1, min(PICTURE // height, WIDTH // width))
+        factor = max(1, min(HEIGHT // height, WIDTH // width))
         whole = (max(WIDTH, width * factor), height * factor + LINE * (len(lines) + 1))
         if self._surface.get_size() != whole:
             self._surface = pygame.display.set_mode(whole)
@@ -232,9 +231,9 @@ class _Window:
         pygame.display.flip()
 
     def next_key(self, fps: int) -> tuple[str, frozenset[str]]:
-        """The next key that goes down, and those held; closing the window is ``escape``.
+        """The next key pressed, and the keys held; closing the window is ``escape``.
 
-        In real time keys that play count once a tick, however long they are held; a tick without any is an empty key.
+        In real time a key that plays counts once per tick, however long it is held; a tick without one is an empty key.
         """
         pygame: Any = self._pygame
         tapped: set[str] = set()
@@ -268,36 +267,36 @@ GRID_KEYS = {
     "drop": ("page down", "q"),
     "done": ("return",),
 }
-"""Keys of actions that have these names, as MiniGrid's have; the first as MiniGrid's own manual control."""
+"""Keys of actions with MiniGrid's names; the first key is that of MiniGrid's manual control."""
 
 DIRECTIONS = {
     "UP": ("up", "w"), "RIGHT": ("right", "d"), "LEFT": ("left", "a"), "DOWN": ("down", "s"), "FIRE": ("space",)
 }  # fmt: skip
 FALLBACK = tuple("0123456789bcfghijkotvxyz")
-"""Keys of actions without one by their name: their number, from 10 on a letter that nothing above has, nor marking."""
+"""Keys of other actions: their number, from 10 on a letter that is not used otherwise."""
 
 
 class Source:
-    """A state at a time."""
+    """States shown one at a time."""
 
-    state: NDArray[np.uint8]  # the one that is shown, (H, W, C)
+    state: NDArray[np.uint8]  # the one shown, (H, W, C)
     note: str  # where it is from
-    help: tuple[str, ...]  # which keys do what, in lines
+    help: tuple[str, ...]  # lines that explain the keys
 
     def press(self, key: str, held: Set[str]) -> bool:
-        """What a key does, of those ``held`` down; false where nothing."""
+        """React to a key while others are ``held``; returns whether the state changed."""
         raise NotImplementedError
 
     def idle(self) -> bool:
-        """What happens when no key is held, in real time; false where nothing."""
+        """React to a tick without a key, in real time; returns whether the state changed."""
         return False
 
     def marked(self) -> None:
-        """The state was marked; what is played goes on as it is."""
+        """React to a mark; by default nothing happens."""
 
 
 class Recorded(Source):
-    """States that were recorded before, (N, H, W, C); a marked one makes way for the next."""
+    """Recorded states, (N, H, W, C); after a mark the next one is shown."""
 
     help = ("left, right: the state before, the next one", "page up, page down: ten at once")
 
@@ -310,21 +309,22 @@ class Recorded(Source):
         self.note = f"state {index + 1} of {len(self._states)}"
 
     def press(self, key: str, held: Set[str]) -> bool:
-        """One or ten on, or back."""
+        """Go one or ten states forward or back."""
         before, steps = self._index, {"left": -1, "right": 1, "page up": -10, "page down": 10}
         self._show(min(max(before + steps.get(key, 0), 0), len(self._states) - 1))
         return self._index != before
 
     def marked(self) -> None:
-        """On to the next."""
+        """Show the next state."""
         self.press("right", frozenset())
 
 
 class Played(Source):
-    """An environment that is played by keyboard; its states are those that an agent would see.
+    """An environment played by keyboard; its states are those that an agent would see.
 
-    ``make`` makes it: observations uint8 (H, W, C) or (H, W), actions ``Discrete``, else a ``UserError``. ``reset`` is
-    given ``layout_seed``; the next layout is one more. ``recorded``: layout seed and actions of each episode.
+    ``make`` makes it, with observations uint8 (H, W, C) or (H, W) and ``Discrete`` actions, else a ``UserError``.
+    ``reset`` gets ``layout_seed``; the next layout has the next seed. ``recorded``: layout seed and actions of each
+    episode.
     """
 
     def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
@@ -358,7 +358,7 @@ class Played(Source):
         return action is not None and self._play(action)
 
     def idle(self) -> bool:
-        """Play NOOP where there is one."""
+        """Play NOOP, if there is one."""
         return not self._over and "NOOP" in self._names and self._play(self._names.index("NOOP"))
 
     def _play(self, action: int) -> bool:
@@ -372,7 +372,7 @@ class Played(Source):
 
 
 def action_names(env: gymnasium.Env) -> tuple[str, ...]:
-    """What an environment calls its actions, else their numbers: MiniGrid has ``actions``, Atari its meanings."""
+    """The names of an environment's actions (MiniGrid's ``actions``, Atari's meanings), or their numbers."""
     count = int(env.action_space.n)  # type: ignore[attr-defined]
     with UsersCode("the names of the environment's actions", env):
         inner = env.unwrapped
@@ -384,30 +384,30 @@ def action_names(env: gymnasium.Env) -> tuple[str, ...]:
 
 
 def action_of(names: Sequence[str], key: str, held: Set[str]) -> int | None:
-    """The action that a key stands for: by name as MiniGrid's, by the keys held together as Atari's, else by number."""
+    """The action of a key: by name for MiniGrid, by the keys held together for Atari, else by number."""
     if "NOOP" in names:
         down = {key, *held}
-        axes = (("UP", "DOWN"), ("RIGHT", "LEFT"), ("FIRE",))  # of each the first one that is held
+        axes = (("UP", "DOWN"), ("RIGHT", "LEFT"), ("FIRE",))  # the first one held of each
         name = "".join(next((part for part in axis if down & set(DIRECTIONS[part])), "") for axis in axes)
         return names.index(name) if name in names else None
     return next((index for index, keys in enumerate(keys_of(names)) if key in keys), None)
 
 
 def keys_of(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Which keys play each action: those of its name, else one of ``FALLBACK``; none where there are more actions."""
+    """The keys of each action: those of its name, else one of ``FALLBACK``, which may run out."""
     return [GRID_KEYS.get(name) or FALLBACK[index : index + 1] for index, name in enumerate(names)]
 
 
 def action_help(names: Sequence[str]) -> tuple[str, ...]:
-    """Which keys play which actions, in lines."""
+    """Lines that list the keys of the actions."""
     if "NOOP" in names:
         return ("arrows or w a s d, space: move, fire; together, too",)
-    told = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
-    return tuple(", ".join(told[first : first + 3]) for first in range(0, len(told), 3))
+    texts = [f"{' or '.join(keys) or 'no key'}: {name}" for name, keys in zip(names, keys_of(names), strict=True)]
+    return tuple(", ".join(texts[first : first + 3]) for first in range(0, len(texts), 3))
 
 
 def recorded_states(path: Path) -> Sequence[NDArray[np.uint8]]:
-    """The unlabelled states of a data file or of a ``.npz`` file, or the images of a folder; else a ``UserError``."""
+    """The unlabelled states of a data file or ``.npz`` file, or the images of a folder; else a ``UserError``."""
     if path.is_dir():
         return [read_image(file) for file in image_files(path)]
     states: Any = read_states(path) if path.suffix == ".npz" else open_dataset(path).unlabelled()

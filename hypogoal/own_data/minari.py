@@ -1,4 +1,4 @@
-"""Minari datasets: episodes whose states a function labels, and episodes of agents. The package is not needed."""
+"""Minari datasets: import of episodes, labelled by functions, and export of agents' episodes, without the package."""
 
 import json
 import math
@@ -21,29 +21,29 @@ from hypogoal.own_data.parts import Parts, require_memory
 
 METADATA = Path("data") / "metadata.json"
 DO = "Give the folder of a Minari dataset in the format 'hdf5', for example ~/.minari/datasets/NAME-v0."
-MINARI_VERSION = "0.5.4"  # whose layout is written
-SHARES = (0.4, 0.4, 0.2)  # of the episodes that are labelled, unlabelled and held out
+MINARI_VERSION = "0.5.4"  # its layout is written
+SPLIT = (0.4, 0.4, 0.2)  # shares of episodes that are labelled, unlabelled and held out
 
 Label = Callable[[NDArray[Any]], bool]  # from an observation to whether the sub-goal holds
 
 
 def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: int = 0) -> Parts:
-    """The observations of a dataset's episodes, each episode's either labelled, unlabelled or held out, by ``seed``.
+    """The observations of a dataset; each whole episode is labelled, unlabelled or held out, drawn by ``seed``.
 
-    ``folder`` is the one with ``data/`` in it, ``key`` which part of observations that are dictionaries is meant.
-    No such dataset, another storage format, too few episodes, or a label function that fails is a ``UserError``.
+    ``folder`` contains ``data/``; ``key`` selects a part of observations that are dictionaries. A missing dataset,
+    another storage format, too few episodes, and a label function that fails are a ``UserError``.
     """
     if not labels:
         raise UserError("a Minari dataset has no labels", folder, "Give --label NAME=module:function.")
-    about = read_json(folder / METADATA, "the metadata are", DO)
-    stored = about.get("data_format", "hdf5") if isinstance(about, dict) else None
+    metadata = read_json(folder / METADATA, "the metadata are", DO)
+    stored = metadata.get("data_format", "hdf5") if isinstance(metadata, dict) else None
     if stored != "hdf5":
         raise UserError(f"the storage format {stored!r} is not read", folder, DO)
-    names, episodes = _episodes(folder / MINARI, key, _picture_shape(about.get("observation_space"), key))
+    names, episodes = _episodes(folder / MINARI, key, _picture_shape(metadata.get("observation_space"), key))
     if len(episodes) < 3:
         raise UserError(f"{len(episodes)} episodes cannot be labelled, unlabelled and held out", folder, "Give three.")
     order = rng_for(seed, "minari").permutation(len(episodes))
-    ends = np.round(np.cumsum(SHARES)[:2] / sum(SHARES) * len(episodes)).astype(int)
+    ends = np.round(np.cumsum(SPLIT)[:2] / sum(SPLIT) * len(episodes)).astype(int)
     ends = np.clip(ends, (1, 2), (len(episodes) - 2, len(episodes) - 1))
     parts = np.split(order, ends)
     labelled, unlabelled, heldout = (np.concatenate([episodes[i] for i in part]) for part in parts)
@@ -55,7 +55,7 @@ def read_minari(folder: Path, labels: Sequence[Label], *, key: str = "", seed: i
         step = row - int(ends_of_episodes[place]) + len(episodes[part[place]])
         return f"{names[part[place]]}, step {step}"
 
-    return Parts(labelled, _told(labels, labelled), unlabelled, heldout, _told(labels, heldout), name=name)
+    return Parts(labelled, _labels(labels, labelled), unlabelled, heldout, _labels(labels, heldout), name=name)
 
 
 def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list[str], list[NDArray[Any]]]:
@@ -79,12 +79,12 @@ def _episodes(path: Path, key: str, shape: tuple[int, ...] | None) -> tuple[list
 
 
 def _picture_shape(space: object, key: str) -> tuple[int, ...] | None:
-    """The shape of a space of pictures, told as JSON, which Minari may have made JPEG; None where it is no such one."""
+    """The shape in the JSON of a space of pictures, which Minari may store as JPEG; None for any other space."""
     try:
-        about = json.loads(space) if isinstance(space, str) else {}
-        about = about["subspaces"][key] if key else about
-        shape = tuple(about["shape"])
-        return shape if (about["type"], about["dtype"]) == ("Box", "uint8") and len(shape) in (2, 3) else None
+        box = json.loads(space) if isinstance(space, str) else {}
+        box = box["subspaces"][key] if key else box
+        shape = tuple(box["shape"])
+        return shape if (box["type"], box["dtype"]) == ("Box", "uint8") and len(shape) in (2, 3) else None
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
 
@@ -94,20 +94,20 @@ def _number(name: str) -> int:
     return int(tail) if tail.isdecimal() else -1
 
 
-def _told(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.bool_]:
-    """What the functions say of each observation, bool (N, G)."""
-    told = np.empty((len(observations), len(labels)), np.bool_)
+def _labels(labels: Sequence[Label], observations: NDArray[Any]) -> NDArray[np.bool_]:
+    """The functions' labels of each observation, bool (N, G)."""
+    truths = np.empty((len(observations), len(labels)), np.bool_)
     for column, label in enumerate(labels):
         with UsersCode(f"the label function {getattr(label, '__name__', column)}", label) as code:
-            told[:, column] = [code.truth(label(observation), "the label") for observation in observations]
-    return told
+            truths[:, column] = [code.truth(label(observation), "the label") for observation in observations]
+    return truths
 
 
 def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, actions: int, description: str) -> int:
-    """Episodes, one at least, as a Minari dataset of format ``hdf5``, pictures as they were seen; returns its steps.
+    """Write at least one episode as a Minari dataset of format ``hdf5``, pictures uncompressed; returns its steps.
 
-    ``name`` is its id, such as ``doorkey/options-v0``, ``actions`` how many primitive ones there are. ``infos/option``
-    says which option led to a state, -1 at the start.
+    ``name`` is the dataset's id, such as ``doorkey/options-v0``; ``actions`` is the number of primitive actions.
+    ``infos/option`` is the option that led to each state, -1 at the start.
     """
     seen: Any = None
     total = count = 0
@@ -129,7 +129,7 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
         | {bound: np.full(shape, value).tolist() for bound, value in zip(("low", "high"), bounds, strict=True)},
         "action_space": {"type": "Discrete", "dtype": "int64", "start": 0, "n": actions},
     }
-    about = {
+    metadata = {
         "total_episodes": count,
         "total_steps": total,
         "data_format": "hdf5",
@@ -138,7 +138,7 @@ def write_minari(folder: Path, episodes: Iterable[Episode], *, name: str, action
         "minari_version": MINARI_VERSION,
         "algorithm_name": "hypogoal",
         "description": description,
-        **{space: json.dumps(about) for space, about in spaces.items()},
+        **{name: json.dumps(space) for name, space in spaces.items()},
     }
-    (folder / METADATA).write_text(json.dumps(about) + "\n", encoding="utf-8")
+    (folder / METADATA).write_text(json.dumps(metadata) + "\n", encoding="utf-8")
     return total

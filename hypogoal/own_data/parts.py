@@ -1,4 +1,4 @@
-"""What users bring, checked, as the sets of states that a data file holds."""
+"""Users' states, checked and split into the sets of a data file."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,39 +26,39 @@ from hypogoal.dataset import (
 from hypogoal.domains.observations import Reading, reading_of, shrunk_picture
 from hypogoal.own_data.supervision import contradictions, looks_of, near_duplicates, require_own_pictures
 
-COPIES = 4  # of the states, all held in memory at once while they are compared and written
+COPIES = 4  # of the states, in memory at once while they are compared and written
 
 
 @dataclass(frozen=True)
 class Parts:
-    """States as they were found, not yet looked at. Where none are held out, a share of the labelled ones is."""
+    """States as read, unchecked. Without held-out states, a share of the labelled ones will be held out."""
 
-    observations: NDArray[Any]  # (N, H, W, C) or (N, H, W), or (N, *shape) of no pictures, with labels
+    observations: NDArray[Any]  # labelled: pictures (N, H, W, C) or (N, H, W), or numbers (N, *shape)
     labels: NDArray[Any]  # (N,) or (N, G)
-    unlabelled: NDArray[Any]  # (M, ...) of as many
-    heldout_observations: NDArray[Any] | None = None  # as the first two
+    unlabelled: NDArray[Any]  # (M, ...)
+    heldout_observations: NDArray[Any] | None = None  # as ``observations``
     heldout_labels: NDArray[Any] | None = None
-    sub_goals: tuple[str, ...] = ()  # their names, where they were found with them
-    features: tuple[str, ...] = ()  # those of the numbers, where they are no pictures
-    name: Callable[[str, int], str] = "{}[{}]".format  # of a state, by its field and row, for messages
+    sub_goals: tuple[str, ...] = ()  # their names, if the source has them
+    features: tuple[str, ...] = ()  # names of the numbers
+    name: Callable[[str, int], str] = "{}[{}]".format  # names a state, by its field and row, in messages
 
 
 def collected_of(
     parts: Parts, sub_goals: Sequence[str], *, share: float = 0.2, seed: int = 0, resize: int = 0, stack: bool = False
 ) -> tuple[Collected, list[str]]:
-    """The states in the form of a data file, and what is allowed but may surprise, a line each.
+    """The states in the form of a data file, and lines that warn of what is allowed but may surprise.
 
-    Of one sub-goal the name may be left out. Where there are no held-out states, a ``share`` of the labelled ones of
-    each class is, by ``seed``. ``resize`` and ``stack``: see :func:`as_observations`. What cannot be used, or a class
-    that is missing or has no picture of its own, is a ``UserError``.
+    The name of a single sub-goal is optional. Without held-out states, a ``share`` of each class of the labelled ones
+    is held out by ``seed``. ``resize`` and ``stack``: see :func:`as_observations`. Unusable states, and a class that is
+    missing or only has pictures that the other class has too, are a ``UserError``.
     """
     warned: list[str] = []
     images = as_observations(parts.observations, "the labelled observations", resize=resize, stack=stack)
     if doubt := _reading(parts.observations).doubt:
         warned.append(doubt)
     if parts.features and (images.dtype != np.float32 or len(parts.features) != images[0].size):
-        given = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
-        raise UserError("the number of feature names is wrong", given, "Give one for each.")
+        counts = f"{len(parts.features)} for {images.dtype} {images.shape[1:]}"
+        raise UserError("the number of feature names is wrong", counts, "Give one for each.")
     shape = images.shape[1:]
     labelled = States(images, as_labels(parts.labels, len(images), "the labels"), _rows(images))
     goals = named(sub_goals or parts.sub_goals, labelled.labels.shape[1])
@@ -67,28 +67,28 @@ def collected_of(
     looks, kind = looks_of(images), "picture" if images.dtype == PICTURE else "observation"
     names = partial(parts.name, "observations"), partial(parts.name, "heldout_observations")
     if parts.heldout_observations is not None and parts.heldout_labels is not None:
-        what = "the held-out observations"
-        heldout = as_observations(parts.heldout_observations, what, images, resize=resize, stack=stack)
-        told = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
-        test = States(heldout, told, _rows(heldout))
-        every = np.concatenate([looks, looks_of(heldout)]), np.concatenate([labelled.labels, told])
+        heldout = parts.heldout_observations
+        heldout = as_observations(heldout, "the held-out observations", images, resize=resize, stack=stack)
+        heldout_labels = as_labels(parts.heldout_labels, len(heldout), "the held-out labels", len(goals))
+        test = States(heldout, heldout_labels, _rows(heldout))
+        every = np.concatenate([looks, looks_of(heldout)]), np.concatenate([labelled.labels, heldout_labels])
         warned += contradictions(*every, goals, _one_after_another(len(images), *names), kind=kind)
         do = "Hold out others, of other contexts."
         test = _apart(test, (images, unlabelled), "held-out", "to learn from", do, warned)
     else:
         warned += contradictions(looks, labelled.labels, goals, names[0], kind=kind)
         _, first, picture = np.unique(looks, return_index=True, return_inverse=True)
-        ordered = np.sort(first)  # each picture once, in the order given
+        ordered = np.sort(first)  # each picture once, in the original order
         chosen = np.zeros(len(images), np.bool_)
         chosen[ordered[held_out(labelled.labels[ordered], share, seed)]] = True
-        chosen = chosen[first][picture]  # and all states that look like one held out
+        chosen = chosen[first][picture]  # with all states that look like a held-out one
         test, labelled, looks = labelled.where(chosen), labelled.where(~chosen), looks[~chosen]
         names = names[0], names[0]
         do = "Give some of other contexts."
         bare = _apart(bare, (test.observations,), "unlabelled", "held out", do, warned)
         warned.append(
             f"no held-out states were given: {int(chosen.sum())} of the labelled ones are held out, which says nothing "
-            "of other contexts"
+            "about other contexts"
         )
     require_classes(labelled.labels, goals, None, "Give states of both kinds.")
     of_labelled, of_test = _of_rows(labelled, names[0]), _of_rows(test, names[1])
@@ -104,12 +104,12 @@ def _rows(states: NDArray[Any]) -> dict[str, NDArray[np.int64]]:
 
 
 def _of_rows(states: States, name: Callable[[int], str]) -> Callable[[int], str]:
-    """The names of states, some of those that were found."""
+    """The names of states that are a selection of the original ones."""
     return lambda index: name(int(states.origins["row"][index]))
 
 
 def _one_after_another(count: int, first: Callable[[int], str], second: Callable[[int], str]) -> Callable[[int], str]:
-    """The names of ``count`` states, then of others."""
+    """The names of ``count`` states followed by others."""
     return lambda index: first(index) if index < count else second(index - count)
 
 
@@ -121,78 +121,78 @@ def require_memory(size: int, where: Path) -> None:
         raise UserError(what, where, "Give fewer states.")
 
 
-def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, of: str, do: str, warned: list[str]) -> States:
-    """States of a ``kind`` that look like none of the others, which are ``of`` another; none left: a ``UserError``."""
+def _apart(states: States, others: Sequence[NDArray[Any]], kind: str, role: str, do: str, warned: list[str]) -> States:
+    """The states of a ``kind`` that equal none of the others, whose ``role`` is for messages; none: a ``UserError``."""
     kept = leave_out(states, *others)
     count = len(states.labels)
     if len(kept.labels) < count:
         twice = f"{count - len(kept.labels)} of {count} {kind} states"
-        warned.append(f"{twice} look like one {of}: they are left out")
+        warned.append(f"{twice} look like one {role}: they are left out")
     if not len(kept.labels):
-        raise UserError(f"every {kind} state looks like one {of}", None, do)
+        raise UserError(f"every {kind} state looks like one {role}", None, do)
     return kept
 
 
 def as_observations(
     values: NDArray[Any], what: str, like: NDArray[Any] | None = None, *, resize: int = 0, stack: bool = False
 ) -> NDArray[Any]:
-    """Pictures uint8 (N, H, W, C), or else numbers, float32 (N, *shape), as ``hypogoal.domains.observations`` says.
+    """Pictures uint8 (N, H, W, C) or numbers float32 (N, *shape), told apart by ``hypogoal.domains.observations``.
 
-    ``stack``: frames and colours in other places become channels. ``resize``: the longer side of pictures in pixels, at
-    most. What is neither, none at all, or of another kind than those that they are to be ``like`` is a ``UserError``.
+    ``stack``: axes of frames and colours become channels. ``resize``: at most so many pixels on the longer side. Values
+    that are neither, an empty array, and a shape or type that differs from ``like`` are a ``UserError``.
     """
-    found = f"{values.dtype} {values.shape}"
+    actual = f"{values.dtype} {values.shape}"
     if values.dtype.kind not in "iufb" or values.ndim < 2 or 0 in values.shape[1:]:
         do = "Give images (N, height, width, channels), or numbers (N, ...)."
-        raise UserError(f"{what} are not observations", found, do)
+        raise UserError(f"{what} are not observations", actual, do)
     if not len(values):
-        raise UserError(f"there are none of {what}", found, "Give some: from other contexts, where unlabelled.")
+        raise UserError(f"{what} are empty", actual, "Give some; unlabelled ones from other contexts.")
     reading = _reading(values)
     stackable = reading.dtype == PICTURE and reading.picture is not None and len(reading.picture.axes) > 2
     if reading.fault and not (stack and stackable):
         pictures = reading.picture.expression(batch=True) if reading.picture else "uint8 (N, H, W, C)"
         stacks = ", as 'import --stack' does" if stackable else ""
         do = f"Of pictures give {pictures}{stacks}; of numbers x.reshape(len(x), -1)"
-        raise UserError(f"{what} {reading.fault}", found, f"{do}.")
+        raise UserError(f"{what} {reading.fault}", actual, f"{do}.")
     if reading.dtype == PICTURE:
         values = reading.picture.arrange(values) if reading.picture else values
         if resize and max(values.shape[1:3]) > resize:
             values = np.stack([shrunk_picture(picture, resize) for picture in values])
     elif resize:
-        raise UserError("only pictures can be resized", found, "Leave out --resize.")
+        raise UserError("only pictures can be resized", actual, "Leave out --resize.")
     else:
         values = values.astype(NUMBERS, copy=False)
         if not np.isfinite(values).all():
-            raise UserError(f"{what} have numbers that are not finite", found, "Give finite ones.")
+            raise UserError(f"{what} have numbers that are not finite", actual, "Give finite ones.")
     if like is not None and (values.shape[1:], values.dtype) != (like.shape[1:], like.dtype):
-        given = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
-        raise UserError(f"{what} differ in shape or type from the labelled ones", given)
+        difference = f"{values.dtype} {values.shape[1:]}, not {like.dtype} {like.shape[1:]}"
+        raise UserError(f"{what} differ in shape or type from the labelled ones", difference)
     return np.ascontiguousarray(values)
 
 
 def _reading(values: NDArray[Any]) -> Reading:
-    """How observations (N, ...) are read."""
+    """How observations (N, ...) are interpreted."""
     top = float(values.max()) if values.dtype.kind == "f" and values.size else 0.0
     return reading_of(values.shape[1:], values.dtype, top)
 
 
 def as_labels(values: NDArray[Any], count: int, what: str, goals: int | None = None) -> NDArray[np.bool_]:
-    """Labels bool (count, G); another number of them, or other values than 0 and 1, are a ``UserError``."""
-    found = f"{values.dtype} {values.shape}"
+    """Labels bool (count, G); another number, or values other than 0 and 1, are a ``UserError``."""
+    actual = f"{values.dtype} {values.shape}"
     columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or len(columns) != count or columns.shape[1] == 0:
-        raise UserError(f"{what} do not fit {count} states", found, f"Give ({count},), or ({count}, sub-goals).")
+        raise UserError(f"{what} do not fit {count} states", actual, f"Give ({count},), or ({count}, sub-goals).")
     numbers = columns.dtype.kind in "biuf"
-    odd = np.setdiff1d(columns, (0, 1))[:3].tolist() if numbers else found
+    odd = np.setdiff1d(columns, (0, 1))[:3].tolist() if numbers else actual
     if odd:
         raise UserError(f"{what} are not only 0 and 1", odd, "1 where the sub-goal holds, 0 where not.")
     if goals is not None and columns.shape[1] != goals:
-        raise UserError(f"{what} are of {columns.shape[1]} sub-goals, not {goals}", found, "Give a column for each.")
+        raise UserError(f"{what} are of {columns.shape[1]} sub-goals, not {goals}", actual, "Give a column for each.")
     return columns.astype(np.bool_)
 
 
 def named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
-    """The names of ``count`` sub-goals; a ``UserError`` where there are not as many plain ones, each once."""
+    """The names of ``count`` sub-goals; a ``UserError`` unless there are as many plain, distinct ones."""
     names = tuple(sub_goals) or (("sub-goal",) if count == 1 else ())
     if len(names) != count:
         do = f"Give --sub-goal NAME {count} times, in the order of the labels' columns."
@@ -202,10 +202,9 @@ def named(sub_goals: Sequence[str], count: int) -> tuple[str, ...]:
 
 
 def held_out(labels: NDArray[np.bool_], share: float, seed: int) -> NDArray[np.bool_]:
-    """Which states (N,) are held out: ``share`` of each combination of labels (N, G), at random, but never all of one.
+    """Which states are held out, bool (N,): a random ``share`` of each combination of labels (N, G), never all of it.
 
-    What is too little of one combination to be a state is added to the next one's share. No state at all is a
-    ``UserError``.
+    A remainder of less than one state is carried over to the next combination. No state at all is a ``UserError``.
     """
     rng = rng_for(seed, "held-out")
     chosen = np.zeros(len(labels), np.bool_)

@@ -1,4 +1,4 @@
-"""What the labels of equal and of nearly equal states say: contradictions, and test pictures that are hardly new."""
+"""Labels of equal and nearly equal states: contradictions, and held-out pictures that are hardly new."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from hypogoal.dataset import PICTURE, Observations, States, digest
 from hypogoal.domains.observations import resized_picture
 
 GRID = 16  # areas along each side of a picture, whose mean brightness is compared
-LEVELS = 8  # of 255: by at most so much the means of nearly equal pictures differ, once both are equally bright ...
-BRIGHTNESS = 32  # ... which they are not to begin with, by at most so much
+LEVELS = 8  # of 255: the most by which areas of nearly equal pictures differ, after equalising overall brightness
+BRIGHTNESS = 32  # of 255: the most by which overall brightness differs
 RULE = f"in {GRID} x {GRID} areas their brightness differs by at most {LEVELS} of 255 levels"
-MOST_COMPARED = 2_000  # pictures of a set, spread evenly over it
+MOST_COMPARED = 2_000  # pictures per set, spread evenly
 
 Looks: TypeAlias = NDArray[np.bytes_]
 Name: TypeAlias = Callable[[int], str]  # of a state, by its row
 
 
 def looks_of(observations: Observations) -> Looks:
-    """What tells observations (N, ...) apart, (N,)."""
+    """Hashes of observations (N, ...), (N,)."""
     return np.array([digest(each) for each in observations])
 
 
 def contradictions(
     looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name, *, kind: str = "picture"
 ) -> list[str]:
-    """A line for each sub-goal of whose states, labels (N, G), some look the same but differ in their labels."""
+    """A line for each sub-goal with equal states whose labels (N, G) differ."""
     lines = []
     for goal, column in zip(goals, labels.T, strict=True):
         both = np.intersect1d(looks[column], looks[~column])
@@ -42,19 +42,19 @@ def contradictions(
 
 
 def require_own_pictures(looks: Looks, labels: NDArray[np.bool_], goals: Sequence[str], name: Name) -> None:
-    """Refuse (``UserError``) labelled states, labels (N, G), of which all of a class look like one of the other."""
+    """Refuse (``UserError``) labels (N, G) if every state of a class equals one of the other class."""
     for goal, column in zip(goals, labels.T, strict=True):
         for kind, other, of_kind in (("positive", "negative", column), ("negative", "positive", ~column)):
             if np.isin(looks[of_kind], looks[~of_kind]).all():
                 pair = _pair(looks, column, looks[of_kind][0], name)
                 do = "Remove the copies whose label is wrong."
-                raise UserError(f"every {kind} of {goal} is a {other} too", f"for example {pair}", do)
+                raise UserError(f"every {kind} of {goal} is also a {other}", f"for example {pair}", do)
 
 
 def near_duplicates(labelled: States, heldout: States, goals: Sequence[str], names: tuple[Name, Name]) -> list[str]:
-    """A line where held-out pictures nearly equal labelled ones, and one where a sub-goal's classes have such a pair.
+    """A line if held-out pictures nearly equal labelled ones, and one per sub-goal whose classes have such a pair.
 
-    Equal pictures are not meant, nor numbers. ``names``: of labelled and of held-out states.
+    Equal pictures do not count, nor do numbers. ``names``: of labelled and of held-out states.
     """
     if labelled.observations.dtype != PICTURE:
         return []
@@ -81,19 +81,19 @@ def near_duplicates(labelled: States, heldout: States, goals: Sequence[str], nam
 
 
 def _pair(looks: Looks, labels: NDArray[np.bool_], look: Any, name: Name) -> str:
-    """The first positive and the first negative that look like this."""
+    """The names of the first positive and the first negative with this hash."""
     positive, negative = (int(np.flatnonzero((looks == look) & kind)[0]) for kind in (labels, ~labels))
     return f"{name(positive)} and {name(negative)}"
 
 
 def _spread(count: int) -> NDArray[np.int64]:
-    """Rows, all or ``MOST_COMPARED`` of so many."""
+    """All rows of ``count``, or ``MOST_COMPARED`` spread evenly."""
     return np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(np.int64)
 
 
 def _sketches(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Pictures (N, H, W, C) in few numbers (N, D), none of which differs by over LEVELS where two are nearly equal."""
-    if pictures.shape[3] == 3:  # colours in the proportion in which eyes see them bright; else frames, as they are
+    """Pictures (N, H, W, C) as few numbers (N, D); nearly equal ones differ in none by more than LEVELS."""
+    if pictures.shape[3] == 3:  # weighted by perceived brightness; frames stay as they are
         pictures = (pictures @ np.array([0.299, 0.587, 0.114], np.float32)).round().astype(np.uint8)[..., None]
     height, width = (min(GRID, side) for side in pictures.shape[1:3])
     small = np.stack([resized_picture(picture, height, width).ravel() for picture in pictures]).astype(np.float32)
@@ -102,7 +102,7 @@ def _sketches(pictures: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _nearest(sketches: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.int64]:
-    """For each of the sketches (N, D) the row of the other (M, D) that is nearest, -1 where none nearly equals it."""
+    """For each of the sketches (N, D) the row of its nearest of the others (M, D), -1 if none is nearly equal."""
     from scipy.spatial import KDTree
 
     if not len(sketches) or not len(others):

@@ -1,4 +1,4 @@
-"""The stages that have settings, by name: what a command and a function of :mod:`hypogoal.api` do alike."""
+"""Stages with settings, by name: what commands and the functions of :mod:`hypogoal.api` share."""
 
 from collections.abc import Mapping
 from importlib import import_module
@@ -14,31 +14,31 @@ def make(
 ) -> Any:
     """Run ``stage`` with the user's ``settings`` on its ``source``; returns what the stage returns.
 
-    The source is a domain's name, which the user gave, or else the data file or ensemble, which names its own.
-    ``module:object`` among the settings may be loaded, and not what a preset says.
+    The source is a domain's name, which the user typed, or a data file or ensemble, which names its domain.
+    ``module:object`` may be loaded if it is among the settings, not if it is in a preset.
     """
     from hypogoal.domains.base import defaults_of, load_domain
 
-    given = isinstance(source, str)
+    by_user = isinstance(source, str)
     domain = source if isinstance(source, str) else domain_of(source, stage)
-    config = configuration(stage, domain, preset, (), settings, given=given)
+    config = configuration(stage, domain, preset, (), settings, by_user=by_user)
     values = [part for value in settings.values() for part in (value.split(",") if isinstance(value, str) else ())]
-    own = [value for value in defaults_of(domain, stage, given=given).values() if isinstance(value, str)]
+    trusted = [value for value in defaults_of(domain, stage, given=by_user).values() if isinstance(value, str)]
     first: Any = source
     if stage == "collect":
         first, rest["name"] = load_domain(domain, given=True), domain
-    with own_code.given(*map(str.strip, values)), own_code.vouched(*own):
+    with own_code.given(*map(str.strip, values)), own_code.vouched(*trusted):
         return named(stage)(first, config, out, **rest)
 
 
 def named(stage: str) -> Any:
-    """The function of a stage, which is imported where it is needed."""
+    """The function of a stage, imported when needed."""
     name = stage.replace("-", "_")
     return getattr(import_module(f"hypogoal.stages.{name}"), name)
 
 
 def domain_of(source: Path, stage: str) -> str:
-    """The domain of what a stage is given: a data file or an ensemble."""
+    """The domain of a stage's source, a data file or an ensemble."""
     from hypogoal.core.artefacts import open_artefact
     from hypogoal.dataset import open_dataset
 

@@ -17,7 +17,7 @@ from hypogoal.dataset import GET_MORE, hard_to_judge, hard_to_learn, open_datase
 from hypogoal.domains.base import BUILT_IN, Domain
 from hypogoal.options.config import OptionConfig
 
-COLLECT_BASE = 200e6  # bytes of a process that collects next to nothing
+COLLECT_BASE = 200e6  # bytes of a process that collects almost nothing
 
 
 def collect(
@@ -33,36 +33,36 @@ def collect(
 ) -> dict[str, Any]:
     """Collect ``domain``'s states into the HDF5 file ``out``, with an instance of its ``config_class``.
 
-    ``name`` is that by which later stages find the domain; its own where None. ``resume``: go on with what was begun,
-    of a domain whose collecting can be resumed. Returns numbers of states and positives per split and sub-goal.
+    ``name``, by default the domain's own, is the one by which later stages find it. ``resume``: continue an unfinished
+    output, for domains that can. Returns numbers of states and positives per split and sub-goal.
     """
-    require_names(domain.sub_goals)  # not after all the play, when the file is written
-    given, out = out, claim(out, kind=DATA, force=force, resume=resume)
-    about: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
-    about["inputs"] = [{"path": str(path), "sha256": sha256_of(path)} for path in domain.inputs(config)]
+    require_names(domain.sub_goals)  # before play, not when the file is written
+    requested, out = out, claim(out, kind=DATA, force=force, resume=resume)
+    identity: dict[str, Any] = {"domain": name or domain.name, "config": as_dict(config), "seed": seed}
+    identity["inputs"] = [{"path": str(path), "sha256": sha256_of(path)} for path in domain.inputs(config)]
     if resume and out.exists() and not unfinished(out):
-        found = open_dataset(out)
-        before = {"domain": found.domain, "config": found.config, "seed": found.attributes["seed"]}
-        raise check_complete({**before, "inputs": found.inputs}, about, given)
+        existing = open_dataset(out)
+        before = {"domain": existing.domain, "config": existing.config, "seed": existing.attributes["seed"]}
+        raise check_complete({**before, "inputs": existing.inputs}, identity, requested)
     if domain.doubt:
         say(f"hypogoal: {domain.doubt}", err=True)
     size = domain.collected_bytes(config)
     preflight("collect", out, Needs(COLLECT_BASE + 2 * size, size / domain.packed), quiet=quiet)
-    with draft(out, {"kind": "data", **about, "versions": versions()}, force=force, resume=resume) as work:
+    with draft(out, {"kind": "data", **identity, "versions": versions()}, force=force, resume=resume) as work:
         kept = {"kept": partial(checkpoints_of, work.files)} if domain.resumes else {}
-        with Progress(f"collect {about['domain']}", total=1, quiet=quiet) as progress:
+        with Progress(f"collect {identity['domain']}", total=1, quiet=quiet) as progress:
             collected = domain.collect(config, seed, progress, **kept)
-        made = work.files / out.name
-        write_dataset(made, collected, **about, force=True)
-        put_in_place(made, out)
-    if about["domain"] not in BUILT_IN:
-        told = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
-        for line in told + hard_to_judge(collected.heldout.labels, collected.sub_goals):
+        file = work.files / out.name
+        write_dataset(file, collected, **identity, force=True)
+        put_in_place(file, out)
+    if identity["domain"] not in BUILT_IN:
+        warnings = [f"{line}. {GET_MORE}" for line in hard_to_learn(collected.labelled.labels, collected.sub_goals)]
+        for line in warnings + hard_to_judge(collected.heldout.labels, collected.sub_goals):
             say(f"hypogoal: {line}", err=True)
         if "step" in collected.labelled.origins and "option_timeout" not in domain.defaults.get("train-options", {}):
             soonest = (collected.labelled.origins["step"][held].min() for held in collected.labelled.labels.T)
             apart = int(np.diff(sorted([0, *soonest])).max())  # of two sub-goals, or the start and one
             if 2 * apart > OptionConfig.option_timeout and not quiet:
-                what = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
-                say(f"hypogoal: {what}: --set option_timeout={2 * apart} gives options time for that", err=True)
+                message = f"play took up to {apart} steps from one sub-goal to the next, each at its earliest"
+                say(f"hypogoal: {message}: --set option_timeout={2 * apart} gives options time for that", err=True)
     return open_dataset(out).counts()

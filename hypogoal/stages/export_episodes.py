@@ -19,11 +19,11 @@ NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")
 def export_episodes(
     meta: Path, out: Path, *, episodes: int = 20, seed: int = 0, force: bool = False, quiet: bool = False
 ) -> int:
-    """Let the agent of a meta artefact play, and write what happened as a Minari dataset; returns its steps.
+    """Let the agent of a meta artefact play and write its episodes as a Minari dataset; returns the number of steps.
 
     ``out`` is the dataset's folder; its name, such as ``solved-v0``, ends the dataset's id, see :func:`dataset_id`.
-    ``seed`` is of the draws of options. With ``force`` an empty folder is replaced; any other has to be moved away. No
-    such agent, no such name, or something at ``out`` is a ``UserError``.
+    ``seed`` determines the draws of options. ``force`` replaces an empty folder only. A missing agent, another name, or
+    an existing ``out`` is a ``UserError``.
     """
     prepare()
     if not NAME.fullmatch(out.name):
@@ -37,22 +37,22 @@ def export_episodes(
     )
     loop = agent_of(source, seed)
 
-    def told(progress: Progress) -> Iterator[Episode]:
+    def counted(progress: Progress) -> Iterator[Episode]:
         for number, episode in enumerate(play_episodes(loop, episodes), 1):
             yield episode
             progress.update(number)
 
     with draft(out, {"kind": "episodes"}, force=force) as work:
         with Progress("export", total=episodes, quiet=quiet) as progress:
-            about = {"name": dataset_id(out), "description": described}
-            steps = write_minari(work.files, told(progress), actions=loop.engine.n_actions, **about)
+            details = {"name": dataset_id(out), "description": described}
+            steps = write_minari(work.files, counted(progress), actions=loop.engine.n_actions, **details)
         put_in_place(work.files, out)
     return steps
 
 
 def dataset_id(out: Path) -> str:
-    """By which id minari finds a dataset's folder: ``namespace/name-v0`` below where it looks, else ``name-v0``."""
-    told = os.environ.get("MINARI_DATASETS_PATH")
-    root = Path(os.path.expanduser("~"), ".minari", "datasets") if told is None else Path(told)
+    """The id by which minari finds a dataset's folder: its path below minari's root folder, else its name."""
+    configured = os.environ.get("MINARI_DATASETS_PATH")
+    root = Path(os.path.expanduser("~"), ".minari", "datasets") if configured is None else Path(configured)
     place, root = out.resolve(), root.resolve()
     return place.relative_to(root).as_posix() if place.is_relative_to(root) else out.name

@@ -1,4 +1,4 @@
-"""Spec B6: states that users bring, as a data file, and a data file's states as arrays for other software."""
+"""Spec B6: import of users' states into a data file, and export of a data file's states as arrays."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,15 +35,14 @@ def import_data(
     seed: int = 0,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Write the states of ``source`` into the data file ``out``; returns numbers of states and positives, as
-    :func:`collect`.
+    """Write the states of ``source`` into the data file ``out``; returns numbers of states and positives.
 
     ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of images, or a Minari dataset's folder.
-    ``sub_goals`` are names in the order of the labels' columns; of a Minari dataset ``labels`` has by sub-goal
-    ``module:function`` from an observation to a truth, and ``key`` is the part of a dictionary that is meant.
-    ``share`` of the labelled states, by ``seed``, is held out where no held-out ones are given. ``resize`` is the
-    longer side of pictures in pixels, at most; 0: as it is. ``stack``: axes of frames and colours become channels.
-    ``domain`` is what they are of, for later stages. Errors: see ``hypogoal.own_data``.
+    ``sub_goals`` are names in the order of the labels' columns. For a Minari dataset, ``labels`` maps sub-goals to
+    ``module:function``, from an observation to a truth value, and ``key`` selects a part of a dictionary. Without
+    held-out states a ``share`` of the labelled ones is held out by ``seed``. ``resize``: at most so many pixels on the
+    longer side of pictures; 0: unchanged. ``stack``: axes of frames and colours become channels. ``domain`` is for
+    later stages. Errors: see ``hypogoal.own_data``.
     """
     claim(out, kind=DATA, inputs=[source], force=force)
     if (source / MINARI).exists():
@@ -67,14 +66,14 @@ def import_data(
 
 
 def _too_small(domain: str, states: Collected) -> list[str]:
-    """What ``train-ensemble`` will say of such images, unless it is given another network."""
+    """The error that ``train-ensemble`` will raise for such images with its default network, if any."""
     from hypogoal.hypotheses.config import EnsembleConfig
     from hypogoal.hypotheses.networks import build_network, network_for
 
     name = defaults_of(domain, "train-ensemble", given=True).get("network", EnsembleConfig().network)
     name = network_for(name, states.labelled.observations.dtype)
     try:
-        with own_code.vouched(name):  # by the domain
+        with own_code.vouched(name):  # the domain names it
             build_network(name, states.observation_shape, torch_generator(0, "import"))
     except UserError as error:
         return [str(error)]
@@ -82,11 +81,11 @@ def _too_small(domain: str, states: Collected) -> list[str]:
 
 
 def export_data(data: Path, out: Path, *, force: bool = False) -> None:
-    """Write the states of a data file as ``.npz``, which ``import_data`` takes again; see :func:`write_arrays`."""
+    """Write the states of a data file as ``.npz``, which ``import_data`` reads; see :func:`write_arrays`."""
     if out.suffix != ".npz":
         raise UserError("states are exported as .npz", out, "Give --out NAME.npz.")
     out = claim(out, kind=ARRAYS, inputs=[data], force=force)
     dataset = open_dataset(data)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(out) as made:
-        write_arrays(made, dataset)
+    with replacing(out) as fresh:
+        write_arrays(fresh, dataset)

@@ -1,4 +1,4 @@
-"""Spec B6: states marked by hand, in the folder of images that ``import`` takes."""
+"""Spec B6: states marked by hand, in a folder of images for ``import``."""
 
 import json
 from collections.abc import Mapping
@@ -30,18 +30,18 @@ def label(
     resume: bool = False,
     record: Path | None = None,
 ) -> dict[str, int]:
-    """Show states in a window and keep what a person says of them; returns how many states of each kind are marked.
+    """Show states in a window and save a person's marks; returns the number of marked states of each kind.
 
-    ``source`` is a data file, a ``.npz`` file or a folder of images, whose states are shown one after another; or what
-    is played: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
-    environment, with ``arguments``. ``out`` is the folder, whose name is the sub-goal's; ``heldout``: the marks are for
-    evaluation, in ``out/heldout``. ``fps``: steps a second in real time; 0: a step for each key. ``record``: the file
-    that what is played becomes, for ``collect --play``. No such source, an ``out`` that exists and is not to be gone on
-    with (``resume``), a ``record`` that exists, or no screen is a ``UserError``.
+    ``source`` is a data file, a ``.npz`` file or a folder of images, whose states are shown in turn; or an environment
+    to play: a domain, a Gymnasium environment's id, or ``module:object``, a domain or a function that makes an
+    environment from ``arguments``. ``out`` is the folder, named after the sub-goal; ``heldout``: the marks are for
+    evaluation, in ``out/heldout``. ``fps``: steps per second in real time; 0: a step for each key. ``record``: a file
+    for the episodes played, for ``collect --play``. A missing source, an existing ``out`` without ``resume``, an
+    existing ``record``, and a missing screen are a ``UserError``.
     """
     require_names([out.resolve().name])
     if out.exists() and not resume and not (heldout and not (out / HELD_OUT).exists()):
-        raise UserError("it exists already", out, "Give --resume to go on with it, or another --out.")
+        raise UserError("the folder exists already", out, "Give --resume to continue it, or another --out.")
     if record and (record.exists() or Path(source).exists()):
         raise UserError("--record needs a new file", record, "Give another --record, or none.")
     states: Source
@@ -62,20 +62,20 @@ def label(
 
 
 def environment_of(source: str, arguments: Mapping[str, Any]) -> Any:
-    """An environment by its id, of a domain, or by the function that makes it; none such is a ``UserError``."""
+    """An environment by its id, of a domain, or from the function that makes it; an unknown one is a ``UserError``."""
     import ale_py
-    import minigrid  # noqa: F401 - registers its environments when it is loaded
+    import minigrid  # noqa: F401 - loading it registers its environments
 
     gymnasium.register_envs(ale_py)
     if source in gymnasium.registry:
         return gymnasium.make(source, **arguments)
     try:
-        found = own_code.load_own(source, "environment", ENTRY_POINTS, BUILT_IN)
+        loaded = own_code.load_own(source, "environment", ENTRY_POINTS, BUILT_IN)
     except UserError as error:
-        if source.partition(":")[2] in gymnasium.registry:  # Gymnasium's module:id, and the module is loaded now
+        if source.partition(":")[2] in gymnasium.registry:  # Gymnasium's module:id; the module is loaded now
             return gymnasium.make(source, **arguments)
         if ":" in source:
             raise
         do = "Give a data file, a .npz file, a folder of images, a domain, an environment's id or module:object."
         raise UserError("neither a file nor an environment", source, do) from error
-    return found.make_env(**arguments) if isinstance(found, Domain) else found(**arguments)
+    return loaded.make_env(**arguments) if isinstance(loaded, Domain) else loaded(**arguments)

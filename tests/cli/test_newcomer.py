@@ -78,7 +78,7 @@ def test_an_option_is_a_setting(tmp_path: Path, capsys: pytest.CaptureFixture[st
         found[name] = (config["steps"], config["setting"])
     assert {*found.values()} == {(640, "paper")}
     capsys.readouterr()
-    for wrong, words in (("0", "out of range"), ("many", "wrong kind of value")):
+    for wrong, words in (("0", "out of range"), ("many", "wrong type of value")):
         assert main([*train, "--steps", wrong, "--out", str(tmp_path / "none")]) == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from toy_data import reseal
+from toy_data import files_of, reseal
 
 from hypogoal.core.artefacts import check_files, claim, create_artefact, find_artefacts, open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.hdf5 import create_hdf5
-from hypogoal.core.manifests import files_of
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import load_tensors, save_tensors
 
@@ -67,7 +66,7 @@ def test_refusals(tmp_path: Path) -> None:
     (tmp_path / "other" / "mine.txt").write_text("precious")
     cases = [
         (lambda: claim(out, kind="meta"), "exists already"),
-        (lambda: claim(tmp_path / "other", kind="meta", force=True), "no manifest"),
+        (lambda: claim(tmp_path / "other", kind="meta", force=True), "without a manifest"),
         (lambda: open_artefact(tmp_path / "none"), "no such artefact"),
         (lambda: open_artefact(tmp_path / "other"), "not an artefact"),
         (lambda: open_artefact(out, "ensemble"), "'ensemble' is needed|but ensemble is needed"),
@@ -130,7 +129,7 @@ def test_force_replaces_only_what_a_stage_makes_there(tmp_path: Path) -> None:
     ]
     cases += [(tmp_path / name, kind) for name in texts for kind in ("meta", "data", "arrays")]
     for out, kind in cases:
-        with pytest.raises(UserError, match="what stands there is not of kind"):
+        with pytest.raises(UserError, match="the existing output is not of kind"):
             claim(out, kind=kind, force=True)
     assert contents(tmp_path) == before
     (meta / "manifest.json").write_text('{"format": 1, "kind": "meta"}')  # damaged, and to be made again

@@ -124,9 +124,9 @@ def test_what_is_unfinished_is_not_begun_anew_by_mistake(tmp_path: Path) -> None
     out = tmp_path / "meta"
     with pytest.raises(Broken):
         stop(out, Broken())
-    with pytest.raises(UserError, match="an unfinished output is there"):
+    with pytest.raises(UserError, match="an unfinished output exists"):
         claim(out, kind="meta")
-    with pytest.raises(UserError, match="an unfinished output is there"):
+    with pytest.raises(UserError, match="an unfinished output exists"):
         finish(out)
     assert unfinished(out) and claim(out, kind="meta", resume=True) and claim(out, kind="meta", force=True)
 
@@ -135,7 +135,7 @@ def test_a_full_disk_says_that_the_checkpoint_is_kept(tmp_path: Path) -> None:
     """Spec G1: or 'run it again' is done without --resume, and refused."""
     with pytest.raises(OSError, match="No space left") as caught:
         stop(tmp_path / "meta", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
-    assert notes_of(caught.value) == ["the last checkpoint is kept: give the same command with --resume to go on"]
+    assert notes_of(caught.value) == ["the last checkpoint is kept: give the same command with --resume to continue"]
 
 
 def test_a_damaged_draft_is_one_line(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_no_room_leaves_nothing(tmp_path: Path) -> None:
 
 def test_want_of_memory_says_that_the_checkpoint_is_kept(tmp_path: Path) -> None:
     """Spec G1: and so does whatever else ends a stage, unless it says itself what to do about the checkpoint."""
-    note = ["the last checkpoint is kept: give the same command with --resume to go on"]
+    note = ["the last checkpoint is kept: give the same command with --resume to continue"]
     for number, error in enumerate((MemoryError(), RuntimeError("can't allocate memory"), UserError("your code"))):
         with pytest.raises(type(error)) as caught:
             stop(tmp_path / str(number), error)

@@ -43,7 +43,7 @@ def test_a_control_group_allows_less(
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(preflight, "_folders", lambda: [tmp_path, tmp_path / "none"])
     if free is None:
-        assert abs((preflight.free_memory() or 0) - (preflight._told("/proc/meminfo", "MemAvailable:") or 0)) < 2**30
+        assert abs((preflight.free_memory() or 0) - (preflight._amount("/proc/meminfo", "MemAvailable:") or 0)) < 2**30
     else:
         assert preflight.free_memory() == free
 

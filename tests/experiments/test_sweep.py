@@ -178,7 +178,7 @@ def test_a_lost_plan_is_written_anew_and_what_is_complete_is_kept(
     other.write_text((swept / "toy.toml").read_text().replace("steps=6", "steps=7"))
     assert main(["sweep", str(other), "--out", str(out), "-q"]) == 2
     err = capsys.readouterr().err
-    assert "not what the command of ensemble-seed-0 makes: what is complete there was made with steps=6, not 7" in err
+    assert "not what the command of ensemble-seed-0 makes: the complete output was made with steps=6, not 7" in err
     assert (out / "sweep.json").read_text() == ""
     assert main(["sweep", str(swept / "toy.toml"), "--out", str(out), "-q"]) == 0
     assert "is written anew: what is complete is kept" in capsys.readouterr().err

@@ -126,7 +126,7 @@ def test_a_share_is_held_out_where_nothing_else_is_given(tmp_path: Path, capsys:
     counts = open_dataset(data).counts()
     assert counts["heldout"]["sub-goal"] == {"states": 10, "positives": 5}
     assert counts["labelled"]["sub-goal"] == {"states": 30, "positives": 15}
-    assert "says nothing of other contexts" in capsys.readouterr().err
+    assert "says nothing about other contexts" in capsys.readouterr().err
 
 
 def test_a_share_is_held_out_of_many_small_groups_too() -> None:
@@ -190,7 +190,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"unlabelled": np.zeros((60, 12, 48, 48), np.uint8)}, r"frames, first: uint8 \(60, 12, 48, 48\)"),
     ({"observations": np.zeros((40, 0), np.uint8)}, "are not observations"),
     ({"unlabelled": np.zeros((5, 9, 9, 3), np.uint8)}, "differ in shape or type from the labelled ones"),
-    ({"unlabelled": pictures(0)[0]}, "there are none of the unlabelled observations"),
+    ({"unlabelled": pictures(0)[0]}, "the unlabelled observations are empty"),
     ({"labels": np.arange(39) % 2}, "do not fit 40 states"),
     ({"labels": np.zeros(0)}, "do not fit 40 states"),
     ({"sub_goals": np.array([b"won"])}, r"sub_goals are \|S3, not texts"),

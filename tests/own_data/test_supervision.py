@@ -64,14 +64,16 @@ def test_labelled_and_held_out_pictures_contradict_each_other_too() -> None:
 def test_a_class_without_a_picture_of_its_own_is_refused(tmp_path: Path, only: bool) -> None:
     """Spec B6, G2: all pictures twice; or every positive, or negative, a copy of some other; nothing is written."""
     images, labels = pictures(40)
-    with pytest.raises(UserError, match=r"every positive of sub-goal is a negative too: for example observations\[0\]"):
+    with pytest.raises(
+        UserError, match=r"every positive of sub-goal is also a negative: for example observations\[0\]"
+    ):
         warned_of(observations=np.concatenate([images, images]), labels=np.arange(80) < 40)
     kept = labels if only else ~labels
     copied = {"observations": np.concatenate([images, images[kept]]), "labels": np.append(labels, ~labels[kept])}
     kind, other = ("positive", "negative") if only else ("negative", "positive")
-    with pytest.raises(UserError, match=f"every {kind} of sub-goal is a {other} too: .* Remove the copies"):
+    with pytest.raises(UserError, match=f"every {kind} of sub-goal is also a {other}: .* Remove the copies"):
         warned_of(**copied)
-    with pytest.raises(UserError, match=f"every {kind} of sub-goal is a {other} too"):
+    with pytest.raises(UserError, match=f"every {kind} of sub-goal is also a {other}"):
         warned_of(**copied, heldout_observations=None, heldout_labels=None)
     folder = save_images(tmp_path / "goal")
     for file in (folder / kind).iterdir():

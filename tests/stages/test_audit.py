@@ -13,11 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from own_domain import CorridorDomain, TallCorridor
 from PIL import Image
+from toy_data import files_of
 
 from hypogoal.cli import main
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints, State
-from hypogoal.core.manifests import files_of
 from hypogoal.core.own_code import OF_FILE
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.domains.doorkey_engine import KEY, TILE, DoorKeyEngine, tiles

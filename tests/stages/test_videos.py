@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from toy_data import files_of
 
 from hypogoal.core.artefacts import create_artefact, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.core.manifests import files_of
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation import choosing

@@ -1,0 +1,65 @@
+"""The check that counts functions with vague names (``make check``)."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.vague_names import count, main
+
+SOURCE = '''
+"""A module: docstrings told nothing about names."""
+
+
+def clear(rows, columns):
+    total = sum(row for row in rows)
+    return total, columns.told
+
+
+def argument(told):
+    return told
+
+
+def local(rows):
+    for one in rows:
+        print(one)
+
+
+def from_lambda(rows):
+    return sorted(rows, key=lambda about: about.size)
+
+
+def outer(rows):
+    def inner(own):
+        return own
+
+    return inner(rows)
+
+
+def message(size):
+    what = f"too large ({size})"
+    raise UserError(what)
+
+
+def passed_on(path, what, do):
+    return path, what, do
+
+
+def vague_what(what):
+    return what
+'''
+
+
+def test_functions_with_vague_arguments_and_locals_are_counted(tmp_path: Path) -> None:
+    (tmp_path / "part").mkdir()
+    (tmp_path / "part" / "module.py").write_text(SOURCE)
+    (tmp_path / "clear.py").write_text("def clear(rows):\n    return rows\n")
+    total, vague = count(tmp_path)
+    assert total == 10  # inner counts, outer is clear
+    assert dict(vague) == {"part/module.py": 5, "clear.py": 0}  # argument, local, from_lambda, inner, vague_what
+
+
+def test_above_the_limit_it_fails_and_names_the_worst_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "module.py").write_text(SOURCE)
+    assert main(tmp_path, limit=0.6) == 0
+    assert main(tmp_path, limit=0.5) == 1
+    assert "5 in module.py" in capsys.readouterr().out
