@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 BASE = 400e6
 MEMBER = 8e6  # weights of a member whose network is the user's own, where it is not run
-WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.windows), while their table grows
+WINDOWS = 6e6  # of a member's numbers for known windows (hypotheses.known_windows), while their table grows
 PAPER_POLICY = 42e6  # weights of a member's policy in the paper's setting: 10.5 M parameters
 LIGHT_POLICIES = 1e6  # weights of all light policies, which share most of them; 0.4 MB of 15 options, 0.7 with a grid
 COPIES = 5  # of weights in training: those, a target or gradients beside them, and two of Adam's

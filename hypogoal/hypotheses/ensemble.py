@@ -32,7 +32,7 @@ from hypogoal.hypotheses.networks import (
 from hypogoal.hypotheses.views import AgentView, FullView
 
 THRESHOLD = 0.5  # of the probability, where none was chosen
-CHUNK = 64  # images at once in a plain forward pass: what fits a CPU's cache; on a GPU 16 times as many
+IMAGES_AT_ONCE = 64  # images at once in a plain forward pass: what fits a CPU's cache; on a GPU 16 times as many
 PATCH_CHUNK = 4096  # images at once where few patches are distinct
 FOLD_FROM = 32  # images from which making BatchNorm part of the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
@@ -190,7 +190,7 @@ class Ensemble(nn.Module):
         if was_training:
             self.eval()
         logits = np.empty((len(observations), len(self), 2), dtype=np.float32)
-        chunk = PATCH_CHUNK if self.thresholds.device.type == "cpu" else CHUNK * 16
+        chunk = PATCH_CHUNK if self.thresholds.device.type == "cpu" else IMAGES_AT_ONCE * 16
         with torch.inference_mode():
             for start in range(0, len(observations), chunk):
                 some = observations[start : start + chunk]
@@ -225,7 +225,7 @@ class Ensemble(nn.Module):
                 return _logits(trunk, heads, batch)
         if len(observations) >= FOLD_FROM:
             trunk, heads = trunk and folded(trunk), tuple(folded(head) for head in heads)
-        chunk = at_once(CHUNK, observations.shape[1:]) if device.type == "cpu" else len(observations)
+        chunk = at_once(IMAGES_AT_ONCE, observations.shape[1:]) if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
             inputs = as_input(torch.from_numpy(observations[start : start + chunk]).to(device))

@@ -14,9 +14,9 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.hypotheses.changes import grey_maps, pattern
 from hypogoal.hypotheses.networks import folded
 
-CELL = 4  # pixels: the side of a heat-map's cell
+HEAT_CELL = 4  # pixels: the side of a heat-map's cell
 FEATURES = 32  # of a cell
-CHUNK = 64  # states at once where no gradient is kept
+LOCATED_AT_ONCE = 64  # states at once where no gradient is kept
 STEPS, BATCH, LEARNING_RATE, L2_WEIGHT = 1500, 24, 2e-3, 1e-4
 HELD_SHARE = 0.35  # of the labelled states are shown as if nothing moved
 FARTHEST_SHIFT = 20  # pixels
@@ -27,7 +27,7 @@ BLOBS = 2  # at most
 GREY_SHARE = 0.5  # of the states get their shades changed
 
 
-Pixels = Callable[[NDArray[np.int64]], NDArray[np.float64]]  # positions (N, 3) -> row and column (N, 2)
+AgentPixels = Callable[[NDArray[np.int64]], NDArray[np.float64]]  # positions (N, 3) -> row and column (N, 2)
 
 
 class RamLocaliser(nn.Module):
@@ -38,7 +38,7 @@ class RamLocaliser(nn.Module):
 
     needs_positions = True
 
-    def __init__(self, pixels: Pixels):
+    def __init__(self, pixels: AgentPixels):
         super().__init__()
         self.pixels = pixels
 
@@ -71,8 +71,8 @@ class LearnedLocaliser(nn.Module):
         places = np.empty((len(observations), 2))
         device = next(self.network.parameters()).device
         with torch.inference_mode():
-            for start in range(0, len(observations), CHUNK):
-                chunk = slice(start, start + CHUNK)
+            for start in range(0, len(observations), LOCATED_AT_ONCE):
+                chunk = slice(start, start + LOCATED_AT_ONCE)
                 images = torch.from_numpy(observations[chunk]).to(device, torch.float32)
                 places[chunk] = _peaks(self.network(_as_heat_input(images))[:, 0]).cpu().numpy()
         return places
@@ -135,7 +135,7 @@ def _held(observations: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[
 
 def _heat_loss(heat: Tensor, places: NDArray[np.float64]) -> Tensor:
     """Cross entropy of heat-maps (B, rows, columns) as distributions over cells; agents out of sight do not count."""
-    cells = np.floor((places + 0.5) / CELL).astype(np.int64)
+    cells = np.floor((places + 0.5) / HEAT_CELL).astype(np.int64)
     seen = ((cells >= 0) & (cells < heat.shape[1:])).all(1)
     cell = torch.from_numpy((cells[:, 0] * heat.shape[2] + cells[:, 1])[seen])
     return functional.cross_entropy(heat.flatten(start_dim=1)[torch.from_numpy(seen)], cell)
@@ -180,7 +180,7 @@ def _peaks(heat: Tensor) -> Tensor:
     shares = around[torch.arange(count), cell[:, 0], cell[:, 1]].flatten(start_dim=1).softmax(dim=1).view(count, 3, 3)
     offsets = torch.tensor([-1.0, 0.0, 1.0], device=heat.device)
     refined = cell + torch.stack([shares.sum(dim=2) @ offsets, shares.sum(dim=1) @ offsets], dim=1)
-    return (refined + 0.5) * CELL - 0.5
+    return (refined + 0.5) * HEAT_CELL - 0.5
 
 
 def _changed(

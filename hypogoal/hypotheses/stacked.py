@@ -15,11 +15,11 @@ from torch.nn import functional
 from hypogoal.core.compute import tensor
 from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.known_windows import KnownWindows, split_of
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.views import FullView
-from hypogoal.hypotheses.windows import KnownWindows, split_of
 
-CHUNK = 64  # images at once: what fits a CPU's cache
+IMAGES_AT_ONCE = 64  # images at once: what fits a CPU's cache
 WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # the same for all members at once
 
 
@@ -31,8 +31,8 @@ class StackedMembers:
     an encoder that members share, are not ``joined``: each ensemble predicts by itself.
 
     The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
-    ``repeats``: states are of a grid world, so what convolutions make of windows is kept, see :mod:`.windows`; where
-    members do not see all of a state, or on a GPU, it makes no difference.
+    ``repeats``: states come from a grid world, so the convolutions' outputs for windows are kept, see
+    :mod:`.known_windows`; it has no effect where members see a part of a state, or on a GPU.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble], *, repeats: bool = False):
@@ -61,7 +61,7 @@ class StackedMembers:
         seen = self._see(observations, positions)
         rows = [np.empty((0, self.count), dtype=np.float32)]
         with torch.inference_mode():
-            chunk = at_once(CHUNK, seen.shape[1:])
+            chunk = at_once(IMAGES_AT_ONCE, seen.shape[1:])
             for start in range(0, len(seen), chunk):
                 logits = self._logits(seen[start : start + chunk])
                 rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())

@@ -18,7 +18,7 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import Round
-from hypogoal.hypotheses.views import FullView, windows
+from hypogoal.hypotheses.views import FullView, cut_windows
 
 SECONDS = 0.3  # after which no larger batch is tried
 LEARNING = 3  # numbers beside each weight that learns: its gradient and two of Adam's
@@ -46,7 +46,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     cut, margin = pictures and config.view == "agent-crop", config.jitter
     if cut:  # in the middle, wherever the agent is
         size = config.crop_height + 2 * margin, config.crop_width + 2 * margin
-        states = windows(states, np.tile(np.divide(states.shape[1:3], 2), (len(states), 1)), *size)
+        states = cut_windows(states, np.tile(np.divide(states.shape[1:3], 2), (len(states), 1)), *size)
     shape = (config.crop_height, config.crop_width, *states.shape[3:]) if cut else states.shape[1:]
     view = FullView(shape, None if pictures else standard_of(shape, states))
     states = states if pictures else view.see(states)

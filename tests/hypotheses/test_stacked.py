@@ -73,7 +73,7 @@ def test_a_window_s_numbers_do_not_depend_on_its_company() -> None:
 
 def test_networks_without_windows_are_judged_whole() -> None:
     """Spec C5: an own network with padding, pictures that are no grid world."""
-    from hypogoal.hypotheses.windows import split_of
+    from hypogoal.hypotheses.known_windows import split_of
 
     padded = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3, padding=1), torch.nn.ReLU())
     assert split_of(padded) is None

@@ -26,7 +26,7 @@ from hypogoal.hypotheses.localisers import (
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.training import fit
-from hypogoal.hypotheses.views import AgentView, FullView, windows
+from hypogoal.hypotheses.views import AgentView, FullView, StateOrigins, cut_windows
 
 SHAPE = (84, 84, 4)
 
@@ -39,16 +39,16 @@ def numbered(count: int = 1) -> NDArray[np.uint8]:
 
 def test_a_window_by_hand() -> None:
     """The pixel in the middle of an odd window is the agent's; of an even one it is the one after the middle."""
-    odd = windows(numbered(), np.array([[2.0, 3.0]]), 3, 3)
+    odd = cut_windows(numbered(), np.array([[2.0, 3.0]]), 3, 3)
     np.testing.assert_array_equal(odd[0, :, :, 0], [[12, 13, 14], [22, 23, 24], [32, 33, 34]])
-    even = windows(numbered(), np.array([[2.4, 3.4]]), 2, 4)
+    even = cut_windows(numbered(), np.array([[2.4, 3.4]]), 2, 4)
     np.testing.assert_array_equal(even[0, :, :, 0], [[11, 12, 13, 14], [21, 22, 23, 24]])
     np.testing.assert_array_equal(even[0, :, :, 1], [[2, 3, 4, 5], [3, 4, 5, 6]])
 
 
 def test_outside_the_image_is_black() -> None:
     """At two corners, and somewhere else altogether; each state has its own window."""
-    found = windows(numbered(3), np.array([[0.0, 0.0], [5.0, 6.0], [-90.0, 400.0]]), 3, 3)[..., 1]
+    found = cut_windows(numbered(3), np.array([[0.0, 0.0], [5.0, 6.0], [-90.0, 400.0]]), 3, 3)[..., 1]
     np.testing.assert_array_equal(found[0], [[0, 0, 0], [0, 0, 1], [0, 1, 2]])
     np.testing.assert_array_equal(found[1], [[9, 10, 0], [10, 11, 0], [0, 0, 0]])
     assert not found[2].any()
@@ -253,7 +253,7 @@ def test_data_that_do_not_say_enough_are_one_clear_line() -> None:
     with pytest.raises(UserError, match=r"do not say room, x, y of each state: localiser=ram"):
         fit_crop(observations, labels, observations, origins=origins)
     with pytest.raises(UserError, match="the agent's place in these observations is not known: view=agent-crop"):
-        fit(observations, labels, observations, CROP, 0, origins=origins)
+        fit(observations, labels, observations, CROP, 0, origins=StateOrigins(origins))
     with pytest.raises(UserError, match="the surroundings of the agent are not known: augment=grey-context"):
         fit(observations, labels, observations, dataclasses.replace(CROP, view="full", augment="grey-context"), 0)
     plain = dataclasses.replace(CROP, view="full")

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.patches import windows_of
 
-MOST = 16_384  # windows kept; with 960 numbers each, 63 MB
+MOST_WINDOWS = 16_384  # windows kept; with 960 numbers each, 63 MB
 BATCH = 4  # windows computed at once, always so many
 
 
@@ -48,7 +48,7 @@ class KnownWindows:
     pixels. Where there are more than ``most`` windows it begins anew.
     """
 
-    def __init__(self, compute: Callable[[Tensor], Tensor], side: int, stride: int, most: int = MOST):
+    def __init__(self, compute: Callable[[Tensor], Tensor], side: int, stride: int, most: int = MOST_WINDOWS):
         self.compute, self.side, self.stride, self.most = compute, side, stride, most
         self._rows: dict[bytes, int] = {}
         self._table = torch.empty(0)
