@@ -81,9 +81,7 @@ class TrainingStates:
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
         self._trunk, self._features = trunk, None
-        self.shared = (
-            [*trunk.parameters()] if trunk is not None and not frozen else []
-        )  # weights that all networks train
+        self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # trained by all networks
         if trunk is not None and frozen and not (grey or jitter):
             size = at_once(EVALUATED_AT_ONCE, images.shape[1:])
             chunks = [np.arange(at, min(at + size, len(images))) for at in range(0, len(images), size)]
@@ -143,7 +141,7 @@ class TrainingStates:
     def count_in(
         self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
     ) -> None:
-        """Update BatchNorm's running statistics, of networks in training mode, with states (B,); computes nothing else."""
+        """Update BatchNorm's running statistics, of networks in training mode, with states (B,), and nothing else."""
         first = [_up_to_last_norm(network) for network in (networks if self._trunk is None else [self._trunk])]
         if not any(len(network) for network in first):
             return

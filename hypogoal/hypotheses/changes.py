@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-# augment=grey-context: the share of states that change, the share of those that get a pattern, and the pixels kept above,
-# below, left and right of the agent.
+# augment=grey-context: the share of states that change, the share of those that get a pattern, and the pixels kept
+# above, below, left and right of the agent.
 CONTEXT_SHARE, PATTERN_SHARE, BRIGHTEST = 0.7, 0.8, 200
 NEAREST, FARTHEST = (4, 7, 4, 4), (14, 14, 15, 15)
 GREY_KNOTS = 8  # segments of a piecewise linear map of shades

@@ -59,8 +59,8 @@ class EnsembleConfig:
     class_weight_positive: float = setting(0.5, "weight of positives in the cross entropy", source="Table 3", low=1e-6)
     class_balance: str = setting(
         "batch",
-        "batch: half of each labelled batch is positive, so that the class weights apply; none: labelled states are drawn "
-        "as they come",
+        "batch: half of each labelled batch is positive, so that the class weights apply; none: labelled states are "
+        "drawn as they come",
         source="own choice: with none, go-to-goal (8 positives of 1,640) falls to .63 (DEV-13)",
         choices=("batch", "none"),
     )
@@ -79,7 +79,7 @@ class EnsembleConfig:
     crop_width: int = setting(32, "width of the window of view=agent-crop", unit="pixels", source=BEYOND, low=1)
     localiser: str = setting(
         "learned",
-        "how the agent is found (view=agent-crop): learned, from the observation; ram, from the game's memory (an oracle)",
+        "finds the agent (view=agent-crop): learned, from the observation; ram, from the game's memory (an oracle)",
         source=BEYOND,
         choices=("learned", "ram"),
     )
@@ -106,7 +106,7 @@ class EnsembleConfig:
     )
     threshold: str = setting(
         "0.5",
-        "where a prediction is positive: above 0.5; for 5 % of the unlabelled states; above the cut that best splits the "
+        "a prediction is positive above 0.5; for 5 % of the unlabelled states; above the cut that best splits the "
         "unlabelled states in two; or for half of the labelled positives",
         source=f"{BEYOND}; unlabelled-split: Otsu 1979",
         choices=("0.5", "unlabelled-q95", "unlabelled-split", "positives-median"),

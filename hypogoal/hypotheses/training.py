@@ -207,7 +207,7 @@ class Round(Resumable):
         super().restore(snapshot)
         restore_global(snapshot["layers"], self.states.device)
 
-    def steps(self, on_step: OnStep | None) -> Iterator[int]:
+    def steps(self, report: OnStep | None = None) -> Iterator[int]:
         """Take the steps that are left; yields their numbers."""
         config = self.config
         for labelled, unlabelled in islice(self.states.batches(config, self.seed), self.done, None):
@@ -220,9 +220,9 @@ class Round(Resumable):
             self.done += 1
             if self.done % REPORT_EVERY == 0 or self.done == config.steps:
                 self._require_finite_losses()
-                if on_step is not None:
+                if report is not None:
                     parts = {"labelled": member_losses.mean().item(), "diversity": diversity_losses.sum().item()}
-                    on_step(self.before + self.done, {"loss": loss.item(), **parts})
+                    report(self.before + self.done, {"loss": loss.item(), **parts})
             yield self.before + self.done
         for member, network in zip(self.members, self.networks, strict=True):
             if not all(bool(value.isfinite().all()) for value in network.state_dict().values()):

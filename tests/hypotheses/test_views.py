@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -232,14 +232,17 @@ CROP = EnsembleConfig(
 )
 
 
-fit_crop = partial(fit, config=CROP, seed=0, agent_pixels=observed_pixel)
+def fit_crop(observations: Any, labels: Any, unlabelled: Any, *origins: Any) -> Ensemble:
+    """An ensemble of windows, with the origins of labelled and unlabelled states."""
+    places = StateOrigins(*origins, agent_pixels=observed_pixel)
+    return fit(observations, labels, unlabelled, CROP, 0, origins=places)
 
 
 def test_an_ensemble_learns_from_windows() -> None:
     """Beyond the paper: what surrounds the agent decides, wherever it is."""
     observations, labels, origins = montezuma_states(60, seed=0)
     others, truth, there = montezuma_states(60, seed=1)
-    ensemble = fit_crop(observations, labels, others, origins=origins, unlabelled_origins=there)
+    ensemble = fit_crop(observations, labels, others, origins, there)
     positions = np.stack([there[name] for name in ("room", "x", "y")], axis=1)
     assert (ensemble.verdicts(others, positions) == truth[:, None]).mean() > 0.95
 
@@ -249,9 +252,9 @@ def test_data_that_do_not_say_enough_are_one_clear_line() -> None:
     observations, labels, origins = montezuma_states(12, seed=0)
     some = {name: origins[name] for name in ("room", "x", "ladder")}
     with pytest.raises(UserError, match=r"do not say y of each state: view=agent-crop"):
-        fit_crop(observations, labels, observations, origins=some, unlabelled_origins=origins)
+        fit_crop(observations, labels, observations, some, origins)
     with pytest.raises(UserError, match=r"do not say room, x, y of each state: localiser=ram"):
-        fit_crop(observations, labels, observations, origins=origins)
+        fit_crop(observations, labels, observations, origins)
     with pytest.raises(UserError, match="the agent's place in these observations is not known: view=agent-crop"):
         fit(observations, labels, observations, CROP, 0, origins=StateOrigins(origins))
     with pytest.raises(UserError, match="the surroundings of the agent are not known: augment=grey-context"):
