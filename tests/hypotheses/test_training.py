@@ -452,8 +452,8 @@ def test_methods_see_the_same_labelled_states_changed_the_same_way(monkeypatch: 
             seen[-1].append(images)
         return images
 
-    inputs = TrainingStates._inputs
-    monkeypatch.setattr(TrainingStates, "_inputs", recorded)
+    inputs = TrainingStates._images_of
+    monkeypatch.setattr(TrainingStates, "_images_of", recorded)
     for changes in ({}, {"diversity": "none"}, {"diversity": "none", "unlabelled_bn": False}):
         seen.append([])
         fit(observations, labels, unlabelled, dataclasses.replace(TOY, steps=3, augment="grey", **changes), seed=0)
