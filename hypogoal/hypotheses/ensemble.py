@@ -48,7 +48,8 @@ class Ensemble(nn.Module):
         members: K, at least 1.
         generator: draws the initial weights.
         view: what members see of an observation; None: a whole picture.
-        encoder, hidden_width: as in ``TrainEnsembleConfig``.
+        encoder: as in ``TrainEnsembleConfig``.
+        hidden_width: as in ``TrainEnsembleConfig``.
 
     Attributes:
         members: K ``nn.Sequential``, from ``networks.as_input`` of the view (for pictures float (N, C, h, w) in 0..1)

@@ -251,9 +251,7 @@ class _Contract:
                 rows.setdefault(image.tobytes(), set()).add(label.tobytes())
         ambiguous = sum(len(labels) > 1 for labels in rows.values())
         if ambiguous:
-            text = (
-                f"{ambiguous} of {len(rows)} observations have different labels: no classifier can tell them apart"
-            )
+            text = f"{ambiguous} of {len(rows)} observations have different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=2)
         counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, positives, strict=True))
         return f"held in random play, of {self.count * COUNT} states: {counts}"
