@@ -37,7 +37,7 @@ ATTRIBUTES = (
 )  # fmt: skip
 RECOLLECT = "Collect it again."
 GET_MORE = "Collect more steps or other layouts, or bring recorded play (--play FILE) or a policy that gets there."
-FEW = 10  # warn below so many labelled states of a class
+FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
 BLOCK = 8  # states of a sample that are read together
 COLUMN_CHUNK = 1 << 16  # values of a label or origin

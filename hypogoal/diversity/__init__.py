@@ -73,7 +73,7 @@ class Objective:
         self.name, self.pair_loss, self.ensemble_loss = name, pair_loss, ensemble_loss
 
     def acts(self, members: int) -> bool:
-        """Whether it has an effect on an ensemble of so many members: pairs need two."""
+        """Whether it has an effect on an ensemble with this number of members: pairs need two."""
         return self.name != "none" and (members > 1 or self.ensemble_loss is not None)
 
     def terms(self, members: Sequence[int], frozen: int) -> list[str]:

@@ -405,7 +405,7 @@ class Domain(ABC):
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
     """One step of an engine; a ``UserError`` if a user's engine returns a malformed step."""
     step: Any = engine.step(actions)
-    do = f"Give a Step of arrays of length {engine.count}, of the types that hypogoal.domains.base.Step says."
+    do = f"Give a Step of arrays of length {engine.count}, of the types in hypogoal.domains.base.Step."
     if not isinstance(step, Step):
         UsersCode("the engine's step", engine, "step").refuse(f"gave a {type(step).__name__}, not a Step", do)
     for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):

@@ -70,7 +70,7 @@ class GymnasiumDomain(Domain):
         policy: plays ``1 - explore`` of the steps to collect states; None: random play. Policies by sub-goal, for
             example one that reaches each rare sub-goal, share the steps evenly.
         defaults: by stage, settings that suit this domain: ``{"train-ensemble": {"network": "montezuma"}}``.
-        memory: the number of distinct states of which training keeps observations, see ``GymnasiumEngine``.
+        memory: the number of distinct states whose observations training keeps, see ``GymnasiumEngine``.
         features: names of the numbers in observations other than pictures; default: those of a ``Dict``, or x0, x1, ...
         resize: the side in pixels to which pictures are resized; 0: no resizing.
         name: for messages; artefacts use the name that the user passed to ``collect``.

@@ -22,7 +22,7 @@ MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
-RESETS = 5  # a wrapper that drops the seed hardly begins alike so many times
+RESETS = 5  # a wrapper that drops the seed is unlikely to begin alike that often
 MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 

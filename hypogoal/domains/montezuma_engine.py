@@ -1,6 +1,6 @@
 """The training engine of Montezuma's Revenge: many emulators stepped together, states by id, each frame kept once.
 
-An observation is four frames, of which a step makes one, so states share frames. The newest ``memory`` states are kept;
+An observation is four frames, and each step adds one, so states share frames. The newest ``memory`` states are kept;
 the frames of older ones are forgotten.
 """
 

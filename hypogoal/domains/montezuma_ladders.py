@@ -64,7 +64,7 @@ def ladder_named(name: str) -> Ladder:
 
 
 def within(positions: NDArray[np.integer], places: Sequence[Position], reach: int) -> NDArray[np.bool_]:
-    """Which positions (n, 3) of room, x, y are within ``reach``, in x and in y, of which places (m); bool (n, m)."""
+    """Whether positions (n, 3) of room, x, y are within ``reach``, in x and in y, of places (m); bool (n, m)."""
     distance = np.abs(positions[:, None] - np.array(places))
     near: NDArray[np.bool_] = (distance[..., 1:] <= reach).all(-1)
     return near & (distance[..., 0] == 0)

@@ -37,11 +37,11 @@ ON_GROUND = 255  # the RAM's value for the jump without one
 
 # The least shares of a room's states by kind, as far as the rollouts reached them.
 KIND_SHARES = {BASE: 0.2, NEAR_BASE: 0.15, CLIMBING: 0.15, TOP: 0.05, JUMPING: 0.1, DYING: 0.1}
-SPARE = 1.25  # gather so many times the states to keep, to choose from
+SPARE = 1.25  # states to gather, relative to those to keep
 # Play in a room until these shares of the states to keep are positive, at all its bases and at each.
 FEWEST_POSITIVES, FEWEST_AT_A_BASE = 0.1, 0.02
 MOST_STEPS = 60  # agent steps per state to keep, after which a room is given up; two to four are usual
-HELD_OUT_EACH = 3  # one in so many stacks is for the held-out set
+HELD_OUT_EACH = 3  # every third stack, by digest, is for the held-out set
 
 ROLLOUT_STEPS = 40
 RANDOM_STEPS = 200

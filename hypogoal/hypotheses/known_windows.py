@@ -45,7 +45,7 @@ class KnownWindows:
     """The outputs for windows, by the windows' pixels.
 
     ``compute`` maps float32 (BATCH, C, side, side) in 0..1 to float32 (BATCH, F, 1, 1); ``side`` and ``stride`` are in
-    pixels. Beyond ``most`` windows the cache starts anew.
+    pixels. Beyond ``most`` windows the cache starts over.
     """
 
     def __init__(self, compute: Callable[[Tensor], Tensor], side: int, stride: int, most: int = MOST_WINDOWS):

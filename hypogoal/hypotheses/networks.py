@@ -151,7 +151,7 @@ def build_network(
     """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
     ``generator`` draws the initial weights (PyTorch's default distributions); ``hidden_width`` above 0 adds a layer of
-    so many units before the last. An unknown network (see :func:`load_network`), or observations that it does not take,
+    that width before the last. An unknown network (see :func:`load_network`), or observations that it does not take,
     for example images too small for it, are a ``UserError``.
     """
     parts_of = load_network(name)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 WORTHWHILE = 0.5  # of the plain network's work in convolutions; above, gathering patches costs more than it saves
 SAMPLE = 64  # images from which that is estimated,
-SAMPLE_PIXELS = 2**19  # or fewer, with at most so many pixels: each takes some 250 bytes
+SAMPLE_PIXELS = 2**19  # or fewer images, within this number of pixels: each takes some 250 bytes
 LOOKUP_PER_VALUE = 4  # table entries per value to rank; beyond, sorting is faster
 
 

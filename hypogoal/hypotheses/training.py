@@ -81,15 +81,12 @@ def fit(
             without the origins that the settings need.
         NumericalError: Spec G3, a loss or weight is NaN or Inf; the message names the member and the step.
     """
-    if len(unlabelled) == 0:
-        if _diverse(config):
-            raise UserError(
-                "unlabelled states are needed to make members differ", None, "Give some, or set diversity=none."
-            )
-        if config.threshold in NEED_UNLABELLED:
-            raise UserError(
-                "unlabelled states are needed to set thresholds on", None, "Give some, or set threshold=0.5."
-            )
+    if len(unlabelled) == 0 and _diverse(config):
+        do = "Give some, or set diversity=none."
+        raise UserError("unlabelled states are needed to make members differ", None, do)
+    if len(unlabelled) == 0 and config.threshold in NEED_UNLABELLED:
+        do = "Give some, or set threshold=0.5."
+        raise UserError("unlabelled states are needed to set thresholds on", None, do)
     if config.schedule == "sequential" and config.encoder == "shared":
         fault = "members one after the other cannot share an encoder that learns"
         raise UserError(fault, "encoder=shared, schedule=sequential", "Set encoder=frozen or schedule=simultaneous.")

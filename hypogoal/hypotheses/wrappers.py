@@ -67,7 +67,7 @@ class SubgoalReward(_Subgoal):
         scale: the reward.
         add: add to the environment's own reward instead of replacing it.
 
-    ``info["subgoal"]`` says whether the sub-goal holds.
+    ``info["subgoal"]`` is whether the sub-goal holds.
     """
 
     def __init__(self, env: Env, ensemble: Ensemble, by: By = "vote", *, scale: float = 1.0, add: bool = False):
@@ -85,7 +85,7 @@ class SubgoalReward(_Subgoal):
 class SubgoalTermination(_Subgoal):
     """The episode terminates where a sub-goal's classifier fires (Spec D1); arguments as for :class:`SubgoalReward`.
 
-    ``info["subgoal"]`` says whether the sub-goal holds.
+    ``info["subgoal"]`` is whether the sub-goal holds.
     """
 
     def __init__(self, env: Env, ensemble: Ensemble, by: By = "vote"):

@@ -61,7 +61,7 @@ class _Network:
     def repeats(self) -> str:
         first, second = self.network(), self.network()
         for left, right in zip(first.parameters(), second.parameters(), strict=True):
-            promise(torch.equal(left, right), "two networks of one seed differ", "Make the layers anew at every call.")
+            promise(torch.equal(left, right), "two networks of one seed differ", "Make new layers at every call.")
         return "weights come from the generator"
 
     def agrees(self) -> str:
