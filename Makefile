@@ -3,7 +3,7 @@ PYTHON ?= python3
 JOBS ?= 2
 DEMO ?= runs/demo
 ROOMS ?= runs/rooms
-ONLY ?= doorkey pixels montezuma training options loop startup
+ONLY ?= doorkey montezuma training options loop startup
 
 VENV := .venv
 BIN := $(VENV)/bin

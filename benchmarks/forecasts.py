@@ -17,7 +17,7 @@ import numpy as np
 from hypogoal.core.compute import prepare
 from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.hypotheses.config import TrainEnsembleConfig
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.needs import ensemble_needs
 
 MAY_DIFFER = 1.5  # times
@@ -53,7 +53,7 @@ def trained(states: np.ndarray[Any, Any], config: TrainEnsembleConfig, results: 
     looks = range(config.steps * config.members + 1)
     fit(
         states[:half].copy(), labels, states[half:].copy(), config, 0,
-        look=lambda step, ensemble: ends.append(time.process_time()), look_at=looks,
+        Watcher(look=lambda step, ensemble: ends.append(time.process_time()), look_at=looks),
     )  # fmt: skip
     status = Path("/proc/self/status").read_text(encoding="ascii")  # ru_maxrss has the parent's
     peak = next(float(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM:"))

@@ -38,7 +38,7 @@ from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.scores import cross_fitted
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Watcher, fit
 from hypogoal.stages.train_ensemble import score_rows
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -130,8 +130,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequenc
         data.unlabelled.observations,
         config,
         seed_for(seed, "ensemble", sub_goal),
-        look=look,
-        look_at=looks,
+        Watcher(look=look, look_at=looks),
     )
     return list(rows.values())
 

@@ -26,7 +26,7 @@ from hypogoal.domains.doorkey import DOMAIN
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import cross_fitted, halves, member_scores, ranking
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Watcher, fit
 
 LABELS = (5, 10, 20, 50, 200, 0)  # 0: all of them
 TRAINED = ("dbat", "none", "dbat-unpaired")
@@ -75,8 +75,7 @@ def run_cell(count: int, method: str, sub_goal: str, seed: int) -> list[Row]:
         data.unlabelled.observations,
         dataclasses.replace(EnsembleConfig(steps=STEPS), **settings_of(method)),
         seed_for(seed, "ensemble", sub_goal),
-        look=look,
-        look_at=(STEPS,),
+        Watcher(look=look, look_at=(STEPS,)),
     )
     return rows
 

@@ -30,7 +30,7 @@ from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Watcher, fit
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -116,8 +116,7 @@ def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> lis
         data.unlabelled.observations,
         dataclasses.replace(config, **METHODS[method]),
         seed_for(seed, "ensemble", SUB_GOAL),
-        look=look,
-        look_at=looks,
+        Watcher(look=look, look_at=looks),
     )
     return rows
 

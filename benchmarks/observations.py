@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import NUMBERS, PICTURE
-from hypogoal.domains.gymnasium_engine import look_of
+from hypogoal.domains.gymnasium_engine import reader_of
 from hypogoal.own_data.images import read_image
 from hypogoal.own_data.parts import Parts, as_observations, collected_of
 
@@ -53,14 +53,14 @@ def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
     """
     env, states = Constant(shape, dtype), np.ones((2, *shape), dtype)
     wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
-    of_env, of_array = _refusal(lambda: look_of(env)), _refusal(lambda: as_observations(states, "the states"))
+    of_env, of_array = _refusal(lambda: reader_of(env)), _refusal(lambda: as_observations(states, "the states"))
     assert bool(of_env) == bool(of_array), (of_env, of_array)
     if of_env:
         assert dtype == "uint8" or (wide and "float" not in dtype), of_env
         _check_lines_of_env(of_env, env)
         _check_lines_of_array(of_array, states)
         return "refused"
-    look, taken = look_of(env), as_observations(states, "the states")[0]
+    look, taken = reader_of(env), as_observations(states, "the states")[0]
     assert (taken.shape, taken.dtype) == (look.shape, look.dtype)
     np.testing.assert_array_equal(look.read(env, env.reset()[0]), taken)
     if look.dtype == PICTURE:
@@ -86,7 +86,7 @@ def _check_lines_of_env(refusal: str, env: gymnasium.Env[Any, Any]) -> None:
     for line, dtype in zip(lines.groups(), (PICTURE, NUMBERS), strict=True):
         if line:
             wrapped = eval(line, {"gymnasium": gymnasium, "env": env})
-            look = look_of(wrapped)
+            look = reader_of(wrapped)
             assert look.dtype == dtype and not look.doubt, line
             look.read(wrapped, wrapped.reset()[0])
 

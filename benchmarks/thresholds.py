@@ -30,7 +30,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, member_scores
 from hypogoal.hypotheses.thresholds import unlabelled_split
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Watcher, fit
 
 Probabilities = NDArray[np.float64]  # of one member
 Rule = Callable[[Any, Any, Any], float | np.floating]  # labelled positives, negatives, unlabelled
@@ -105,8 +105,7 @@ def run_cell(layouts: str, method: str, sub_goal: str, seed: int) -> list[Row]:
         data.unlabelled.observations,
         dataclasses.replace(EnsembleConfig(steps=LOOKS[-1]), **METHODS[method]),
         seed_for(seed, "ensemble", sub_goal),
-        look=look,
-        look_at=LOOKS,
+        Watcher(look=look, look_at=LOOKS),
     )
     return rows
 

@@ -19,18 +19,15 @@ if TYPE_CHECKING:
     from hypogoal.api import train_ensemble, train_meta, train_options  # isort: skip
     from hypogoal.core.errors import UserError
     from hypogoal.domains.gymnasium_domain import GymnasiumDomain
-    from hypogoal.domains.minigrid_vector import make_vec
     from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
 
 _LAZY = {
     "GymnasiumDomain": "hypogoal.domains.gymnasium_domain",
     "UserError": "hypogoal.core.errors",
-    "make_vec": "hypogoal.domains.minigrid_vector",
 }
 __all__ = [
     "GymnasiumDomain", "Made", "OptionEnv", "SubgoalReward", "SubgoalTermination", "UserError", "__version__",
-    "collect", "compare", "evaluate", "load_ensemble", "load_options", "make_vec", "train_ensemble", "train_meta",
-    "train_options",
+    "collect", "compare", "evaluate", "load_ensemble", "load_options", "train_ensemble", "train_meta", "train_options",
 ]  # fmt: skip
 
 

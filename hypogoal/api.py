@@ -20,7 +20,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.core.terminal import printable, say
-from hypogoal.domains.base import BUILT_IN, Domain, here, load_domain
+from hypogoal.domains.base import BUILT_IN, REGISTERED, Domain, load_domain
 from hypogoal.domains.gymnasium_domain import GymnasiumDomain
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.wrappers import SubgoalReward, SubgoalTermination
@@ -69,7 +69,7 @@ def collect(domain: str | Domain, out: Place, **given: Any) -> Made:
     if isinstance(domain, Domain):
         if domain.name in BUILT_IN and load_domain(domain.name) is not domain:
             raise UserError("this domain has the name of one of hypogoal's", domain.name, "Give it another name.")
-        here[domain.name] = domain
+        REGISTERED[domain.name] = domain
     return _made("collect", domain if isinstance(domain, str) else domain.name, out, given)
 
 

@@ -1,9 +1,9 @@
 """The HDF5 schema of collected states: labelled, unlabelled, held-out (Spec A1, A8).
 
 ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``, ``heldout/<sub-goal>/{observations,labels}``
-and ``origin/*`` per state beside each. Sub-goals that share their states share one dataset on disk (hard links).
-The root's attributes hold format version, domain, observation space, arguments and versions; ``complete`` is set last,
-so a file without it was cut off.
+and, beside each, ``origin/*`` per state. Sub-goals with the same states share one dataset on disk (hard links). The
+root's attributes hold format version, domain, observation space, arguments and versions. ``complete`` is set last, so a
+file without it was cut off.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import FORMULA, NO_FILE_NAME, parse_json, path_part, plain_name, plain_names, replacing
 
-if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # its integer types differ and would fail deep in the work
+if np.lib.NumpyVersion(np.__version__) < "2.0.0":  # it promotes integers differently, which fails late
     raise UserError("hypogoal needs NumPy 2", f"found {np.__version__}", "pip install 'numpy>=2,<3'")
 
 DATA_FORMAT = 2  # 1: texts of variable length
@@ -35,18 +35,18 @@ ATTRIBUTES = (
     "format", "domain", "sub_goals", "observation_shape", "observation_dtype", "config", "seed", "inputs", "versions",
     "complete",
 )  # fmt: skip
-COLLECT_AGAIN = "Collect it again."
+RECOLLECT = "Collect it again."
 GET_MORE = "Collect more steps or other layouts, or bring recorded play (--play FILE) or a policy that gets there."
-FEW = 10  # labelled states of a class; fewer give a warning
-RARE = 0.05  # share of a class; less gives a warning
-BLOCK = 8  # neighbouring states read together for a sample
-COLUMN_CHUNK = 1 << 16  # labels or origins per chunk
+FEW = 10  # warn below this number of labelled states of a class
+RARE = 0.05  # warn below this share of a class
+BLOCK = 8  # states of a sample that are read together
+COLUMN_CHUNK = 1 << 16  # values of a label or origin
 MAX_SIDE = 1 << 16  # of an observation
 # Observations are pictures, bytes (H, W, C), or numbers of any shape, which networks see standardised.
 PICTURE, NUMBERS = np.dtype(np.uint8), np.dtype(np.float32)
-Observations: TypeAlias = NDArray[Any]  # uint8 or float32 (N, ...)
-Standard: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]  # mean and standard deviation of numbers
-DEVIATIONS = 10.0  # standardised numbers are clipped here, far from all training states
+Observations: TypeAlias = NDArray[Any]  # of either type
+Standard: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]  # mean and deviation of numbers
+DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
 MOST_ROWS = 20_000  # states from which mean and deviation are computed
 
 
@@ -57,7 +57,7 @@ class States:
     Attributes:
         observations: uint8 or float32 (N, *observation_shape).
         labels: bool (N, G), one column per sub-goal; (N,) for a single sub-goal.
-        origins: int (N,) arrays, where each state comes from (layout_seed, agent_x, ...).
+        origins: int (N,) arrays by name, where each state comes from (layout_seed, agent_x, ...).
     """
 
     observations: Observations
@@ -72,7 +72,7 @@ class States:
 
 @dataclass(frozen=True)
 class Collected:
-    """The result of a domain's ``collect``: three sets of states, the names of G sub-goals and of features, if any."""
+    """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any."""
 
     observation_shape: tuple[int, ...]
     sub_goals: tuple[str, ...]
@@ -83,38 +83,38 @@ class Collected:
 
 
 class Unmet(UserError):
-    """Play did not reach the required states; ``collected`` is what it reached, if known."""
+    """Play did not reach the states needed; ``collected`` has those it reached, if known."""
 
     collected: Collected | None = None
 
 
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
-    """A 16-byte hash of an observation and its labels, to compare observations of one shape and type."""
+    """16 bytes that identify an observation among those of its shape and type, together with its labels."""
     return blake2b(observation.tobytes() + labels, digest_size=16).digest()
 
 
 def standard_of(shape: tuple[int, ...], *observations: Observations) -> Standard:
-    """Mean and standard deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary."""
-    rows = [some[:: 1 + len(some) // MOST_ROWS] for some in observations]
-    every = np.concatenate([np.zeros((int(not any(map(len, rows))), *shape), NUMBERS), *rows])
-    mean, deviation = every.mean(0, dtype=np.float64), every.std(0, dtype=np.float64)
+    """Mean and deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary, or without any."""
+    rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
+    sample = np.concatenate([np.zeros((int(not any(map(len, rows))), *shape), NUMBERS), *rows])
+    mean, deviation = sample.mean(0, dtype=np.float64), sample.std(0, dtype=np.float64)
     deviation = np.where(deviation > 1e-6 * np.abs(mean), deviation, 1.0)
     return mean.astype(NUMBERS), deviation.astype(NUMBERS)
 
 
 def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
-    """Standardised numbers (N, *shape), arrays or tensors, clipped at ``DEVIATIONS``."""
+    """Numbers (N, *shape), arrays or tensors, in deviations from their mean (*shape)."""
     return ((observations - mean) / deviation).clip(-DEVIATIONS, DEVIATIONS)
 
 
 def leave_out(states: States, *training: Observations) -> States:
-    """Spec B3: the states whose observations are not among ``training``, (M, ...) each, on which members train."""
-    seen = {digest(picture) for pictures in training for picture in pictures}
-    return states.where(np.array([digest(picture) not in seen for picture in states.observations], np.bool_))
+    """Spec B3: the states without those that look like one of ``training``, observations (M, ...) each."""
+    digests = {digest(observation) for observations in training for observation in observations}
+    return states.where(np.array([digest(observation) not in digests for observation in states.observations], np.bool_))
 
 
 def joined(parts: Sequence[States]) -> States:
-    """States concatenated, with the names of origins of the first part."""
+    """The states of all parts, with the origins that the first part has."""
     observations, labels = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("observations", "labels")
     )
@@ -123,7 +123,7 @@ def joined(parts: Sequence[States]) -> States:
 
 
 def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal with few positives or negatives among the labels (N, G)."""
+    """A line for each sub-goal with few positives, or few negatives, among the labels (N, G)."""
     lines = []
     for goal, column in zip(goals, labels.T, strict=True):
         positives = int(column.sum())
@@ -135,13 +135,13 @@ def hard_to_learn(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
 
 
 def hard_to_judge(labels: NDArray[np.bool_], goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal whose held-out labels (N, G) are all of one class."""
+    """A line for each sub-goal with one class only among the held-out labels (N, G)."""
     one_class = [goal for goal, column in zip(goals, labels.T, strict=True) if len(np.unique(column)) < 2]
-    return [f"{goal} has only one class in the held-out states, so they cannot score its members" for goal in one_class]
+    return [f"{goal} has one class only in the held-out states, so it cannot be judged by them" for goal in one_class]
 
 
 def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: object, do: str) -> None:
-    """Refuse (``Unmet``) labels (N, G) that are all of one class for some sub-goal."""
+    """Refuse (``Unmet``) labels (N, G) of labelled states that have one class only for some sub-goal."""
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
             lacking = "negatives" if column.any() else "positives"
@@ -149,7 +149,7 @@ def require_classes(labels: NDArray[np.bool_], goals: Sequence[str], where: obje
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
-    """Refuse (``UserError``) names that are not plain or differ only in case, and an empty list."""
+    """Refuse (``UserError``) an empty list, names that are not plain, and names that differ only in case."""
     if not sub_goals:
         raise UserError("there are no sub-goals", None, "Give at least one, with a name.")
     for name in sub_goals:
@@ -171,9 +171,9 @@ def write_dataset(
     inputs: Sequence[Mapping[str, str]] = (),
     force: bool = False,
 ) -> None:
-    """Write collected states; the file gets its name only when it is whole.
+    """Write collected states; the file appears under its name only once it is complete.
 
-    A name that cannot be a file name, labels that are not truth values, and an existing file are a ``UserError``.
+    Raises ``UserError`` if a name cannot be a file name, labels are not truth values, or the file exists.
     """
     require_names(collected.sub_goals)
     for origin in {*collected.labelled.origins, *collected.unlabelled.origins, *collected.heldout.origins}:
@@ -192,22 +192,22 @@ def write_dataset(
         hdf5.set_attribute(file, "seed", seed)
         hdf5.set_attribute(file, "inputs", json.dumps(list(inputs)))
         hdf5.set_attribute(file, "versions", json.dumps(versions()))
-        hdf5.set_attribute(file, "complete", False)  # first, so that a truncated file keeps its attributes
+        hdf5.set_attribute(file, "complete", False)  # written first, so that a truncated file still has it
         for split, states in (("labelled", collected.labelled), ("heldout", collected.heldout)):
             _write_split(file, split, states, collected.sub_goals)
         group = file.create_group("unlabelled")
         write_observations(group, collected.unlabelled.observations)
         _write_origins(group, collected.unlabelled.origins)
-        if collected.features:  # perhaps more than an attribute holds
+        if collected.features:  # a dataset, because they may exceed an attribute's size
             file["features"] = hdf5.fixed(json.dumps(list(collected.features)))
         file.attrs.modify("complete", True)
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ...]) -> None:
     labels, shape = states.labels, (len(states.observations), len(sub_goals))
-    if getattr(labels, "dtype", None) != np.bool_ or labels.shape != shape:  # NumPy would read the text 'False' as True
-        actual = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
-        raise UserError(f"the domain's {split} labels are not truth values", actual, f"Give bool {shape}.")
+    if getattr(labels, "dtype", None) != np.bool_ or labels.shape != shape:  # NumPy turns the text 'False' into True
+        kind = f"{labels.dtype} {labels.shape}" if isinstance(labels, np.ndarray) else type(labels).__name__
+        raise UserError(f"the domain's {split} labels are not truth values", kind, f"Give bool {shape}.")
     first: Any = None
     for index, sub_goal in enumerate(sub_goals):
         group = file.create_group(f"{split}/{sub_goal}")
@@ -221,17 +221,17 @@ def _write_split(file: Any, split: str, states: States, sub_goals: tuple[str, ..
 
 
 def write_observations(group: Any, observations: Observations) -> None:
-    """Write ``observations`` into an HDF5 group, in compressed chunks of up to 64 states."""
+    """Write ``observations`` to an HDF5 group, in compressed chunks of up to 64 states."""
     _store(group, "observations", observations, 64, compression="gzip", compression_opts=1)
 
 
 def _write_column(group: Any, name: str, values: NDArray[Any]) -> None:
-    """Write one value per state with checksums: unlike a damaged compressed state, a flipped label is still a label."""
+    """Write one value per state, with checksums: a flipped label, unlike a damaged compressed state, is still valid."""
     _store(group, name, values, COLUMN_CHUNK, fletcher32=True)
 
 
 def _store(group: Any, name: str, values: NDArray[Any], most: int, **filters: Any) -> None:
-    """Write a dataset in chunks of ``most`` states."""
+    """Write a dataset in chunks of up to ``most`` states."""
     chunks = (min(most, len(values)), *values.shape[1:])
     group.create_dataset(name, data=values, **({"chunks": chunks, **filters} if len(values) else {}))
 
@@ -254,36 +254,36 @@ class Dataset:
             if version > DATA_FORMAT:
                 raise UserError(f"format {version} is newer than this hypogoal reads", path, "Upgrade hypogoal.")
             if version < DATA_FORMAT:
-                raise UserError(f"format {version} comes from an earlier hypogoal", path, COLLECT_AGAIN)
-            if hdf5.attribute(file, "lost") not in (None, "[]"):  # saved from a truncated file by an earlier hypogoal
-                raise UserError("a part of the data file was cut off", path, COLLECT_AGAIN)
+                raise UserError(f"format {version} comes from an earlier hypogoal", path, RECOLLECT)
+            if hdf5.attribute(file, "lost") not in (None, "[]"):  # an earlier hypogoal rescued a truncated file
+                raise UserError("a part of the data file was cut off", path, RECOLLECT)
             self.attributes = {name: hdf5.attribute(file, name) for name in ATTRIBUTES}
         if not self.attributes["complete"]:
-            raise UserError("the data file is not complete", path, COLLECT_AGAIN)
+            raise UserError("the data file is not complete", path, RECOLLECT)
         self.sub_goals: tuple[str, ...] = tuple(self._json("sub_goals", list))
         self.observation_shape: tuple[int, ...] = tuple(self._json("observation_shape", list))
-        dtype = self.attributes["observation_dtype"] or str(PICTURE)  # files from before there was another
+        dtype = self.attributes["observation_dtype"] or str(PICTURE)  # early files do not say
         self.observation_dtype = NUMBERS if dtype == str(NUMBERS) else PICTURE
         self.config: dict[str, Any] = self._json("config", dict)
         self.inputs: list[Any] = self._json("inputs", list) if self.attributes["inputs"] else []
         self.domain = self.attributes["domain"]
         sizes = all(type(size) is int and 0 < size <= MAX_SIDE for size in self.observation_shape)
         names = plain_names(self.sub_goals)
-        valid_dtype = dtype == str(self.observation_dtype)
-        if not (sizes and names and valid_dtype and self.observation_shape and isinstance(self.domain, str)):
+        supported = dtype == str(self.observation_dtype)
+        if not (sizes and names and supported and self.observation_shape and isinstance(self.domain, str)):
             raise foreign
-        self.observation_bytes = prod(self.observation_shape) * self.observation_dtype.itemsize  # of one
+        self.observation_bytes = prod(self.observation_shape) * self.observation_dtype.itemsize  # of one observation
 
     def features(self) -> list[str]:
-        """Names of the numbers in an observation that is not a picture, in order; ``x0``, ... if unnamed."""
+        """The names of an observation's numbers, in order; ``x0``, ``x1``, ... if the file has no names."""
         count = prod(self.observation_shape)
         with self._file() as file:
             if hdf5.find(file, "features") is None:
                 return [f"x{number}" for number in range(count)]
             text = hdf5.read_array(file, "features", "S").tobytes().rstrip(b"\0").decode(errors="replace")
-        names = parse_json(text, self.path, "names of features are", COLLECT_AGAIN)
+        names = parse_json(text, self.path, "names of features are", RECOLLECT)
         if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
-            raise UserError("the data file's feature names do not fit", self.path, COLLECT_AGAIN)
+            raise UserError("the data file's feature names do not fit", self.path, RECOLLECT)
         return names
 
     def labelled(self, sub_goal: str) -> States:
@@ -291,7 +291,7 @@ class Dataset:
         return self._split("labelled", sub_goal)
 
     def heldout(self, sub_goal: str) -> States:
-        """The held-out states of one sub-goal with true labels, for evaluation only."""
+        """The held-out states of one sub-goal with their true labels, for evaluation only."""
         return self._split("heldout", sub_goal)
 
     def unlabelled(self) -> Observations:
@@ -300,23 +300,23 @@ class Dataset:
             return self._observations(file, "unlabelled")
 
     def sample(self, part: str, count: int) -> Observations:
-        """About ``count`` states spread over ``unlabelled`` or ``labelled/<sub-goal>``; the others are not read."""
+        """About ``count`` states spread over ``unlabelled`` or ``labelled/<sub-goal>``; reads no others."""
         with self._file() as file:
-            length = len(self._stored(file, f"{part}/observations"))
+            length = len(self._observation_data(file, f"{part}/observations"))
             blocks = max(1, min(-(-count // BLOCK), length // BLOCK))  # blocks do not overlap
             starts = np.linspace(0, max(0, length - BLOCK), blocks).astype(np.int64)
             rows = [slice(start, start + min(count, BLOCK)) for start in starts]
             return np.concatenate([self._observations(file, part, block) for block in rows])
 
     def unlabelled_origins(self) -> dict[str, NDArray[np.int64]]:
-        """Where each unlabelled state comes from: int64 (M,) by name; empty if the file does not say."""
+        """The unlabelled states' origins, int64 (M,) by name; empty if the file has none."""
         with self._file() as file:
-            return self._origins(file, "unlabelled", len(self._stored(file, "unlabelled/observations")))
+            return self._origins(file, "unlabelled", len(self._observation_data(file, "unlabelled/observations")))
 
     def counts(self) -> dict[str, Any]:
         """Numbers of states and positives, without reading the observations."""
         with self._file() as file:
-            rows: dict[str, Any] = {"unlabelled": len(self._stored(file, "unlabelled/observations"))}
+            rows: dict[str, Any] = {"unlabelled": len(self._observation_data(file, "unlabelled/observations"))}
             for split in SPLITS:
                 rows[split] = {}
                 for goal in self.sub_goals:
@@ -344,22 +344,22 @@ class Dataset:
 
     def _observations(self, file: Any, base: str, rows: slice | None = None) -> Observations:
         name = f"{base}/observations"
-        stored = self._stored(file, name)
+        data = self._observation_data(file, name)
         dtype = self.observation_dtype
-        if stored.shape[1:] != self.observation_shape or stored.dtype != dtype:
-            raise hdf5.Foreign(f"{name!r} is {stored.dtype} {stored.shape}, not {dtype} (N, {self.observation_shape})")
+        if data.shape[1:] != self.observation_shape or data.dtype != dtype:
+            raise hdf5.Foreign(f"{name!r} is {data.dtype} {data.shape}, not {dtype} (N, {self.observation_shape})")
         values = hdf5.read_array(file, name, "uf", rows)
         if dtype == NUMBERS and not np.isfinite(values).all():
             raise hdf5.Foreign(f"{name!r} has numbers that are not finite")
         return values
 
     @staticmethod
-    def _stored(file: Any, name: str) -> Any:
+    def _observation_data(file: Any, name: str) -> Any:
         hdf5.size_of(file, name, "uf")
-        stored = file[name]
-        if not stored.shape:
+        data = file[name]
+        if not data.shape:
             raise hdf5.Foreign(f"{name!r} is a single number")
-        return stored
+        return data
 
     @staticmethod
     def _origins(file: Any, base: str, count: int) -> dict[str, NDArray[np.int64]]:
@@ -374,20 +374,18 @@ class Dataset:
     def _json(self, name: str, kind: type) -> Any:
         parsed = self.attributes[name]
         if isinstance(parsed, str):
-            parsed = parse_json(
-                parsed, self.path, f"not a hypogoal data file, its attribute {name!r} is", COLLECT_AGAIN
-            )
+            parsed = parse_json(parsed, self.path, f"not a hypogoal data file, its attribute {name!r} is", RECOLLECT)
         if not isinstance(parsed, kind):
             do = f"Its attribute {name!r} is not a JSON {kind.__name__}."
             raise UserError("not a hypogoal data file", self.path, do)
         return parsed
 
     def _file(self) -> contextlib.AbstractContextManager[Any]:
-        return hdf5.open_hdf5(self.path, "the data file", COLLECT_AGAIN)
+        return hdf5.open_hdf5(self.path, "the data file", RECOLLECT)
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file of ``collect`` or of the same schema; any other path is a ``UserError``."""
+    """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
     if path.is_dir():
         do = "Give the .h5 file in it."
         raise UserError("a folder where a data file is needed", path, do)

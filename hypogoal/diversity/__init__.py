@@ -1,4 +1,4 @@
-"""Spec C1: diversity objectives. One objective per file; the file's name is the name on the command line.
+"""Spec C1: diversity objectives, one per file; the file's name is the name on the command line.
 
 An objective is one of two functions:
 
@@ -6,9 +6,9 @@ An objective is one of two functions:
   loss (...,), lower where the two members differ more. Eq. (1) sums it over all ordered pairs.
 - ``ensemble_loss(context)`` takes all members at once, see :class:`Context`. It returns one number, a tensor ().
 
-Both must stay finite and differentiable at extreme logits and for N = 0 (``hypogoal check --diversity`` tests
-it). Name your own as ``module:function``, a function of two arguments or of one. Other packages add theirs under the
-entry point group ``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` that contains one.
+Both must stay finite and differentiable at extreme logits and for N = 0 (``hypogoal check --diversity`` tests it). Name
+your own as ``module:function``, a function of two arguments or of one. Other packages add theirs under the entry point
+group ``hypogoal.diversity``, as ``name = "module:function"`` or ``name = "module"`` with one of these functions.
 """
 
 from __future__ import annotations
@@ -39,16 +39,15 @@ class Context:
     """One batch as K members in training see it: B labelled and N unlabelled states.
 
     Attributes:
-        labels: int64 (B,), 1 where the sub-goal is reached.
+        labels: int64 (B,), 1 where the sub-goal holds.
         labelled: float (K, B, 2), logits of labelled states.
         unlabelled: float (K, N, 2), logits of unlabelled states.
         labelled_features: float (K, B, D), the last hidden layer's outputs.
-        unlabelled_features: float (K, N, D), the same of unlabelled states.
-        frozen: float (F, N, 2), logits of members that were trained before these (schedule=sequential); they get no
-            gradient.
-        positives: the share of positives among all labelled states, not only this batch's; above 0 and below 1.
-        input_gradients: computes float (K, B, C * H * W), the gradients of each member's logit gap (yes minus no) with
-            respect to the pixels of the labelled states; differentiable. Costs another pass through the members.
+        unlabelled_features: float (K, N, D), the same for unlabelled states.
+        frozen: float (F, N, 2), logits of members trained earlier (schedule=sequential), which get no gradient.
+        positives: the share of positives among all labelled states, not only this batch's; strictly between 0 and 1.
+        input_gradients: computes float (K, B, C * H * W), the differentiable gradients of each member's log-odds with
+            respect to the pixels of the labelled states. Costs another pass through the members.
     """
 
     labels: Tensor
@@ -66,29 +65,29 @@ class Objective:
 
     Attributes:
         name: as in the setting ``diversity``.
-        pair_loss: what Eq. (1) sums over pairs, or None.
-        ensemble_loss: of all members at once; None where there is a ``pair_loss``.
+        pair_loss: the loss that Eq. (1) sums over pairs, or None.
+        ensemble_loss: the loss of all members at once; None if there is a ``pair_loss``.
     """
 
     def __init__(self, name: str, *, pair_loss: PairLoss | None = None, ensemble_loss: EnsembleLoss | None = None):
         self.name, self.pair_loss, self.ensemble_loss = name, pair_loss, ensemble_loss
 
     def acts(self, members: int) -> bool:
-        """Whether it moves anything in an ensemble of so many: pairs need two."""
+        """Whether it has an effect on an ensemble with this number of members: pairs need two."""
         return self.name != "none" and (members > 1 or self.ensemble_loss is not None)
 
     def terms(self, members: Sequence[int], frozen: int) -> list[str]:
-        """What each of :meth:`losses` is, in words; ``members`` are in training, 0 to ``frozen`` - 1 were before."""
+        """Names for each of :meth:`losses`; ``members`` are in training, 0 to ``frozen`` - 1 are frozen."""
         if self.ensemble_loss is not None:
             return ["the diversity loss"]
         pairs = [*combinations(members, 2), *((old, member) for member in members for old in range(frozen))]
         return [f"the diversity loss of members {first} and {second}" for first, second in pairs]
 
     def losses(self, context: Context) -> Tensor:
-        """The inner sums of Eq. (1), float (P,): a loss for each pair, those in training first, then with the frozen.
+        """The inner sums of Eq. (1), float (P,): a loss per pair, first in training, then with frozen members.
 
-        The double sum meets each pair in training in both orders: a factor of 2. Its i = m is left out:
-        disagreement with itself would push every member to p = 1/2. An ``ensemble_loss`` is the only one.
+        The double sum counts each pair in training twice. Its i = m is left out: disagreement with itself would push
+        every member to p = 1/2. An ``ensemble_loss`` is the only loss.
         """
         import torch
 
@@ -103,12 +102,12 @@ class Objective:
 def load_objective(name: str) -> Objective:
     """The diversity objective ``name``: of :data:`OBJECTIVES`, an installed entry point, or ``module:function``.
 
-    Raises ``UserError`` if there is no such objective, if it cannot be loaded or is not one, or if the user did not
-    allow the code (see :mod:`hypogoal.core.own_code`).
+    Raises ``UserError`` if it is unknown, cannot be loaded or is no objective, or if the user did not allow the code
+    (see :mod:`hypogoal.core.own_code`).
     """
     built_in = {objective: f"{__name__}.{objective.replace('-', '_')}" for objective in OBJECTIVES}
     loaded = load_own(name, "diversity objective", ENTRY_POINTS, built_in)
-    for kind in ("ensemble_loss", "pair_loss"):  # the first may be made of the second
+    for kind in ("ensemble_loss", "pair_loss"):  # the first may use the second
         if hasattr(loaded, kind):
             function = getattr(loaded, kind)
             break
@@ -121,7 +120,7 @@ def load_objective(name: str) -> Objective:
 
 
 def _arguments(function: object) -> int:
-    """How many arguments a function must be given; 0 where it does not say."""
+    """The number of required positional arguments; 0 if unknown."""
     try:
         parameters = inspect.signature(function).parameters.values()  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -131,21 +130,21 @@ def _arguments(function: object) -> int:
 
 
 def _watched(name: str, objective: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """An objective of someone's own, whose loss must have the shape that Eq. (1) sums.
+    """A user's objective, with a check of its loss's shape.
 
-    Whether it is finite is looked at in training, every few steps: a look makes a GPU wait.
+    Training checks every few steps whether it is finite, since each check makes a GPU wait.
     """
 
     def watched(*arguments: Any) -> Tensor:
         with UsersCode(f"the diversity objective {name}", objective) as code:
             loss = objective(*arguments)
             logits = arguments[0].unlabelled if isinstance(arguments[0], Context) else arguments[0]
-            wanted = () if isinstance(arguments[0], Context) else tuple(logits.shape[:-2])
+            expected = () if isinstance(arguments[0], Context) else tuple(logits.shape[:-2])
             shape = getattr(loss, "shape", None)
-            if shape != wanted or not loss.is_floating_point():
-                gave = type(loss).__name__ if shape is None else f"{loss.dtype} {tuple(shape)}"
-                do = f"Give a float {wanted}: a mean over the states, axis -2."
-                code.refuse(f"gave {gave} for logits {tuple(logits.shape)}", do)
+            if shape != expected or not loss.is_floating_point():
+                kind = type(loss).__name__ if shape is None else f"{loss.dtype} {tuple(shape)}"
+                do = f"Give a float {expected}: a mean over the states, axis -2."
+                code.refuse(f"gave {kind} for logits {tuple(logits.shape)}", do)
             return loss
 
     return watched

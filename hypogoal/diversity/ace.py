@@ -8,15 +8,15 @@ from torch import Tensor
 
 from hypogoal.diversity import Context
 
-LEAST_SHARE = 0.1  # of unlabelled states on which members are to differ, in each direction: the source's mix rate
+LEAST_SHARE = 0.1  # of unlabelled states on which members should differ, in each direction: the source's mix rate
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """For each ordered pair, -log p_a(yes) - log p_b(no), mean over the tenth of unlabelled states where it is lowest.
+    """For each ordered pair, -log p_a(positive) - log p_b(negative), mean over the tenth of states with the lowest.
 
-    D-BAT asks members to contradict each other on every unlabelled state. This asks for it on some, those where the
-    members as they are disagree most, and for certainty there; of the rest nothing is asked. Mixed directions: a says
-    yes where b says no on some states, and the other way round on others.
+    D-BAT rewards contradiction on every unlabelled state. This rewards confident contradiction where the members
+    already disagree most, and ignores the rest. It covers both directions: a is positive and b negative on some states,
+    and the reverse on others.
 
     Returns:
         float (), at least 0, in nats; 0 for no states or no pairs.
@@ -28,6 +28,6 @@ def ensemble_loss(context: Context) -> Tensor:
     pairs = [(a, b) for a, b in permutations(range(len(log)), 2) if min(a, b) < trained]
     if not pairs or states == 0:
         return context.unlabelled.sum() * 0.0
-    yes, no = (torch.stack([log[pair[side], :, 1 - side] for pair in pairs]) for side in (0, 1))
-    lowest = torch.topk(-(yes + no), math.ceil(LEAST_SHARE * states), dim=1, largest=False, sorted=False)
+    positive, negative = (torch.stack([log[pair[side], :, 1 - side] for pair in pairs]) for side in (0, 1))
+    lowest = torch.topk(-(positive + negative), math.ceil(LEAST_SHARE * states), dim=1, largest=False, sorted=False)
     return lowest.values.mean(dim=1).sum()

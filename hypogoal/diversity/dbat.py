@@ -7,18 +7,17 @@ from torch import Tensor
 def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
     """Eq. (1), second term, Spec C2: ``-log(p_a (1 - p_b) + (1 - p_a) p_b)``, mean over unlabelled states.
 
-    Eq. (1) as printed multiplies matching classes, which read literally rewards agreement. The term of
-    D-BAT is the log probability that two members, each drawing its class from its own p, draw different
-    ones. It is computed from log-softmax: from probabilities a logit gap of 20 already gives log 0 and a
-    gradient of NaN.
+    Eq. (1) as printed multiplies matching classes, which literally rewards agreement. D-BAT's term is the log
+    probability that two members, each drawing its class from its own p, draw different ones. It is computed from
+    log-softmax: from probabilities, a logit gap of 20 already gives log 0 and a gradient of NaN.
 
     Args:
-        logits_a: float (..., N, 2), one member on N unlabelled states; column 1 is "sub-goal reached".
+        logits_a: float (..., N, 2), one member on N unlabelled states; column 1 is positive.
         logits_b: float (..., N, 2), another member on the same states.
 
     Returns:
-        float (...,), at least 0, in nats; lower where the members disagree; 0 for N = 0. Symmetric in a and
-        b.
+        float (...,), at least 0, in nats; lower where the members disagree; 0 for N = 0. Symmetric in a
+        and b.
 
     Source: Eq. (1) and arXiv:2202.04414 (D-BAT).
     """

@@ -1,4 +1,4 @@
-"""A control for D-BAT that pairs no members: each member's term is with itself."""
+"""A control for D-BAT without pairs: each member is paired with itself."""
 
 from torch import Tensor
 
@@ -9,8 +9,8 @@ from hypogoal.diversity.dbat import pair_loss
 def ensemble_loss(context: Context) -> Tensor:
     """``sum_m (K - 1) l(m, m)`` with D-BAT's pair loss ``l``: in Eq. (1), half of l(a, a) + l(b, b) for each l(a, b).
 
-    It is lowest where every member is undecided (p = 1/2) on every unlabelled state, so it asks for no difference
-    between members. What D-BAT gains over it comes from pairing. One member alone has a weight of 1.
+    It is lowest if every member is undecided (p = 1/2) on every unlabelled state, so it rewards no difference between
+    members. What D-BAT gains over it comes from pairing. A single member has a weight of 1.
 
     Returns:
         float (), at least 0, in nats; 0 for no states.

@@ -8,15 +8,15 @@ from torch import Tensor
 from hypogoal.diversity import Context
 from hypogoal.diversity.mutual_information import pair_loss
 
-RATIO_WEIGHT = 1.0  # of the ratio term beside the mutual information: own choice, the source tunes it
+RATIO_WEIGHT = 1.0  # of the ratio term beside the mutual information: own choice; the source tunes it
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """Mutual information of all ordered pairs plus, for each member, how far its share of yes is from the labelled.
+    """Mutual information of all ordered pairs, plus each member's deviation from the labelled share of positives.
 
     ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``, with p(y) the labelled states' share of
-    positives. The second term is what keeps a member from saying the same of all unlabelled states, where the first is
-    0 without a gradient.
+    positives. The second term keeps members from predicting one class for all unlabelled states, where the first is 0
+    without a gradient.
 
     Returns:
         float (), in nats, at least 0 up to rounding; 0 for no states.

@@ -7,16 +7,16 @@ from torch import Tensor
 
 from hypogoal.diversity import Context
 
-TINY = 1e-12  # beside squared distances and norms of features, against a division by 0
+TINY = 1e-12  # added to squared distances and norms of features, against division by 0
 
 
 def ensemble_loss(context: Context) -> Tensor:
     """``2 sum_{a<b} HSIC(F_a, F_b) / sqrt(HSIC(F_a, F_a) HSIC(F_b, F_b))`` over the unlabelled states.
 
     HSIC = tr(H A H B) with Gaussian kernels A and B of two members' features, their widths the mean squared distance
-    (of this batch, held fixed), and H = I - 1/N. It is 0 where what one member computes of a state tells nothing of
-    what the other does. Divided so that features cannot escape it by becoming small. Frozen members have no features
-    and do not count.
+    (of this batch, held fixed), and H = I - 1/N. It is 0 if two members' features are
+    independent. The division keeps members from escaping it with small features. Frozen members have no features and
+    are ignored.
 
     Returns:
         float (), from 0 to K (K - 1); 0 for fewer than two states or members.

@@ -1,4 +1,4 @@
-"""Members that look at different pixels: orthogonal gradients of their logits by the input (Teney et al. 2022)."""
+"""Members that depend on different pixels: orthogonal input gradients of their logits (Teney et al. 2022)."""
 
 from itertools import combinations
 
@@ -7,16 +7,15 @@ from torch import Tensor
 
 from hypogoal.diversity import Context
 
-TINY = 1e-12  # beside squared norms of gradients, against a division by 0
+TINY = 1e-12  # added to squared norms of gradients, against division by 0
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """``2 sum_{a<b} mean_n cos(g_a(n), g_b(n))^2`` over labelled states, g the gradient of the logit gap by the pixels.
+    """``2 sum_{a<b} mean_n cos(g_a(n), g_b(n))^2`` over labelled states, with g the log-odds' gradient.
 
-    Two members whose logits depend on the same pixels in the same way have a cosine of 1. The source takes the dot
-    product of the gradients; here they are normalised, so that members cannot escape by flattening, and squared, so
-    that opposite gradients, which use the same features, are no way out. No unlabelled states are needed. Frozen
-    members do not count.
+    Two members whose logits depend on the same pixels in the same way have a cosine of 1. The source uses the dot
+    product of the gradients; here they are normalised, so that members cannot escape by flattening, and the cosine is
+    squared, since opposite gradients use the same features. It needs no unlabelled states and ignores frozen members.
 
     Returns:
         float (), from 0 to K (K - 1); 0 for one member.

@@ -5,18 +5,18 @@ import math
 import torch
 from torch import Tensor
 
-SMALLEST_LOG = -1e30  # stands for log 0, so that 0 log 0 is 0 and not NaN
+SMALLEST_LOG = -1e30  # replaces log 0, so that 0 log 0 is 0 instead of NaN
 
 
 def pair_loss(logits_a: Tensor, logits_b: Tensor) -> Tensor:
     """Spec C1: mutual information of two members' classes over the unlabelled states, to be minimised.
 
-    ``KL(mean_n p_a(y|n) p_b(z|n)  ||  mean_n p_a(y|n) x mean_n p_b(z|n))``: the joint of both members'
-    classes over the batch against the product of their marginals. It is 0 when what one member says of a
-    state tells nothing of what the other says. So it is lowest when members differ on as many states as
-    independence asks for: a member that always contradicts another tells as much as one that always agrees.
-    Where a member says the same of all states it is 0 with a gradient near 0, and members agreeing there
-    stay so: DivDis adds a ratio term for that (:mod:`hypogoal.diversity.divdis`), which the authors dropped.
+    ``KL(mean_n p_a(y|n) p_b(z|n)  ||  mean_n p_a(y|n) x mean_n p_b(z|n))``: the joint distribution of both members'
+    classes over the batch against the product of their marginals. It is 0 if one member's predictions carry no
+    information about the other's. So it is lowest when members differ on as many states as independence implies: always
+    contradicting another member is as informative as always agreeing. If a member predicts one class for all states, it
+    is 0 with a gradient near 0, and members that agree there stay so: DivDis adds a ratio term against that
+    (:mod:`hypogoal.diversity.divdis`), which the authors dropped.
 
     Args:
         logits_a: float (..., N, 2), one member on N unlabelled states.

@@ -7,16 +7,15 @@ from torch import Tensor
 
 from hypogoal.diversity import Context
 
-TINY = 1e-12  # beside the kernel's width, where all members are the same
+TINY = 1e-12  # added to the kernel's width, in case all members are the same
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """``sum_m log mean_j k(f_m, f_j)``, whose gradient by f_m is the kernelised repulsion of the source.
+    """``sum_m log mean_j k(f_m, f_j)``, whose gradient by f_m is the source's kernelised repulsion.
 
-    f_m are member m's logit gaps (yes minus no) on the unlabelled states; k is a Gaussian kernel, its width the median
-    squared distance between members over log K (held fixed). The f_j are held fixed too: each member is pushed away
-    from where the others are. Repulsion falls off with distance, unlike D-BAT's, which goes on until members contradict
-    each other.
+    f_m are member m's log-odds on the unlabelled states; k is a Gaussian kernel, its width the median squared distance
+    between members over log K (held fixed). The f_j are held fixed too: each member is pushed away from the others.
+    Repulsion decreases with distance, unlike D-BAT's, which continues until members contradict each other.
 
     Returns:
         float (), from -K log K to 0; 0 for one member or no states.

@@ -1,4 +1,4 @@
-"""The small interface behind which a domain lives (Spec B6), and how one is found by name."""
+"""The interface of a domain (Spec B6), and how to find one by name."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ BUILT_IN = {
 }
 ENTRY_POINTS = "hypogoal.domains"
 STEP_KINDS = (("next_ids", "iu"), ("rewards", "iuf"), ("terminated", "b"), ("truncated", "b"))
-here: dict[str, Domain] = {}  # a program's own domains, by name
-IMPORTED = "imported"  # what states are of where 'hypogoal import' was not told
+REGISTERED: dict[str, Domain] = {}  # domains that the running program defined, by name
+IMPORTED = "imported"  # the domain of states that 'hypogoal import' got without --domain
 
 
 class Step(NamedTuple):
@@ -41,9 +41,9 @@ class Step(NamedTuple):
         next_ids: int64 (E,), the states reached, before any automatic reset.
         rewards: float32 (E,).
         terminated: bool (E,), the task is over.
-        truncated: bool (E,), the episode was cut at its step limit.
-        succeeded: bool (E,), the episode is over and was a success, where the domain defines success. None: it
-            terminated with a sum of rewards above 0.
+        truncated: bool (E,), the step limit ended the episode.
+        succeeded: bool (E,), the episode is over and a success, where the domain defines success. None: an episode
+            succeeds when it terminates with a sum of rewards above 0.
     """
 
     next_ids: NDArray[np.int64]
@@ -54,21 +54,21 @@ class Step(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What follows in the states that can be reached from the start, as far as it can be told."""
+    """The transitions between the states reachable from the start."""
 
     ids: NDArray[np.int64]  # (N,), the states
-    actions: NDArray[np.int64]  # (A,), those that are followed
-    following: NDArray[np.int64]  # (N, A), the state after each of them, one of ``ids``
-    final: NDArray[np.bool_]  # (N,), an episode ends there, so nothing follows
+    actions: NDArray[np.int64]  # (A,), the actions considered
+    following: NDArray[np.int64]  # (N, A), the state after each action, one of ``ids``
+    final: NDArray[np.bool_]  # (N,), the episode ends there, so nothing follows
     solved: NDArray[np.bool_]  # (N,), it ends there with the task solved
 
 
 class Layouts(Resumable):
-    """Which layout each episode begins in: one of ``seeds``, drawn anew by ``rng``; where that is None, environment
-    number e is always in the e-th, round and round.
+    """The layout each episode begins in: one of ``seeds``, drawn by ``rng`` for every episode; without ``rng``,
+    environment e always begins in seed number e (modulo their count).
 
     Attributes:
-        now: the layout seeds of the environments' episodes.
+        now: the layout seeds of the environments' current episodes.
     """
 
     CHANGING = ("rng", "now")
@@ -81,7 +81,7 @@ class Layouts(Resumable):
         return {"now": 0}
 
     def begin(self, number: int) -> int:
-        """The layout seed of a new episode of environment ``number``."""
+        """The layout seed of a new episode in environment ``number``."""
         place = number if self.rng is None else int(self.rng.integers(len(self.seeds)))
         self.now += [-1] * (number + 1 - len(self.now))
         self.now[number] = self.seeds[place % len(self.seeds)]
@@ -91,24 +91,24 @@ class Layouts(Resumable):
 class Engine(ABC):
     """Many environments, of one layout or several, stepped together; every distinct state has an integer id.
 
-    What every engine must have comes first, then what is optional, with its defaults.
+    Required members come first, then optional ones with their defaults.
 
     Attributes:
         n_actions: primitive actions are 0 .. n_actions - 1.
         count: environments (E).
-        observation_shape, observation_dtype: uint8 (H, W, C), pictures, or float32 of any shape.
-        standard: mean and deviation by which agents standardise float32 observations; set in training.
+        observation_shape, observation_dtype: uint8 (H, W, C) for pictures, or float32 of any shape.
+        standard: mean and deviation with which agents standardise float32 observations; set in training.
         max_steps: steps after which an episode is truncated.
         ids: int64 (E,), the current state of each environment.
         elapsed: int64 (E,), steps since its episode began.
-        memory: how many of the latest states, at least, it can still draw; it forgets older frames. None: all.
+        memory: it can draw at least this many of the latest states, and forgets older frames. None: it can draw all.
         starts: its start states, with ids 0 .. S - 1, never forgotten, each with ``on_the_way``; empty where all
             episodes begin alike.
-        action_sets: sets of actions that a policy may be restricted to, by name.
-        position_names: names of the columns of :meth:`positions`; empty where it does not know where the agent is.
+        action_sets: by name, sets of actions to which a policy may be restricted.
+        position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
         restarts: whether it has :meth:`restart`; resumes: whether it has :meth:`snapshot` and :meth:`restore`.
-        alike: whether its snapshots are always built alike, but for what they mark as ``growing``.
+        alike: whether all its snapshots have the same structure, except for the parts marked as ``growing``.
     """
 
     n_actions: int
@@ -129,32 +129,32 @@ class Engine(ABC):
     @property
     @abstractmethod
     def n_states(self) -> int:
-        """Ids known so far are 0 .. n_states - 1."""
+        """Ids assigned so far are 0 .. n_states - 1."""
 
     def reset(self) -> NDArray[np.int64]:
-        """Begin a new episode in every environment; returns the ids, int64 (E,). By default with ``restart``."""
+        """Begin a new episode in every environment; returns the ids, int64 (E,). Uses ``restart`` by default."""
         self.ids = self.elapsed = np.zeros(self.count, np.int64)
         self.restart(np.ones(self.count, np.bool_))
         return self.ids.copy()
 
     @abstractmethod
     def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment with actions (E,); where an episode ends, ``ids`` is then a start state."""
+        """Step every environment with actions (E,); where an episode ends, ``ids`` becomes a start state."""
 
     @abstractmethod
     def images(self, ids: NDArray[np.int64], out: Any = None) -> Observations:
-        """Observations (n, *observation_shape), ``observation_dtype``, of known states, into ``out`` where given."""
+        """Observations (n, *observation_shape), ``observation_dtype``, of known states, in ``out`` if passed."""
 
     @abstractmethod
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """True sub-goal predicates, bool (n, G): the oracle that only evaluation and the upper bound may see."""
+        """True sub-goal predicates, bool (n, G): an oracle, for evaluation and the upper bound only."""
 
     def labels_now(self) -> NDArray[np.bool_]:
-        """The labels of the environments' current states, bool (E, G), computed anew where they are kept by id."""
+        """The labels of the environments' current states, bool (E, G), computed again rather than looked up by id."""
         return self.labels(self.ids)
 
     def room_for(self, count: int, out: Observations | None) -> Observations:
-        """Where to draw ``count`` observations: ``out``, or a new array; ``ValueError`` where ``out`` does not fit."""
+        """An array for ``count`` observations: ``out``, or a new one; ``ValueError`` if ``out`` does not fit."""
         shape = (count, *self.observation_shape)
         if out is None:
             return np.empty(shape, self.observation_dtype)
@@ -163,15 +163,15 @@ class Engine(ABC):
         return out
 
     def restart(self, where: NDArray[np.bool_]) -> None:
-        """Begin a new episode now in the environments ``where``, bool (E,); needs ``restarts``."""
+        """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``."""
         raise UserError("this domain's engine cannot begin an episode on request", None, "Let its episodes end.")
 
     def snapshot(self) -> dict[str, Any]:
-        """Its whole state, nested dicts of arrays and JSON values; needs ``resumes``."""
+        """Its whole state as nested dicts of arrays and JSON values; needs ``resumes``."""
         raise UserError("this domain's engine cannot be saved", None, "Train on it without --resume.")
 
     def kept(self) -> dict[str, Any]:
-        """Its snapshot for a checkpoint, which is compared with a fresh one where snapshots are ``alike``."""
+        """Its snapshot for a checkpoint; on loading, ``alike`` ones are compared with a fresh snapshot."""
         return self.snapshot() if self.alike else Unknown(self.snapshot())
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -179,14 +179,14 @@ class Engine(ABC):
         raise UserError("this domain's engine cannot be resumed", None, ANEW)
 
     def take_back(self, kept: Mapping[str, Any]) -> None:
-        """Continue from what was :meth:`kept`; environments in states that it does not know are ``Unlike``."""
+        """Continue from what :meth:`kept` returned; ``Unlike`` if an environment is in an unknown state."""
         self.restore(kept)
         if self.ids.shape != (self.count,) or not ((self.ids >= 0) & (self.ids < self.n_states)).all():
             raise Unlike("at the engine's ids")
 
     @property
     def oldest(self) -> int:
-        """Ids below this one, except start states, are forgotten: they can no longer be drawn."""
+        """Ids below this one, except start states, are forgotten and can no longer be drawn."""
         return 0
 
     def remembers(self, ids: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -194,12 +194,12 @@ class Engine(ABC):
         return (ids >= self.oldest) | (ids < len(self.starts))
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Where the agent is, int64 (n, ``position_names``); of forgotten states too."""
-        raise UserError("this domain's engine does not know where the agent is", None, "Train it with view=full.")
+        """The agent's positions, int64 (n, ``position_names``), also in forgotten states."""
+        raise UserError("this domain's engine does not know where the agent is", None, "Train with view=full.")
 
     @property
     def tiles(self) -> NDArray[np.uint8] | None:
-        """What each cell code looks like, uint8 (codes, height, width, C), where pictures are made of cells."""
+        """The picture of each cell code, uint8 (codes, height, width, C); None if pictures are not made of cells."""
         return None
 
     def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -207,37 +207,37 @@ class Engine(ABC):
         raise UserError("this domain's pictures are not made of cells", None, "Ask for images.")
 
     def reachable(self) -> NDArray[np.int64] | None:
-        """Ids of all states that can be reached, one for each image; None where they are not known."""
+        """Ids of all reachable states, one for each distinct image; None if unknown."""
         return None
 
     def plan(self) -> Plan | None:
-        """What each action leads to in each state; None where that is not known."""
+        """The state each action leads to from each state; None if unknown."""
         return None
 
     def shortest_path(self) -> int | None:
-        """Fewest primitive steps to the end of the task; None where they are not known."""
+        """The fewest primitive steps that solve the task; None if unknown."""
         return None
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float | None:
-        """Share of episodes of uniformly random actions that solve the task; None where it is not measured."""
+        """The share of episodes of uniform-random actions that solve the task; None if not measured."""
         return None
 
 
 class TurnEngine(Engine):
-    """An engine whose environments are stepped one after the other; it says how an episode begins and a step goes.
+    """An engine that steps its environments one after the other; subclasses begin an episode and play a step.
 
-    In plain Python: NumPy's operations make an emulator's next frames slower, see ``montezuma_emulator``.
+    In plain Python, because NumPy's operations slow down an emulator's next frames, see ``montezuma_emulator``.
     """
 
     restarts = resumes = True
 
     @abstractmethod
     def _begin(self, number: int) -> int:
-        """An episode of one environment; returns the start state."""
+        """Begin an episode in one environment; returns the start state."""
 
     @abstractmethod
     def _play(self, number: int, action: int, elapsed: int) -> tuple[int, float, bool, bool]:
-        """One environment's step number ``elapsed`` of an episode: state, reward, terminated, truncated."""
+        """Step ``elapsed`` of one environment's episode: state, reward, terminated, truncated."""
 
     def restart(self, where: NDArray[np.bool_]) -> None:
         ids, elapsed = self.ids.copy(), self.elapsed.copy()
@@ -246,7 +246,7 @@ class TurnEngine(Engine):
         self.ids, self.elapsed = ids, elapsed
 
     def step(self, actions: NDArray[np.int64]) -> Step:
-        """Step every environment; an ``IndexError`` where there is no such action, or not one for each environment."""
+        """Step every environment; ``IndexError`` unless there is one valid action for each."""
         played = actions.tolist()
         if len(played) != self.count or not all(0 <= action < self.n_actions for action in played):
             raise IndexError(f"actions are {self.count} numbers from 0 to {self.n_actions - 1}, not {played}")
@@ -260,31 +260,31 @@ class TurnEngine(Engine):
             ids.append(state)
         self.ids, self.elapsed = np.array(ids, np.int64), np.array(elapsed, np.int64)
         kinds = (np.int64, np.float32, np.bool_, np.bool_)
-        return Step(*(np.array(told, kind) for told, kind in zip(zip(*outcomes, strict=True), kinds, strict=True)))
+        return Step(*(np.array(part, kind) for part, kind in zip(zip(*outcomes, strict=True), kinds, strict=True)))
 
 
 class Domain(ABC):
     """What hypogoal needs to know about a domain; :class:`hypogoal.GymnasiumDomain` makes one from an environment.
 
-    ``hypogoal check`` tests it. What a domain must have comes first, then what is optional.
+    ``hypogoal check`` tests it. Required members come first, then optional ones.
 
     Attributes:
         name: for messages.
         sub_goals: their names (G).
         config_class: the settings of ``collect``, a frozen dataclass of ``core.config.setting`` fields.
-        engine_settings: the names of those that belong to the world: later stages play with them too.
-        defaults: settings of stages that suit it, by stage; sources: where these come from, where known.
+        engine_settings: the names of the settings that define the world; later stages play with them too.
+        defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
         env_id: the id of its registered Gymnasium environment, if any.
-        resumes: ``collect`` also takes ``kept``, a function from a part's name to the ``Checkpoints`` that keep it
-            until all parts are there.
+        resumes: ``collect`` also takes ``kept``, a function from a part's name to the ``Checkpoints`` that keep the
+            part until all are complete.
         kinds: names of the values of the origin ``kind``.
         starts: names of places where episodes begin; ``make_engine`` takes one as ``start``.
-        many_starts: it also takes several, comma-separated.
-        many_layouts: ``make_engine`` also takes ``layouts``, :class:`Layouts` to begin episodes in instead.
+        many_starts: ``start`` may also be several names, comma-separated.
+        many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
         measures: it has :meth:`distance`; near: the distance up to which a state counts as near a true sub-goal.
-        reading: a sentence on how to read its observations, for people.
-        labels_stand_in: where its author adds a sub-goal, for people.
-        packed: about how many times smaller collected states are on disk than in memory; 1 where not known.
+        reading: a sentence for people on how to read its observations.
+        labels_stand_in: for people, where the domain's author adds a sub-goal.
+        packed: about how many times smaller collected states are on disk than in memory; 1 if unknown.
         pictures: it has :meth:`picture` and :meth:`pixel`; sees_agent: it has :meth:`agent_pixels`.
     """
 
@@ -318,7 +318,7 @@ class Domain(ABC):
 
     @property
     def doubt(self) -> str:
-        """A warning that its observations may be meant as pictures but are numbers; empty where they are not."""
+        """A warning if its observations are read as numbers but look like pictures; else empty."""
         return reading_of(tuple(self.observation_shape), self.observation_dtype).doubt
 
     @property
@@ -332,7 +332,7 @@ class Domain(ABC):
 
     @abstractmethod
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Engine:
-        """An engine of ``count`` environments of one layout; ``arguments``: ``engine_settings``, and ``start``."""
+        """An engine of ``count`` environments of one layout; ``arguments``: ``engine_settings`` and ``start``."""
 
     @property
     def has_env(self) -> bool:
@@ -348,41 +348,41 @@ class Domain(ABC):
         return gymnasium.make(self.env_id, **arguments)
 
     def world(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """The engine's settings among those that states were collected with: ``config`` of a data file,
-        ``domain_config`` of an artefact.
+        """The engine settings among ``config``, the settings that states were collected with.
 
-        Missing ones are as ``make_engine`` has them; values that ``collect`` would not take are a ``UserError``.
+        ``config`` is that of a data file, or ``domain_config`` of an artefact. Missing settings are left to
+        ``make_engine``; values that ``collect`` would refuse are a ``UserError``.
         """
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked: Any = from_values(self.config_class, values, "collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
     def small(self, config: Any) -> Any:
-        """Settings with which ``check`` collects: as in ``config``, but for fewer states."""
+        """The settings with which ``check`` collects: ``config`` with fewer states."""
         return config
 
     def shortened(self, config: Any, steps: int) -> Any:
-        """Settings with which ``check`` collects a slow domain in about so many steps; needs ``collected_steps``."""
+        """The settings with which ``check`` collects a slow domain in about ``steps``; needs ``collected_steps``."""
         return config
 
     def collected_steps(self, config: Any) -> int:
-        """Steps that ``collect`` will play in an environment; 0 where not known."""
+        """The environment steps that ``collect`` will play; 0 if unknown."""
         return 0
 
     def inputs(self, config: Any) -> Sequence[Path]:
-        """Files that ``collect`` reads."""
+        """The files that ``collect`` reads."""
         return ()
 
     def collected_bytes(self, config: Any) -> int:
-        """Most bytes of observations that ``collect`` will make; 0 where not known."""
+        """An upper bound on the bytes of observations that ``collect`` makes; 0 if unknown."""
         return 0
 
     def played_bytes(self, steps: int, frames: int) -> int:
-        """Bytes of pictures that an engine keeps while it plays ``steps``, if replays need ``frames`` of them."""
+        """Bytes of pictures that an engine keeps while playing ``steps`` if replays need ``frames`` of them."""
         return 0
 
     def distance(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
+        """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
         raise UserError("this domain measures no distances", self.name, "Leave them out.")
 
     def rooms_of(self, start: str) -> tuple[int, ...]:
@@ -394,18 +394,18 @@ class Domain(ABC):
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
 
     def pixel(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Column and row of positions in that picture, (n, 2); needs ``pictures``."""
+        """The column and row of positions in that picture, (n, 2); needs ``pictures``."""
         raise UserError("this domain has no pictures of rooms", self.name, "Leave them out.")
 
     def agent_pixels(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Row and column of the agent's centre in an observation, (n, 2), from positions; needs ``sees_agent``."""
+        """The row and column of the agent's centre in an observation, (n, 2); needs ``sees_agent``."""
         raise UserError("this domain does not say where in an observation the agent is", self.name, "Set view=full.")
 
 
 def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
-    """One step of an engine; a ``UserError`` where someone's own gives no id, finite reward and two truths for each."""
+    """One step of an engine; a ``UserError`` if a user's engine returns a malformed step."""
     step: Any = engine.step(actions)
-    do = f"Give a Step of arrays of length {engine.count}, of the types that hypogoal.domains.base.Step says."
+    do = f"Give a Step of arrays of length {engine.count}, of the types in hypogoal.domains.base.Step."
     if not isinstance(step, Step):
         UsersCode("the engine's step", engine, "step").refuse(f"gave a {type(step).__name__}, not a Step", do)
     for name, kinds in STEP_KINDS if step.succeeded is None else (*STEP_KINDS, ("succeeded", "b")):
@@ -413,21 +413,21 @@ def step_of(engine: Engine, actions: NDArray[np.int64]) -> Step:
         if getattr(values, "shape", None) != (engine.count,) or values.dtype.kind not in kinds:
             UsersCode("the engine's step", engine, "step").refuse(f"gave {name} {values!r}", do)
     if not np.isfinite(step.rewards).all():
-        place = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
-        what = f"gave the reward {step.rewards[place]} in environment {place}"
-        UsersCode("the engine's step", engine, "step").refuse(what, "Give finite numbers.")
+        number = int(np.flatnonzero(~np.isfinite(step.rewards))[0])
+        fault = f"gave the reward {step.rewards[number]} in environment {number}"
+        UsersCode("the engine's step", engine, "step").refuse(fault, "Give finite numbers.")
     return step
 
 
 def load_domain(name: str, *, given: bool = False) -> Domain:
-    """A domain by its name, by an installed entry point (group ``hypogoal.domains``) or as ``module:object``.
+    """A domain by name: a built-in one, an installed entry point (group ``hypogoal.domains``) or ``module:object``.
 
-    The latter is code that will run, see :mod:`hypogoal.core.own_code`; ``given``: the user gave this name, on the
-    command line or in a program. What is no domain, or code that the user did not allow, is a ``UserError``.
+    ``module:object`` runs code, see :mod:`hypogoal.core.own_code`; ``given``: the user gave this name, on the command
+    line or in a program. Code that the user did not allow, or an object that is no domain, is a ``UserError``.
     """
     try:
         with own_code.given(*([name] if given else [])):
-            domain = here.get(name) or own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
+            domain = REGISTERED.get(name) or own_code.load_own(name, "domain", ENTRY_POINTS, BUILT_IN)
     except UserError:
         if name != IMPORTED:
             raise
@@ -439,7 +439,7 @@ def load_domain(name: str, *, given: bool = False) -> Domain:
 
 
 def installed_domain(name: str, *, given: bool = False) -> Domain | None:
-    """The domain; None where it is not installed here: own data may name one that is not. See :func:`load_domain`."""
+    """The domain, or None if it is not installed: a user's data may name such a one. See :func:`load_domain`."""
     with own_code.given(*([name] if given else [])):
         own_code.require_trust(name, "domain")
         try:
@@ -449,6 +449,6 @@ def installed_domain(name: str, *, given: bool = False) -> Domain | None:
 
 
 def defaults_of(domain: str, stage: str, *, given: bool = False) -> Mapping[str, Any]:
-    """The settings of a stage that this domain has in place of the general ones; see :func:`installed_domain`."""
+    """The domain's own defaults for the settings of a stage; see :func:`installed_domain`."""
     installed = installed_domain(domain, given=given)
     return installed.defaults.get(stage, {}) if installed else {}

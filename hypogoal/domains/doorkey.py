@@ -1,6 +1,6 @@
-"""DoorKey with three keys (Spec B1-B3): the domain as the stages see it, and how its states are collected.
+"""Three-key DoorKey (Spec B1-B3): the domain, and how its states are collected.
 
-The parts: ``doorkey_env`` (the Gymnasium environment and the sub-goals), ``doorkey_engine`` (many environments, fast).
+See also ``doorkey_env`` (the Gymnasium environment and the sub-goals) and ``doorkey_engine`` (many environments, fast).
 """
 
 import itertools
@@ -26,7 +26,7 @@ class DoorKeyConfig:
 
     regime: str = setting(
         "fixed",
-        "labelled states: 'fixed', the layout as it is; 'shuffled', keys placed anew within its walls",
+        "labelled states: 'fixed', the layout as it is; 'shuffled', new key placements within its walls",
         source="paper, MiniGrid experiment",
         choices=("fixed", "shuffled"),
     )
@@ -51,7 +51,7 @@ class DoorKeyConfig:
     wrong_key: str = setting(
         "harmless",
         "holding the blue or the green key is 'harmless', or 'ends' the episode without reward",
-        source="ours: a task in which choosing decides",
+        source="own: a task in which the choice of options matters",
         choices=env.WRONG_KEYS,
     )
 
@@ -65,8 +65,8 @@ def _labelled_layouts(config: DoorKeyConfig, seed: int) -> list[Source]:
         return [(config.labelled_seed, 0, layout)]
     placements = list(itertools.permutations(layout.key_cells(), 3))
     if len(placements) < config.draws:
-        what = f"the layout has only {len(placements)} key placements"
-        raise UserError(what, f"draws={config.draws}", "Ask for fewer.")
+        fault = f"the layout has only {len(placements)} key placements"
+        raise UserError(fault, f"draws={config.draws}", "Ask for fewer.")
     chosen = rng_for(seed, "doorkey", "key-placements").choice(len(placements), config.draws, replace=False)
     return [
         (config.labelled_seed, number, replace(layout, keys=placements[index]))
@@ -75,7 +75,7 @@ def _labelled_layouts(config: DoorKeyConfig, seed: int) -> list[Source]:
 
 
 def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[env.Layout]) -> list[Source]:
-    """The first layouts from ``heldout_first`` on whose grid no other layout has."""
+    """The first layouts from ``heldout_first`` on whose grids are new."""
     grids = {layout.grid for layout in [*avoid, env.layout_of(config.labelled_seed)]}
     chosen: list[Source] = []
     for layout_seed in itertools.count(config.heldout_first):
@@ -89,12 +89,12 @@ def _heldout_layouts(config: DoorKeyConfig, avoid: Iterable[env.Layout]) -> list
 
 
 def _sweep(config: DoorKeyConfig, layout_seed: int, draw: int, layout: env.Layout, progress: Any) -> States:
-    """All states of one layout that an expert can bring about: images, labels and origins."""
+    """All states of one layout that an expert can reach: images, labels and origins."""
     engine = DoorKeyEngine(layout, keyring=config.keyring, door_label=config.door_label, wrong_key=config.wrong_key)
     ids = engine.reachable()
     progress.advance()
-    whence = {"layout_seed": np.full(len(ids), layout_seed), "draw": np.full(len(ids), draw)}
-    return States(engine.images(ids), engine.labels(ids), whence | engine.origins(ids))
+    origins = {"layout_seed": np.full(len(ids), layout_seed), "draw": np.full(len(ids), draw)}
+    return States(engine.images(ids), engine.labels(ids), origins | engine.origins(ids))
 
 
 class DoorKeyDomain(Domain):
@@ -108,10 +108,10 @@ class DoorKeyDomain(Domain):
     engine_settings = ("keyring", "door_label", "wrong_key")
     env_id = "hypogoal/DoorKey-8x8-v0"
     many_layouts = True
-    packed = 20  # 26 were measured
+    packed = 20  # 26 measured
 
     def collected_bytes(self, config: DoorKeyConfig) -> int:
-        """Observations of a collection, at the most: a layout has some 1,640 states (seed 0), others up to 2,500."""
+        """An upper bound: layout 0 has some 1,640 states, others up to 2,500."""
         draws = config.draws if config.regime == "shuffled" else 1
         layouts = draws * (1 + len(config.unlabelled_seeds)) + config.heldout_layouts
         return layouts * 2_500 * math.prod(self.observation_shape)
@@ -119,33 +119,32 @@ class DoorKeyDomain(Domain):
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
         """Spec B3: labelled, unlabelled and held-out states, each with its origin.
 
-        The scripted expert is an exhaustive sweep: every position and direction at every stage of the task (which
-        keys are held; door locked, open, closed again) that can be reached without dropping a key, each image once,
-        found by breadth-first search. Held-out states that look like one of those for learning are left out: with its
-        keys picked up a layout can look like another. In the regime ``shuffled`` as many states as the layout has as
-        it lies are kept, at random.
+        The scripted expert is an exhaustive breadth-first sweep: every position and direction at every stage of the
+        task (keys held; door locked, open, closed again) that is reachable without dropping a key, each image once.
+        Held-out states that look like a training state are left out: with its keys picked up, a layout can look like
+        another. The regime ``shuffled`` keeps a random sample, as large as the set that ``fixed`` has.
 
-        ``seed`` is of the key placements and of the choice among their states; ``fixed`` does not depend on it. Labels
-        are of all three sets (those of the unlabelled are for tests only). Origins, int64 (N,) each: layout_seed, draw
-        (0: keys as the seed has them), and those of ``DoorKeyEngine.origins``. Labelled states of one class only of
-        some sub-goal, or too many draws, are a ``UserError``.
+        ``seed`` draws the key placements and that sample; ``fixed`` does not depend on it. All three sets have labels
+        (the unlabelled states' are for tests only). Origins, int64 (N,) each: layout_seed, draw (0: the seed's own key
+        placement), and those of ``DoorKeyEngine.origins``. A sub-goal with one class only among the labelled states, or
+        too many draws, is a ``UserError``.
         """
         labelled = _labelled_layouts(config, seed)
         unlabelled = [(layout_seed, 0, env.layout_of(layout_seed)) for layout_seed in config.unlabelled_seeds]
         heldout = _heldout_layouts(config, avoid=[layout for _, _, layout in [*labelled, *unlabelled]])
         sources = labelled, unlabelled, heldout
         progress.expect(sum(map(len, sources)))
-        learnt, others, test = (joined([_sweep(config, *source, progress) for source in group]) for group in sources)
+        training, others, test = (joined([_sweep(config, *source, progress) for source in group]) for group in sources)
         if config.regime == "shuffled":
             amount = len(DoorKeyEngine(config.labelled_seed, keyring=config.keyring).reachable())
-            kept = np.zeros(len(learnt.labels), np.bool_)
+            kept = np.zeros(len(training.labels), np.bool_)
             rng = rng_for(seed, "doorkey", "shuffled-states")
             kept[rng.choice(len(kept), min(amount, len(kept)), replace=False)] = True
-            learnt = learnt.where(kept)
-        test = leave_out(test, learnt.observations, others.observations)
+            training = training.where(kept)
+        test = leave_out(test, training.observations, others.observations)
         where = f"labelled_seed={config.labelled_seed}, keyring={config.keyring}"
-        require_classes(learnt.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or keyring=true.")
-        return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, learnt, others, test)
+        require_classes(training.labels, env.SUB_GOALS, where, "Choose another labelled_seed, or keyring=true.")
+        return Collected(env.OBSERVATION_SHAPE, env.SUB_GOALS, training, others, test)
 
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = env.MAX_STEPS, **arguments: Any

@@ -1,12 +1,12 @@
-"""The fast DoorKey engine for training: exact to ``DoorKeyEnv``, which it is tested against step by step.
+"""The fast DoorKey engine for training; tests compare it with ``DoorKeyEnv`` step by step.
 
 Drawing is 99 % of MiniGrid's cost. Here a step is a few table look-ups for all environments together, and an image is
 64 tiles that were drawn once.
 
 A state is a *configuration* (the layout, its door and where its three keys are) and a *pose* (the agent's cell and
 direction). Turning and walking change the pose only and are table look-ups in NumPy. Picking up, dropping and
-toggling change the configuration: rare, so worked out in plain Python the first time and remembered. Every
-state met gets an id.
+toggling change the configuration; they are rare, so plain Python computes each change once and remembers it. Every
+state reached gets an id.
 """
 
 from collections.abc import Mapping
@@ -35,15 +35,15 @@ from hypogoal.domains.doorkey_env import (
 
 N_ACTIONS = len(Actions)
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = (int(action) for action in Actions)
-SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # when it is looked for what can be reached
+SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # in the search for reachable states
 CELLS = SIZE * SIZE
 POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
 HELD = CELLS  # a key's place: its cell, or HELD + rank on the ring (rank 0 was picked up first)
 OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers
-START = 0  # the id of the start state; of several layouts, of the first one's that was played
+START = 0  # the id of the start state; with several layouts, of the first one played
 UNKNOWN = -1
 
-# One byte says what is drawn in a cell.
+# One byte per cell encodes its picture.
 EMPTY, WALL, GOAL = 0, 1, 2
 KEY = 3  # plus 0, 1, 2: blue, green, red
 DOOR = 6  # plus OPEN, CLOSED, LOCKED
@@ -52,7 +52,7 @@ N_CODES = AGENT + 12
 AGENT_ON = np.zeros(N_CODES, np.uint8)
 AGENT_ON[[EMPTY, DOOR + OPEN, GOAL]] = AGENT, AGENT + 4, AGENT + 8  # plus the direction
 
-# MiniGrid's rules as tables. They are read flat: one index into a table is several times faster than two.
+# MiniGrid's rules as tables, read flat: one index into a table is several times faster than two.
 _POSE = np.arange(POSES)
 # AHEAD: the cell in front of each pose. MOVES: the pose after each action.
 AHEAD = np.clip((_POSE >> 2) + np.array((1, SIZE, -1, -SIZE))[_POSE & 3], 0, CELLS - 1)
@@ -60,14 +60,14 @@ MOVES = np.tile(_POSE, (N_ACTIONS, 1))
 MOVES[LEFT] = (_POSE & ~3) | ((_POSE - 1) & 3)
 MOVES[RIGHT] = (_POSE & ~3) | ((_POSE + 1) & 3)
 MOVES[FORWARD] = AHEAD * 4 + (_POSE & 3)
-TURN_OR_WALK = MOVES - _POSE  # as what is added to the pose
-# Given the action and the code ahead: which row of MOVES applies, and may the configuration change?
+TURN_OR_WALK = MOVES - _POSE  # what to add to the pose
+# For each action and code ahead: which row of MOVES applies, and may the configuration change?
 MOVE_AS = np.full((N_ACTIONS, N_CODES), DONE)
 MOVE_AS[LEFT], MOVE_AS[RIGHT] = LEFT, RIGHT
 MOVE_AS[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = FORWARD
 MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), np.bool_)
 MAY_CHANGE[PICKUP, KEY : KEY + 3] = MAY_CHANGE[DROP, EMPTY] = MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
-_ROW_OF_TILE = np.dtype(f"V{TILE * 3}")  # a tile's pixel row moved as one item: twice as fast as 24 bytes
+_ROW_OF_TILE = np.dtype(f"V{TILE * 3}")  # a tile's pixel row as one item: twice as fast to move as 24 bytes
 _AHEAD, _AGENT_ON = AHEAD.tolist(), AGENT_ON.tolist()  # one look-up in a list is faster than in an array
 
 Configuration = tuple[int, ...]  # the layout's seed; the door; the places of the blue, the green and the red key
@@ -75,7 +75,7 @@ Configuration = tuple[int, ...]  # the layout's seed; the door; the places of th
 
 @cache
 def tiles() -> NDArray[np.uint8]:
-    """MiniGrid's drawing of each cell code, uint8 (N_CODES, 8, 8, 3)."""
+    """MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
     things: list[Any] = [None, Wall(), Goal(), *(Key(colour) for colour in KEY_COLOURS)]
     things += [Door(DOOR_COLOUR, is_open=state == OPEN, is_locked=state == LOCKED) for state in (OPEN, CLOSED, LOCKED)]
     drawn = [Grid.render_tile(thing, tile_size=TILE) for thing in things]
@@ -87,9 +87,9 @@ def tiles() -> NDArray[np.uint8]:
 
 
 class DoorKeyEngine(Engine):
-    """Many environments of one layout or several, stepped together; ids are stable, START that of the start state.
+    """Many environments of one layout or several, stepped together; ids are stable, the start state has START.
 
-    Arguments are those of ``DoorKeyEnv``, but for ``layout``, one, the seed of one or several, and ``count``, of
+    Arguments as for ``DoorKeyEnv``, except ``layout``, a layout, a seed or several, and ``count``, the number of
     environments.
     """
 
@@ -109,21 +109,21 @@ class DoorKeyEngine(Engine):
         wrong_key: str = "harmless",
     ):
         self.harsh = wrong_key == "ends"
-        self.known: dict[int, Layout] = {0: layout} if isinstance(layout, Layout) else {}  # those played, by seed
+        self.known: dict[int, Layout] = {0: layout} if isinstance(layout, Layout) else {}  # layouts played, by seed
         seed = 0 if isinstance(layout, Layout) else layout
         self.layouts: Layouts = seed if isinstance(seed, Layouts) else Layouts((seed,))
         self.count, self.max_steps, self.keyring, self.door_label = count, max_steps, keyring, door_label
-        self.changes: dict[int, int] = {}  # of configurations, worked out so far, by configuration, cell and action
+        self.changes: dict[int, int] = {}  # computed next configurations, by configuration, cell, action
         self._numbers: dict[Configuration, int] = {}
-        # Of each configuration: its layout's seed and door cell; its door and keys; what it shows without the agent,
-        # twice; the ids by pose.
+        # For each configuration: its layout's seed and door cell; its door and keys; its cell codes without the agent,
+        # twice; ids by pose.
         self._seeds: list[int] = []
         self._doors = np.zeros(16, np.int64)
         self._places = np.zeros((16, 4), np.uint8)
         self._bare_codes = np.zeros((16, CELLS), np.uint8)
         self._rows: list[bytes] = []
         self._id_at = np.full((16, POSES), UNKNOWN, np.int64)
-        # Of each id: configuration * POSES + pose; where in the bare codes the cell ahead is; and so on.
+        # For each id: configuration * POSES + pose; the index of the cell ahead in the bare codes; and so on.
         self._site = np.zeros(256, np.int64)
         self._ahead = np.zeros(256, np.int64)
         self._codes = np.zeros((256, CELLS), np.uint8)
@@ -161,7 +161,7 @@ class DoorKeyEngine(Engine):
         return Step(next_ids, self.at_goal(next_ids).astype(np.float32), terminated, truncated)
 
     def follow(self, ids: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
-        """MiniGrid's rules: the states that follow, int64 (n,), on actions int (n,) of 0 .. 6."""
+        """MiniGrid's rules: the next states, int64 (n,), after actions int (n,) of 0 .. 6."""
         site = self._site.take(ids)
         case = np.asarray(actions, np.int64) * N_CODES + self._bare_codes.ravel().take(self._ahead.take(ids))
         following_site = site + TURN_OR_WALK.take(MOVE_AS.take(case) * POSES + (site & (POSES - 1)))
@@ -175,10 +175,10 @@ class DoorKeyEngine(Engine):
         return following
 
     def _changed(self, configuration: int, front: int, action: int) -> int:
-        """The configuration after ``pickup``, ``drop`` or ``toggle`` on cell ``front``; may be the same."""
+        """The configuration after ``pickup``, ``drop`` or ``toggle`` on cell ``front``, possibly unchanged."""
         key = (configuration * CELLS + front) * N_ACTIONS + action
-        if (known := self.changes.get(key)) is not None:
-            return known
+        if (changed := self.changes.get(key)) is not None:
+            return changed
         (door, *keys), seed = self._places[configuration].tolist(), self._seeds[configuration]
         held = sum(place >= HELD for place in keys)
         if action == PICKUP and front in keys and (self.keyring or not held):
@@ -199,7 +199,7 @@ class DoorKeyEngine(Engine):
         return out
 
     def codes(self, ids: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """What each cell shows, uint8 (n, 64) row by row: with ``tiles()`` it says the whole image."""
+        """Each state's cell codes, uint8 (n, 64) row by row; with ``tiles()`` they give the whole image."""
         return self._codes.take(ids, axis=0)
 
     def at_goal(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -214,7 +214,7 @@ class DoorKeyEngine(Engine):
         return sub_goals_reached(keys >= HELD, door == OPEN, facing, self.at_goal(ids), self.door_label)
 
     def origins(self, ids: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-        """Where each state is: agent_x, agent_y, direction, door_state, keys_held; int64 (n,) each.
+        """The states' origins: agent_x, agent_y, direction, door_state, keys_held; int64 (n,) each.
 
         ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked); ``keys_held`` has bit 0 for the blue, 1 for
         the green, 2 for the red key.
@@ -230,12 +230,12 @@ class DoorKeyEngine(Engine):
         }
 
     def distances(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Breadth-first search: ids of all states reachable from the starts, nearest first, and steps to each.
+        """Breadth-first search: ids of all states reachable from the starts, nearest first, and the steps to each.
 
-        States in which the episode ends are included and not gone beyond. Without dropping a key they are a few
-        thousand of a layout; with it, which is not looked at, some ten million.
+        The search stops at states in which the episode ends. It never drops a key: that leaves a few thousand states
+        per layout instead of some ten million.
         """
-        rings, depth = [np.array([self._start(seed) for seed in self.layouts.seeds])], 0  # those so many steps away
+        rings, depth = [np.array([self._start(seed) for seed in self.layouts.seeds])], 0
         seen, steps = np.zeros(self.n_states, np.bool_), [np.zeros(len(rings[0]), np.int64)]
         seen[rings[0]] = True
         while len(rings[-1]):
@@ -252,8 +252,7 @@ class DoorKeyEngine(Engine):
     def reachable(self) -> NDArray[np.int64]:
         """Ids of all states reachable from the start, nearest first, one for each image.
 
-        States that differ only in the order of the keys on the ring look the same; the first one found stands
-        for them all.
+        States that differ only in the order of the keys on the ring look the same; the first represents them all.
         """
         ids, _ = self.distances()
         images = self.codes(ids).view(f"V{CELLS}")[:, 0]
@@ -261,7 +260,7 @@ class DoorKeyEngine(Engine):
         return ids[np.sort(first)]
 
     def plan(self) -> Plan:
-        """Of all states but those that only dropping a key leads to, of which there are some ten million."""
+        """The transitions between all states, except some ten million that only dropping a key leads to."""
         ids, actions = self.distances()[0], SEARCHED
         final = self._final[ids]
         following = np.repeat(ids[:, None], len(actions), axis=1)
@@ -270,7 +269,7 @@ class DoorKeyEngine(Engine):
         return Plan(ids, actions, following, final, self.at_goal(ids))
 
     def shortest_path(self) -> int | None:
-        """Primitive steps from the start to the goal, at least; None of many, or where a key must be dropped."""
+        """The fewest primitive steps to the goal; None with several layouts, or if a key must be dropped."""
         if self.layouts.many:
             return None
         ids, steps = self.distances()
@@ -278,7 +277,7 @@ class DoorKeyEngine(Engine):
         return int(steps[at_goal].min()) if at_goal.any() else None
 
     def random_success(self, episodes: int, rng: np.random.Generator) -> float:
-        """Spec F5: share of ``episodes`` of uniformly random actions that reach the goal in ``max_steps``."""
+        """Spec F5: the share of ``episodes`` of uniform-random actions that reach the goal within ``max_steps``."""
         seeds = list(self.layouts.seeds) * episodes
         if self.layouts.many:
             seeds = rng.choice(self.layouts.seeds, episodes).tolist()
@@ -290,7 +289,7 @@ class DoorKeyEngine(Engine):
         return solved / episodes
 
     def snapshot(self) -> dict[str, Any]:
-        """What a resumed run needs to go on exactly: where each environment is, and the ids given so far."""
+        """All that a resumed run needs: each environment's state, and the ids assigned so far."""
         return {
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
@@ -304,7 +303,7 @@ class DoorKeyEngine(Engine):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue, where nothing was played, from a ``snapshot`` of an engine made with the same arguments."""
+        """Continue from a ``snapshot`` of an engine made with the same arguments; call it before the first step."""
         configurations = snapshot["configurations"].tolist()
         seeds = snapshot["seeds"].tolist() if self.layouts.many else self.layouts.seeds * len(configurations)
         for seed, configuration in zip(seeds, configurations, strict=True):
@@ -316,9 +315,9 @@ class DoorKeyEngine(Engine):
             self.layouts.restore(snapshot["layouts"])
 
     def _new_id(self, site: int) -> int:
-        known = self._id_at.item(site)
-        if known != UNKNOWN:  # met twice in one vector step
-            return known
+        state = self._id_at.item(site)
+        if state != UNKNOWN:  # reached twice in one vector step
+            return state
         new = self.n_states
         if new == len(self._site):
             self._site, self._ahead, self._codes, self._on_goal, self._final = (
@@ -339,8 +338,8 @@ class DoorKeyEngine(Engine):
         return new
 
     def _number_of(self, configuration: Configuration) -> int:
-        if (known := self._numbers.get(configuration)) is not None:
-            return known
+        if (number := self._numbers.get(configuration)) is not None:
+            return number
         new = self._numbers[configuration] = len(self._rows)
         if new == len(self._places):
             self._places, self._bare_codes = _doubled(self._places), _doubled(self._bare_codes)
@@ -363,5 +362,5 @@ class DoorKeyEngine(Engine):
 
 
 def _doubled(table: NDArray[Any], filling: int = 0) -> NDArray[Any]:
-    """The table with as many rows again, of ``filling``."""
+    """The table with twice as many rows, the new ones of ``filling``."""
     return np.concatenate([table, np.full_like(table, filling)])

@@ -1,4 +1,4 @@
-"""Spec B1, B2: three-key DoorKey on minigrid's own classes, its five sub-goals, and what a layout is.
+"""Spec B1, B2: three-key DoorKey on minigrid's own classes, its layouts and its five sub-goals.
 
 This is the reference: the fast engine (``doorkey_engine.py``) is tested to be pixel- and step-exact with it.
 """
@@ -37,8 +37,8 @@ def sub_goals_reached(
 ) -> NDArray[np.bool_]:
     """Spec B2: the five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
 
-    ``held`` (..., 3) is of the blue, the green and the red key, all else (...,). ``open-red-door`` holds of an ``open``
-    door, wherever the agent stands, or only ``in-front``, next to it and looking at it.
+    ``held`` (..., 3) covers the blue, the green and the red key; the others are (...,). ``open-red-door`` holds when
+    the door is ``open``, wherever the agent stands, or only when the agent is also ``in-front``, facing it.
 
     Source: the paper's text (``in-front``), its authors' check (``open``).
     """
@@ -50,7 +50,7 @@ def sub_goals_reached(
 class Layout:
     """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x."""
 
-    walls: frozenset[int]  # cells; the door's is not among them
+    walls: frozenset[int]  # cells, without the door's
     door: int
     goal: int
     start: int  # where the agent begins
@@ -59,7 +59,7 @@ class Layout:
 
     @property
     def grid(self) -> tuple[frozenset[int], int, int, tuple[int, int, int]]:
-        """All but the agent: two layouts of the same grid have the same states, whatever their seeds."""
+        """All but the agent: layouts with the same grid have the same states."""
         return self.walls, self.door, self.goal, self.keys
 
     def key_cells(self) -> list[int]:
@@ -82,11 +82,11 @@ class _RingDoor(Door):
 
 
 class DoorKeyGrid(MiniGridEnv):
-    """Three-key DoorKey with MiniGrid's own dictionary observations; ``DoorKeyEnv`` gives the image instead.
+    """Three-key DoorKey with MiniGrid's dictionary observations; ``DoorKeyEnv`` returns the image instead.
 
     Args:
         keyring: True, pickup puts a key onto a ring and drop takes the last one off (the authors' fork);
-            False, MiniGrid's hands that hold one key.
+            False, MiniGrid's rule that the agent holds one key.
         max_steps: steps after which an episode is truncated.
         layout_seed: the layout of every episode; None, the layout follows from ``reset(seed)``.
             ``layout_seed=s`` is the layout of ``reset(seed=s)``.
@@ -150,11 +150,11 @@ class DoorKeyGrid(MiniGridEnv):
         return observation, info | {"labels": self._named_labels()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """MiniGrid's step, but for a ring that takes and gives keys; reward 1 at the goal, else 0."""
+        """MiniGrid's step with a key ring; reward 1 at the goal, else 0."""
         played = action
         if self.keyring and action in (self.actions.pickup, self.actions.drop):
             self._use_ring(pick_up=action == self.actions.pickup)
-            played = self.actions.done  # all that is left to MiniGrid is to count the step and to look
+            played = self.actions.done  # MiniGrid only counts the step and observes
         observation, reward, terminated, truncated, info = super().step(played)
         wrong = self.wrong_key == "ends" and not {*self.held} <= {DOOR_COLOUR}
         return observation, float(reward), terminated or wrong, truncated, info | {"labels": self._named_labels()}
@@ -185,7 +185,7 @@ class DoorKeyGrid(MiniGridEnv):
         return dict(zip(SUB_GOALS, self.labels().tolist(), strict=True))
 
     def layout(self) -> Layout:
-        """The layout of the current episode, read off the grid. Only right after ``reset``."""
+        """The layout of the current episode, read off the grid; valid only right after ``reset``."""
         x, y = self.agent_pos
         where: dict[Any, int] = {}
         walls = set()

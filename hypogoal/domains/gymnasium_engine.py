@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as an engine: many of it stepped in turn, states by id, each distinct one kept once."""
+"""Any Gymnasium environment as an engine: many copies stepped in turn, states by id, each distinct one kept once."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,12 +22,12 @@ MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
-RESETS = 5  # which a wrapper that drops the seed hardly passes by chance
-MEMORY = 110_000  # the replay's 1e5 transitions and what is not yet in it
+RESETS = 5  # a wrapper that drops the seed is unlikely to begin alike that often
+MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 
 def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
-    """What a function of the user's own makes; a ``UserError`` where it fails, or makes no environment."""
+    """The environment that a user's function makes; a ``UserError`` if it fails or returns something else."""
     with UsersCode("the environment", make, failed="cannot be made:") as code:
         env: Any = make(**arguments)
         if not isinstance(env, gymnasium.Env):
@@ -38,9 +38,9 @@ def made(make: Callable[..., gymnasium.Env], **arguments: Any) -> gymnasium.Env:
 
 
 def make_checked(make: MakeEnv) -> gymnasium.Env:
-    """An environment whose observations can be read, and actions are ``Discrete``; else a ``UserError``."""
+    """An environment with readable observations and ``Discrete`` actions; else a ``UserError``."""
     env = made(make)
-    look_of(env)
+    reader_of(env)
     with UsersCode("the environment", env, failed="has no spaces:"):
         actions = env.action_space
     if not isinstance(actions, spaces.Discrete) or actions.start != 0:
@@ -48,11 +48,11 @@ def make_checked(make: MakeEnv) -> gymnasium.Env:
     return env
 
 
-class Look(NamedTuple):
-    """How observations of a space are read: as arrays of one shape and type, see ``dataset.Observations``.
+class Reader(NamedTuple):
+    """Reads observations of a space as arrays of one shape and type, see ``dataset.Observations``.
 
-    ``features`` are the names of the numbers in one that is no picture; ``key`` is that of the picture in a dictionary
-    with nothing else in it. ``doubt`` is a warning, where numbers may be meant as a picture.
+    ``features`` names the numbers of a non-image observation; ``key`` is that of the only entry of a dictionary, a
+    picture. ``doubt`` is a warning that numbers may be meant as a picture.
     """
 
     space: spaces.Space[Any]
@@ -63,7 +63,7 @@ class Look(NamedTuple):
     doubt: str = ""
 
     def read(self, env: gymnasium.Env, observation: Any, method: str = "step") -> Any:
-        """An observation (*shape) that ``method`` gave, in memory of its own; ``UserError`` if its space says other."""
+        """A copy (*shape) of an observation that ``method`` returned; ``UserError`` if it does not fit its space."""
         code = UsersCode("the environment", env, method)
         with code:
             if self.key:
@@ -71,26 +71,26 @@ class Look(NamedTuple):
             elif not isinstance(self.space, spaces.Box):
                 observation = spaces.flatten(self.space, observation)
             values = np.array(observation, order="C")
-        given = f"{values.dtype} {values.shape}"
+        received = f"{values.dtype} {values.shape}"
         if self.dtype == NUMBERS and values.dtype.kind in "iufb":
             values = values.astype(NUMBERS)
         if values.dtype != self.dtype or values.shape not in (self.shape, self.space.shape):
             do = f"Make the observation space and the observations agree; the space says {self.dtype} {self.shape}."
-            code.refuse(f"gave an observation that does not fit its space: {given}", do)
+            code.refuse(f"gave an observation that does not fit its space: {received}", do)
         if self.dtype == NUMBERS and not np.isfinite(values).all():
             code.refuse("gave an observation with numbers that are not finite", "Give finite ones.")
         return values.reshape(self.shape)
 
 
-def look_of(env: gymnasium.Env) -> Look:
-    """How to read an environment's observations; of spaces that are no numbers, or mix pictures in, a ``UserError``.
+def reader_of(env: gymnasium.Env) -> Reader:
+    """A reader of an environment's observations; a ``UserError`` if they are no numbers, or mix pictures with others.
 
     Pictures are a ``Box`` of uint8 (H, W, C) or (H, W), or a ``Dict`` of just that. Any other ``Box`` is float32, see
-    ``hypogoal.domains.observations``; what else Gymnasium's ``flatten`` makes numbers of, dictionaries for one, is
-    float32 (D,), in that order.
+    ``hypogoal.domains.observations``. Other spaces that Gymnasium's ``flatten`` accepts, such as dictionaries, become
+    float32 (D,) in its order.
     """
     with UsersCode("the environment", env, failed="has no spaces:"):
-        whole = space = env.observation_space
+        space = env.observation_space
     parts, doubt = list(_parts(space)), ""
     for name, part in parts:
         if not isinstance(part, spaces.Box):
@@ -102,22 +102,22 @@ def look_of(env: gymnasium.Env) -> Look:
                 raise UserError("observations mix pictures with other values", ", ".join(name for name, _ in parts), do)
             if reading.fault:
                 raise UserError(f"observations {reading.fault}", f"{part.dtype} {part.shape}", _wrapped(reading, name))
-            return Look(part, reading.shape, PICTURE, key=name)
+            return Reader(part, reading.shape, PICTURE, key=name)
         doubt = doubt or reading.doubt
     try:
         sizes = [(name, spaces.flatdim(part)) for name, part in parts]
     except (NotImplementedError, ValueError):
         do = "Wrap it so that it gives those, for example in minigrid's ImgObsWrapper(RGBImgObsWrapper(env))."
-        what = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
-        raise UserError(what, whole, do) from None
+        fault = "observations must be images, uint8 (H, W, C) or (H, W), or numbers that Gymnasium can flatten"
+        raise UserError(fault, space, do) from None
     names = [(name, size, place) for name, size in sizes for place in range(size)]
     features = [(name if size == 1 else f"{name}[{place}]") if name else f"x{place}" for name, size, place in names]
     shape = (isinstance(space, spaces.Box) and space.shape) or (len(features),)
-    return Look(space, shape, NUMBERS, tuple(features), doubt=doubt)
+    return Reader(space, shape, NUMBERS, tuple(features), doubt=doubt)
 
 
 def _wrapped(reading: Reading, key: str) -> str:
-    """The wrappers that make observations, or the part of a dictionary with this key, what they may be meant to be."""
+    """The wrappers that turn observations, or a dictionary's entry ``key``, into what they may be meant to be."""
     numbers = "of numbers: env = gymnasium.wrappers.FlattenObservation(env)"
     if reading.picture is None:
         return f"Give pictures, uint8 (H, W, C); {numbers}"
@@ -129,20 +129,20 @@ def _wrapped(reading: Reading, key: str) -> str:
 
 
 def resized(env: gymnasium.Env, side: int) -> gymnasium.Env:
-    """The same with pictures of side x side pixels, means over areas; without pictures a ``UserError``."""
-    look = look_of(env)
-    if look.dtype != PICTURE:
+    """The environment with pictures of side x side pixels, means over areas; ``UserError`` without pictures."""
+    reader = reader_of(env)
+    if reader.dtype != PICTURE:
         raise UserError("only pictures can be resized", env.observation_space, "Leave out resize.")
 
     def small(observation: Any) -> NDArray[np.uint8]:
-        return resized_picture(look.read(env, observation), side, side)
+        return resized_picture(reader.read(env, observation), side, side)
 
-    space = spaces.Box(0, 255, (side, side, look.shape[-1]), np.uint8)
+    space = spaces.Box(0, 255, (side, side, reader.shape[-1]), np.uint8)
     return gymnasium.wrappers.TransformObservation(env, small, space)
 
 
 def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """The spaces in a ``Dict`` or ``Tuple``, in the order in which they are flattened, by name; else itself."""
+    """By name, the spaces in a ``Dict`` or ``Tuple`` in the order of flattening; any other space itself."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
         for key, part in inner:
@@ -152,47 +152,47 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-    """What ``env.reset(**arguments)`` gives: an observation, see :class:`Look`, and a dict; else a ``UserError``."""
+    """``env.reset(**arguments)``: an observation, see :class:`Reader`, and a dict; ``UserError`` if malformed."""
     with UsersCode("the environment's reset", env, "reset") as code:
         try:
-            given: Any = env.reset(**arguments)
+            result: Any = env.reset(**arguments)
         except Exception:
             code.target = _bad_reset(env, arguments)
             raise
-        if not _complete(given, 2):
+        if not _well_formed(result, 2):
             code.target = _bad_reset(env, arguments)
-            code.refuse(f"gave {_kinds(given)}", "Give (observation, info), info a dict.")
-        return given[0], given[1]
+            code.refuse(f"gave {_types(result)}", "Give (observation, info), info a dict.")
+        return result[0], result[1]
 
 
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """What ``env.step(action)`` gives: an observation, see :class:`Look`, and the rest; else a ``UserError``."""
+    """``env.step(action)``: an observation, see :class:`Reader`, and the rest; ``UserError`` if malformed."""
     with UsersCode("the environment's step", env, "step") as code:
         try:
-            given: Any = env.step(action)
+            result: Any = env.step(action)
         except Exception:
             code.target = _bad_step(env, action)
             raise
-        if not _complete(given, 5):
+        if not _well_formed(result, 5):
             code.target = _bad_step(env, action)
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
-            code.refuse(f"gave {_kinds(given)}", do)
-        number, over = code.number(given[1], "the reward"), code.truth(given[2], "terminated")
-        return given[0], number, over, code.truth(given[3], "truncated"), given[4]
+            code.refuse(f"gave {_types(result)}", do)
+        reward, terminated = code.number(result[1], "the reward"), code.truth(result[2], "terminated")
+        return result[0], reward, terminated, code.truth(result[3], "truncated"), result[4]
 
 
 class Starts:
-    """How the episodes of each layout begin: training relies on the same seed to begin the same episode."""
+    """Checks that the same seed always begins the same episode, as training relies on."""
 
-    def __init__(self, look: Look):
-        self.look = look
-        self._known: dict[int, bytes] = {}  # by seed, a digest of the first observation and the generator
+    def __init__(self, reader: Reader):
+        self.reader = reader
+        self._digests: dict[int, bytes] = {}  # by seed, of the first observation and the generator's state
 
     def begin(self, env: gymnasium.Env, seed: int) -> Any:
-        """What ``env.reset(seed=seed)`` shows; a ``UserError`` where it showed, or will draw, something else before."""
+        """The first observation after ``env.reset(seed=seed)``; ``UserError`` if it began another episode before."""
         observation, _info = begun(env, seed=seed)
-        start = digest(self.look.read(env, observation, "reset"), repr(_generator(env)).encode())
-        if self._known.setdefault(seed, start) != start:
+        start = digest(self.reader.read(env, observation, "reset"), repr(_generator(env)).encode())
+        if self._digests.setdefault(seed, start) != start:
             do = "Pass the seed on: super().reset(seed=seed), in a wrapper self.env.reset(seed=seed, options=options)."
             layer = culprit(env, lambda layer: not _repeats(layer, seed))
             code = UsersCode("the environment's reset", layer, "reset")
@@ -201,36 +201,36 @@ class Starts:
 
 
 def culprit(env: gymnasium.Env, broken: Callable[[gymnasium.Env], bool]) -> Any:
-    """Of an environment and its wrappers the class of the innermost that is ``broken``; all where it does not show.
+    """The class of the innermost wrapper that is ``broken``; the whole environment if none shows the fault.
 
-    Those around a broken one are broken, too.
+    Wrappers around a broken one are broken, too.
     """
     return next((type(layer) for layer in reversed(layers(env)) if broken(layer)), env)
 
 
 def _bad_reset(env: gymnasium.Env, arguments: Mapping[str, Any]) -> Any:
-    return culprit(env, lambda layer: _broken(lambda: layer.reset(**arguments), 2))
+    return culprit(env, lambda layer: _malformed(lambda: layer.reset(**arguments), 2))
 
 
 def _bad_step(env: gymnasium.Env, action: int) -> Any:
-    return culprit(env, lambda layer: _broken(lambda: (layer.reset(), layer.step(action))[1], 5))
+    return culprit(env, lambda layer: _malformed(lambda: (layer.reset(), layer.step(action))[1], 5))
 
 
-def _complete(given: Any, size: int) -> bool:
-    """Whether this is what ``reset`` (2 parts) or ``step`` (5) should give, as far as its form goes."""
-    return isinstance(given, tuple | list) and len(given) == size and isinstance(given[-1], dict)
+def _well_formed(result: Any, size: int) -> bool:
+    """Whether ``reset`` (2 parts) or ``step`` (5 parts) returned a tuple that ends in a dictionary."""
+    return isinstance(result, tuple | list) and len(result) == size and isinstance(result[-1], dict)
 
 
-def _broken(call: Callable[[], Any], size: int) -> bool:
-    """Whether a call of ``reset`` or ``step`` fails, or does not give so many parts."""
+def _malformed(call: Callable[[], Any], size: int) -> bool:
+    """Whether a call of ``reset`` or ``step`` fails or returns something malformed."""
     try:
-        return not _complete(call(), size)
+        return not _well_formed(call(), size)
     except Exception:  # noqa: BLE001 - whatever own code raises
         return True
 
 
 def _repeats(env: gymnasium.Env, seed: int) -> bool:
-    """Whether episodes begin alike for the same seed, as far as ``RESETS`` show it."""
+    """Whether ``RESETS`` episodes of one seed begin alike."""
     try:
         starts = [(deepcopy(env.reset(seed=seed)[0]), _generator(env)) for _ in range(RESETS)]
     except Exception:  # noqa: BLE001 - whatever own code raises
@@ -239,22 +239,22 @@ def _repeats(env: gymnasium.Env, seed: int) -> bool:
 
 
 def _generator(env: gymnasium.Env) -> Any:
-    """The state of the environment's random numbers; None where it has none so far."""
+    """The state of the environment's random generator; None if it has none yet."""
     generator = getattr(env.unwrapped, "_np_random", None)
     return getattr(getattr(generator, "bit_generator", None), "state", None)
 
 
-def _kinds(given: object) -> str:
-    """The types of what was given."""
-    if isinstance(given, tuple | list):
-        return f"({', '.join(type(part).__name__ for part in given)})"
-    return f"no tuple but a {type(given).__name__}"
+def _types(result: object) -> str:
+    """The types of a result's parts, for messages."""
+    if isinstance(result, tuple | list):
+        return f"({', '.join(type(part).__name__ for part in result)})"
+    return f"no tuple but a {type(result).__name__}"
 
 
 class Labels:
-    """Which of G sub-goals hold in an environment's current state, as a user's own functions say.
+    """Which of G sub-goals hold in an environment's current state, by the user's functions.
 
-    That is a function for each name, or names and one function that says all. Names alone, or both, are a
+    Either one function per name, or names and one function for all. Names alone, or both kinds of functions, are a
     ``UserError``.
     """
 
@@ -263,46 +263,45 @@ class Labels:
         self._each = tuple(sub_goals.values()) if isinstance(sub_goals, Mapping) else ()
         self._together = together
         if isinstance(sub_goals, Mapping) == (together is not None):
-            what = "sub-goals have functions and labels= too" if together else "nothing says where sub-goals hold"
+            fault = "sub-goals have functions and labels= too" if together else "nothing says where sub-goals hold"
             do = "Give {name: function}, or names and labels=, a function from the environment to {name: bool}."
-            raise UserError(what, ", ".join(map(str, self.names)), do)
+            raise UserError(fault, ", ".join(map(str, self.names)), do)
 
     def of(self, env: gymnasium.Env) -> NDArray[np.bool_]:
-        """Asked of an environment, bool (G,); a ``UserError`` where a function fails, or says something else."""
+        """The labels of an environment's state, bool (G,); ``UserError`` if a function returns no truth value."""
         if self._together:
             return self._all(env, self._together)
-        told = []
+        labels = []
         with UsersCode("a sub-goal's function") as code:
             for label in self._each:
                 code.target = label
-                told.append(code.truth(label(env), "the label"))
-        return np.array(told, dtype=np.bool_)
+                labels.append(code.truth(label(env), "the label"))
+        return np.array(labels, dtype=np.bool_)
 
     def _all(self, env: gymnasium.Env, together: LabelAll) -> NDArray[np.bool_]:
         with UsersCode("the function of all labels", together) as code:
-            told: Any = together(env)
+            labels: Any = together(env)
             do = f"Give a dictionary of {', '.join(self.names)}, each True or False."
-            if not isinstance(told, Mapping):
-                code.refuse(f"gave a {type(told).__name__}, not a dictionary", do)
+            if not isinstance(labels, Mapping):
+                code.refuse(f"gave a {type(labels).__name__}, not a dictionary", do)
             for name in self.names:
-                if name not in told:
+                if name not in labels:
                     code.refuse(f"gave no label for {name}", do)
-            for name in told:
+            for name in labels:
                 if name not in self.names:
                     code.refuse(f"gave a label for {name!r}, which is not a sub-goal", do)
-            return np.array([code.truth(told[name], f"the label of {name}") for name in self.names], np.bool_)
+            return np.array([code.truth(labels[name], f"the label of {name}") for name in self.names], np.bool_)
 
 
 class GymnasiumEngine(TurnEngine):
     """Environments of one layout or several, stepped one after the other.
 
-    Every episode begins with ``reset(seed=layout_seed)``. States are told apart by what is seen and by their labels, in
-    whichever layout: the same picture with the same labels has the same id again while it is among the newest
-    ``memory`` distinct ones.
-    Twice as many are kept, so that what a replay of ``memory`` steps holds is still there; older ones are forgotten.
+    Every episode begins with ``reset(seed=layout_seed)``. An observation and its labels identify a state, in whichever
+    layout: it keeps its id while it is among the newest ``memory`` distinct ones. Twice as many are kept, so that a
+    replay of ``memory`` steps finds its states; older ones are forgotten.
 
-    Episodes are truncated after ``max_steps`` steps, where the
-    environment does not do so earlier. ``success`` is asked at the end of each, see ``GymnasiumDomain``.
+    Episodes are truncated after ``max_steps`` steps, or earlier by the environment. ``success`` is called at the end of
+    each, see ``GymnasiumDomain``.
     """
 
     alike = True
@@ -322,21 +321,21 @@ class GymnasiumEngine(TurnEngine):
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self.memory: int = memory
         self._envs = [make_checked(make) for _ in range(count)]
-        self._ask, self._success = labels, success
-        self._earned, self._succeeded = [0.0] * count, [False] * count  # in the episode so far; it ended so just now
-        self.look = look_of(self._envs[0])
-        self._starts = Starts(self.look)
-        self.observation_shape, self.observation_dtype = self.look.shape, self.look.dtype
+        self._labeller, self._success = labels, success
+        self._earned, self._succeeded = [0.0] * count, [False] * count  # the episode so far; whether it just succeeded
+        self.reader = reader_of(self._envs[0])
+        self._starts = Starts(self.reader)
+        self.observation_shape, self.observation_dtype = self.reader.shape, self.reader.dtype
         self.n_actions = int(self._envs[0].action_space.n)  # type: ignore[attr-defined]
         self._ring: list[Observations] = []
         self._labels = bytearray()
-        self._ids: OrderedDict[bytes, int] = OrderedDict()  # of the states in the ring, by digest, the oldest first
+        self._ids: OrderedDict[bytes, int] = OrderedDict()  # of the states in the ring by digest, oldest first
         self._played: list[list[int]] = [[] for _ in range(count)]
         self.reset()
 
     @property
     def n_states(self) -> int:
-        return len(self._labels) // max(1, len(self._ask.names))
+        return len(self._labels) // max(1, len(self._labeller.names))
 
     @property
     def oldest(self) -> int:
@@ -365,13 +364,13 @@ class GymnasiumEngine(TurnEngine):
         return step._replace(succeeded=np.array(self._succeeded, np.bool_)) if self._success else step
 
     def _remember(self, env: gymnasium.Env, observation: Any) -> int:
-        """The id of what an environment is in now."""
-        image = self.look.read(env, observation)
-        labels = self._ask.of(env).tobytes()
+        """The id of an environment's current state."""
+        image = self.reader.read(env, observation)
+        labels = self._labeller.of(env).tobytes()
         look, new = digest(image, labels), self.n_states
-        known = self._ids.get(look)
-        if known is not None and known >= new - self.memory:
-            return known
+        state = self._ids.get(look)
+        if state is not None and state >= new - self.memory:
+            return state
         if len(self._ring) < 2 * self.memory:
             self._ring.append(image)
         else:
@@ -381,7 +380,7 @@ class GymnasiumEngine(TurnEngine):
         return new
 
     def _file(self, look: bytes, identity: int) -> None:
-        """The newest id of this digest; those of forgotten states go."""
+        """Enter a digest's newest id, and drop that of a forgotten state."""
         self._ids[look] = identity
         self._ids.move_to_end(look)
         if self._ids[next(iter(self._ids))] < self.oldest:
@@ -396,14 +395,13 @@ class GymnasiumEngine(TurnEngine):
         return out
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        every = np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._ask.names))
-        return every[ids].copy()
+        return np.frombuffer(self._labels, np.bool_).reshape(-1, len(self._labeller.names))[ids].copy()
 
     def labels_now(self) -> NDArray[np.bool_]:
-        return np.stack([self._ask.of(env) for env in self._envs])
+        return np.stack([self._labeller.of(env) for env in self._envs])
 
     def snapshot(self) -> dict[str, Any]:
-        """What a resumed run needs to go on exactly: the states, and what was played since each episode began."""
+        """All that a resumed run needs: the states, and the actions played since each episode began."""
         return {
             "ids": self.ids.copy(),
             "elapsed": self.elapsed.copy(),
@@ -414,15 +412,15 @@ class GymnasiumEngine(TurnEngine):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made alike: episodes are played up to there.
+        """Continue from a ``snapshot`` of an engine made with the same arguments: replays the current episodes.
 
-        Where they lead to other states, the environment is not the same for the same seed, it is a ``UserError``.
+        A ``UserError`` if they lead to other states: the environment is not deterministic.
         """
-        width, size = len(self._ask.names), 2 * self.memory
+        width, size = len(self._labeller.names), 2 * self.memory
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
         if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, size):
-            raise Unlike("at /loop/engine: its pictures and labels are not as many")
+            raise Unlike("at /loop/engine: its pictures and labels differ in number")
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
@@ -436,9 +434,9 @@ class GymnasiumEngine(TurnEngine):
             for action in actions:
                 observation, reward, *_ = stepped(env, action)
                 self._earned[number] += reward
-            here, was = self.look.read(env, observation), int(snapshot["ids"][number])
-            if not np.array_equal(here, self._ring[was % size]):
-                what = "the environment does not repeat itself for the same seed, so this cannot be resumed"
-                raise UserError(what, f"layout_seed={seed}", ANEW)
+            state = int(snapshot["ids"][number])
+            if not np.array_equal(self.reader.read(env, observation), self._ring[state % size]):
+                fault = "the environment does not repeat itself for the same seed, so this cannot be resumed"
+                raise UserError(fault, f"layout_seed={seed}", ANEW)
         self._played = [list(actions) for actions in snapshot["played"]]
         self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()

@@ -1,8 +1,8 @@
-"""Montezuma's Revenge, climbing down ladders (Spec B4, B5): the domain as the stages see it, how states are collected.
+"""Climbing down ladders in Montezuma's Revenge (Spec B4, B5): the domain, and how its states are collected.
 
-The parts: ``montezuma_emulator`` (the game, the agent put anywhere), ``montezuma_ladders`` (where the ladders are),
-``montezuma_states`` (what is collected), ``montezuma_env`` and ``montezuma_engine`` (one game and many, from the top
-of a ladder on).
+See also ``montezuma_emulator`` (the game, with the agent placed anywhere), ``montezuma_ladders`` (the ladders'
+positions), ``montezuma_states`` (the states of a room), ``montezuma_env`` and ``montezuma_engine`` (one game and many,
+from the top of a ladder).
 """
 
 import math
@@ -34,14 +34,14 @@ from hypogoal.domains.montezuma_states import (
     origins_of,
 )
 
-# The unlabelled rooms where none are given: the first of these ladder rooms that has no labels, and a room without a
-# ladder; where all have labels, two without.
+# The default unlabelled rooms: the first of these ladder rooms without labels, and a room without a ladder; if all have
+# labels, two rooms without a ladder.
 UNLABELLED_LADDER_ROOMS = (9, 21, 19, 22, 10)
 UNLABELLED_OTHER_ROOMS = (18, 12)
 SEEN_NOWHERE, SEEN_UNLABELLED, SEEN_LABELLED = range(3)
 
 
-# What lets options learn on a laptop, whether by themselves or below a meta-policy.
+# What lets options learn on a laptop, alone or under a meta-policy.
 LEARNING: Mapping[str, Any] = {
     "option_timeout": MAX_STEPS,
     "experience": "own",
@@ -53,7 +53,7 @@ LEARNING: Mapping[str, Any] = {
     "epsilon_final": 0.01,
     "random_episodes": 0,
 }
-# And where they are learned by themselves, ladder by ladder.
+# Options learned alone, ladder by ladder.
 ALONE: Mapping[str, Any] = {
     **LEARNING,
     "max_episode_steps": MAX_STEPS,
@@ -72,7 +72,7 @@ class MontezumaConfig:
     groups: int = setting(1, "ladder groups with labels (N), out of seven", source="Figure 3", low=1, high=len(GROUPS))
     unlabelled_rooms: tuple[int, ...] = setting(
         (),
-        "rooms of the unlabelled states; empty: one with a ladder that has no labels, and room 18, without a ladder",
+        "rooms of the unlabelled states; empty: one with an unlabelled ladder, and room 18, without a ladder",
         source="paper: for N = 1 one room of each kind",
         low=0,
         high=ROOMS - 1,
@@ -86,18 +86,18 @@ class MontezumaConfig:
     heldout_per_room: int = setting(
         300, "held-out states of each of the 24 rooms", unit="states", source="own choice", low=1, high=100_000
     )
-    heldout_seed: int = setting(0, "another number draws other held-out states, and nothing else changes", low=0)
+    heldout_seed: int = setting(0, "another number draws other held-out states and changes nothing else", low=0)
     unlabelled_from: str = setting(
         "expert",
-        "who plays in the unlabelled rooms: the labelled states' expert, or uniformly random actions from their sides",
-        source="the paper's suggestion",
+        "who plays in the unlabelled rooms: the labelled states' expert, or uniform-random actions from their sides",
+        source="expert: own choice; random: the paper's suggestion (B7)",
         choices=PLAYS,
     )
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
 
 
 class _Task(NamedTuple):
-    """States of a room for the set ``name``: gathered, kept till all are there."""
+    """Gathers the states of a room for the set ``name``, and keeps them until all rooms are complete."""
 
     name: str
     gather: Callable[[], RoomStates]
@@ -105,7 +105,7 @@ class _Task(NamedTuple):
     wanted: int
 
     def load(self) -> RoomStates | None:
-        """What was gathered before."""
+        """The states gathered before, if any."""
         saved = self.kept.load()
         if saved is None:
             return None
@@ -127,7 +127,7 @@ def labelled_rooms(groups: int) -> tuple[int, ...]:
 
 
 def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
-    """The rooms of the unlabelled states: those given, or one with a ladder that has no labels and one without."""
+    """The rooms of the unlabelled states: the configured ones, or one with an unlabelled ladder and one without any."""
     if config.unlabelled_rooms:
         return tuple(dict.fromkeys(config.unlabelled_rooms))
     labelled = labelled_rooms(config.groups)
@@ -136,7 +136,7 @@ def unlabelled_rooms(config: MontezumaConfig) -> tuple[int, ...]:
 
 
 class MontezumaDomain(Domain):
-    """Spec B6: Montezuma's ladders; by default Table 1, and for options what lets them learn on a laptop."""
+    """Spec B6: Montezuma's ladders; the defaults are Table 1, and for options what lets them learn on a laptop."""
 
     name = "montezuma"
     sub_goals = SUB_GOALS
@@ -145,7 +145,7 @@ class MontezumaDomain(Domain):
     env_id = "hypogoal/MontezumaLadder-v0"
     starts = tuple(ladder.name for ladder in LADDERS)
     many_starts = True
-    packed = 20  # 24 were measured
+    packed = 20  # 24 measured
     kinds = KINDS
     resumes = measures = pictures = sees_agent = True
     near = 12
@@ -171,12 +171,12 @@ class MontezumaDomain(Domain):
     )
 
     def collected_bytes(self, config: MontezumaConfig) -> int:
-        """Observations of a collection, at the most: every room labelled, unlabelled and held out."""
+        """An upper bound: every room labelled, unlabelled and held out."""
         each = config.states_per_room + config.unlabelled_per_room + config.heldout_per_room
         return ROOMS * each * math.prod(self.observation_shape)
 
     def played_bytes(self, steps: int, frames: int) -> int:
-        """A frame of each step, as far back as replays reach."""
+        """One frame per step, as far back as replays reach."""
         return frames * math.prod(self.observation_shape[:2])
 
     def collect(
@@ -184,16 +184,16 @@ class MontezumaDomain(Domain):
     ) -> Collected:
         """Spec B5: labelled, unlabelled and held-out states, each with its origin.
 
-        Labelled are the rooms of the first N ladder groups; held out are states of all 24 rooms, the same ones for
-        every N. States at the base of a ladder that runs on through the floor are in the unlabelled set only. No
-        stack of the held-out set is in another one, and none is twice in one room of a set. Nothing depends on how
-        many processes play.
+        The rooms of the first N ladder groups are labelled; all 24 rooms have held-out states, the same for every N.
+        States at the base of a ladder that continues through the floor are in the unlabelled set only. No held-out
+        stack is in another set, and no stack occurs twice in a room of a set. The result does not depend on the number
+        of processes.
 
-        ``seed`` is of the rollouts; each room of each set has a stream of its own. ``kept`` says by name where each
-        room's states are kept until all are there; what is there is not gathered again. Labels are of all three sets
-        (those of the unlabelled are for tests only). Origins: see ``montezuma_states.origins_of``; of held-out states
-        also ``seen``: 0 the room is in no training set, 1 it is among the unlabelled rooms, 2 among the labelled ones.
-        No such room, no emulator, or a room that does not show so many different states is a ``UserError``.
+        ``seed`` seeds the rollouts; each room of each set has its own stream. ``kept`` returns by name the checkpoints
+        that keep each room's states until all rooms are complete; a room kept there is not gathered again. All three
+        sets have labels (the unlabelled states' are for tests only). Origins: see ``montezuma_states.origins_of``;
+        held-out states also have ``seen``: 0 the room is in no training set, 1 it is an unlabelled room, 2 a labelled
+        one. An unknown room, no emulator, or a room with too few different states is a ``UserError``.
         """
         labelled, unlabelled = labelled_rooms(config.groups), unlabelled_rooms(config)
         tasks: list[_Task] = []
@@ -209,28 +209,28 @@ class MontezumaDomain(Domain):
                 tasks.append(_Task(name, job, kept(f"{name}-{room}") if kept else Checkpoints(None), wanted))
             expected += wanted * len(rooms)
         progress.expect(expected)
-        there = {number: states for number, task in enumerate(tasks) if (states := task.load())}
-        for loaded in there.values():
+        gathered = {number: states for number, task in enumerate(tasks) if (states := task.load())}
+        for loaded in gathered.values():
             progress.advance(len(loaded.ram))
-        left = [number for number in range(len(tasks)) if number not in there]
+        left = [number for number in range(len(tasks)) if number not in gathered]
 
         def done(place: int, states: RoomStates) -> None:
             tasks[left[place]].kept.save(vars(states))
-            there[left[place]] = states
+            gathered[left[place]] = states
             progress.advance(len(states.ram))
 
         in_processes([tasks[number].gather for number in left], allowed(config.workers), done)
 
         def all_of(name: str) -> States:
-            rooms = [there.pop(number) for number, task in enumerate(tasks) if task.name == name]
+            rooms = [gathered.pop(number) for number, task in enumerate(tasks) if task.name == name]
             return joined([States(room.observations, labels_of(room.ram)[:, None], origins_of(room)) for room in rooms])
 
-        learnt, others, heldout = map(all_of, ("labelled", "unlabelled", "heldout"))
+        labelled_states, unlabelled_states, heldout = map(all_of, ("labelled", "unlabelled", "heldout"))
         seen = np.full(len(heldout.labels), SEEN_NOWHERE)
         seen[np.isin(heldout.origins["room"], unlabelled)] = SEEN_UNLABELLED
         seen[np.isin(heldout.origins["room"], labelled)] = SEEN_LABELLED
         heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
-        return Collected(OBSERVATION_SHAPE, SUB_GOALS, learnt, others, heldout)
+        return Collected(OBSERVATION_SHAPE, SUB_GOALS, labelled_states, unlabelled_states, heldout)
 
     def make_engine(
         self,
@@ -243,8 +243,8 @@ class MontezumaDomain(Domain):
     ) -> MontezumaEngine:
         """An engine of ``count`` games that begin at the ladder ``start``.
 
-        The game has one layout: ``layout_seed`` is that of the start states where ``arguments`` have no ``seed``. The
-        other arguments are ``MontezumaEngine``'s.
+        The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``. Other
+        arguments as for ``MontezumaEngine``.
         """
         return MontezumaEngine(start, count, max_steps=max_steps, **{"seed": layout_seed, **arguments})
 

@@ -1,8 +1,8 @@
-"""Montezuma's Revenge on the Arcade Learning Environment: RAM, pictures, and an agent put anywhere (Spec B4, B5).
+"""Montezuma's Revenge on the Arcade Learning Environment: RAM, pictures, the agent placed anywhere (Spec B4, B5).
 
-The raw emulator rather than Gymnasium's wrappers: states have to be saved, restored and written to, which the
-wrappers do not offer, and frames that nobody looks at need not be drawn. What is seen is theirs, pixel for pixel (a
-test compares them with ``AtariPreprocessing`` and ``FrameStackObservation``).
+The raw emulator instead of Gymnasium's wrappers: these cannot save, restore and write states, or skip drawing frames
+that are not needed. The observations are the same, pixel for pixel (a test compares them with ``AtariPreprocessing``
+and ``FrameStackObservation``).
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 
 GAME = "montezuma_revenge"
-FRAME_SKIP = 4  # frames per agent step; what is seen is the brighter of the last two, pixel by pixel
+FRAME_SKIP = 4  # frames per agent step; an observation takes the brighter of the last two, pixel by pixel
 SIDE = 84
 STACK = 4  # agent steps in an observation
 OBSERVATION_SHAPE = (SIDE, SIDE, STACK)  # the oldest frame first
@@ -25,8 +25,8 @@ ROOMS = 24
 
 NOOP, FIRE, UP, RIGHT, LEFT, DOWN = range(6)
 
-# RAM, index = the console's address - 0x80. Found by watching the emulator while playing (tests do it again); room, x,
-# y and the inventory are also in the table of Anand et al. 2019, Unsupervised State Representation Learning in Atari.
+# RAM, index = the console's address - 0x80. Found by watching the emulator in play (tests repeat it); room, x, y and
+# the inventory are also in the table of Anand et al. 2019, Unsupervised State Representation Learning in Atari.
 RAM = {
     "room": 0x03,
     "x": 0x2A,
@@ -44,13 +44,13 @@ ON_LADDER = 10  # a pose
 FIRST_ROOM_OF_ROW = (0, 3, 8, 15)
 RIGHT_EDGE, LEFT_EDGE, EDGE_Y = 146, 5, 235
 CROSSING_FRAMES = 40
-FIRST_ROOM_FRAMES = 60  # until a new game lets one play
+FIRST_ROOM_FRAMES = 60  # until a new game accepts actions
 
-# The agent is drawn in columns x - 1 .. x + 6 and rows 308 - y .. 327 - y, where x and y are the RAM's: read off the
-# differences of screens that have the agent at two places; a test does it again.
+# The agent is drawn in columns x - 1 .. x + 6 and rows 308 - y .. 327 - y, with x and y from RAM: read off the
+# difference of screens with the agent at two places; a test repeats it.
 SPRITE_WIDTH, SPRITE_HEIGHT = 8, 20
 SPRITE_LEFT, SPRITE_TOP = -1, 308
-THREE_PLACES = (20, 75, 130)  # so far apart that neither the agent nor what is left of it there is drawn at two of them
+THREE_PLACES = (20, 75, 130)  # so far apart that the agent and its traces never overlap
 
 
 def stack_frames(frames: Sequence[NDArray[np.uint8]], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
@@ -61,11 +61,11 @@ def stack_frames(frames: Sequence[NDArray[np.uint8]], out: NDArray[np.uint8] | N
     return merged
 
 
-Frames = tuple[NDArray[np.uint8], ...]  # of the last four agent steps, uint8 (84, 84) each, the oldest first
+Frames = tuple[NDArray[np.uint8], ...]  # of the last four agent steps, uint8 (84, 84) each, oldest first
 
 
 class Position(NamedTuple):
-    """Where the agent is, in the RAM's units."""
+    """The agent's position in RAM units."""
 
     room: int
     x: int
@@ -74,11 +74,11 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of the emulator and what was seen before it, which is no part of the emulator's own state."""
+    """A state of the emulator and the frames before it, which the emulator does not keep."""
 
     state: Any  # an ``ALEState``
     seen: Frames  # of its observation
-    screen: NDArray[np.uint8]  # (210, 160), the last of them before it was made small
+    screen: NDArray[np.uint8]  # (210, 160), the last of them before resizing
 
     @property
     def stack(self) -> NDArray[np.uint8]:
@@ -92,14 +92,14 @@ def row_of(room: int) -> int:
 
 
 def load_ale(seed: int) -> Any:
-    """A raw emulator with the game's ROM, deterministic, one frame per act; a ``UserError`` where it is not there."""
+    """A raw, deterministic emulator with the game's ROM, one frame per act; ``UserError`` if not installed."""
     try:
         import cv2  # noqa: F401
         from ale_py import ALEInterface, LoggerMode
         from ale_py.roms import get_rom_path
     except ImportError as error:
-        what = f"Montezuma's Revenge cannot be played ({error})"
-        raise UserError(what, GAME, "pip install 'hypogoal[montezuma]'.") from None
+        fault = f"Montezuma's Revenge cannot be played ({error})"
+        raise UserError(fault, GAME, "pip install 'hypogoal[montezuma]'.") from None
     rom = get_rom_path(GAME)
     if rom is None or not rom.is_file():
         raise UserError("the emulator has no ROM of the game", GAME, "Install ale-py 0.11 or newer: its wheel has it.")
@@ -113,15 +113,15 @@ def load_ale(seed: int) -> Any:
 
 
 class Emulator:
-    """One game: agent steps of four frames, stacks of four steps, RAM, and the agent put anywhere.
+    """One game: agent steps of four frames, stacks of four steps, RAM, and the agent placed anywhere.
 
     Attributes:
-        seen, screen: as in ``Snapshot``. Never written to again: each step makes new ones.
-        screens: False, nothing is looked at and ``seen`` stays as it is: half the time, where only RAM is wanted.
+        seen, screen: as in ``Snapshot``; never modified: each step makes new ones.
+        screens: False, no frame is drawn and ``seen`` stays as it is: twice as fast when only RAM matters.
     """
 
     def __init__(self, seed: int = 0):
-        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed; says it where cv2 is missing
+        self.ale = load_ale(seed)  # without sticky actions nothing depends on the seed; refuses if cv2 is missing
         import cv2
 
         self.actions = list(self.ale.getLegalActionSet())
@@ -135,30 +135,30 @@ class Emulator:
 
     @property
     def stack(self) -> NDArray[np.uint8]:
-        """The observation, uint8 (84, 84, 4): what was seen at the last four agent steps, the oldest first; a copy."""
+        """The observation, uint8 (84, 84, 4): a copy of the last four agent steps' frames, oldest first."""
         return stack_frames(self.seen)
 
     def reset(self) -> NDArray[np.uint8]:
-        """A new game; the stack is four times its first frame."""
+        """Begin a new game; the stack repeats its first frame four times."""
         self.ale.reset_game()
         self.screen = self.ale.getScreenGrayscale()
         self.seen: Frames = (self._shrink(self.screen),) * STACK
         return self.stack
 
     def step(self, action: int) -> float:
-        """Spec B4: four frames of ``action`` (0..17), fewer where the game ends; the sum of their rewards."""
+        """Spec B4: play four frames of ``action`` (0..17), fewer if the game ends; returns the sum of their rewards."""
         ale, act = self.ale, self.actions[action]
         reward, drawn = 0.0, 0
         for frame in range(FRAME_SKIP):
             reward += ale.act(act)
             if ale.game_over():
-                break  # without a look at this frame, as Gymnasium's wrapper has it
+                break  # without drawing this frame, as Gymnasium's wrapper does
             if frame >= FRAME_SKIP - 2 and self.screens:
                 ale.getScreenGrayscale(self._drawn[drawn])
                 drawn += 1
         if self.screens:
             if drawn:
-                # NumPy's maximum, where it uses AVX-512, makes the emulator's next frames a seventh slower.
+                # NumPy's maximum, if it uses AVX-512, slows down the emulator's next frames by a seventh.
                 self.screen = self._brighter(self._drawn[0], self._drawn[1] if drawn == 2 else self.screen)
             self.seen = (*self.seen[1:], self._shrink(self.screen))
         return reward
@@ -168,7 +168,7 @@ class Emulator:
         return small
 
     def frames(self, action: int, count: int) -> None:
-        """``count`` single frames of ``action``, undrawn: no agent step, the stack stays as it is."""
+        """Play ``count`` single frames of ``action`` undrawn: no agent step, the stack stays as it is."""
         act = self.actions[action]
         for _ in range(count):
             self.ale.act(act)
@@ -183,11 +183,11 @@ class Emulator:
         return int(self.ram()[RAM[name]])
 
     def write(self, name: str, value: int) -> None:
-        """Write one byte of ``RAM`` by name; the screen shows it from the next frame on."""
+        """Write one byte of ``RAM`` by name; the screen shows it with the next frame."""
         self.ale.setRAM(RAM[name], value)
 
     def position(self) -> Position:
-        """Where the agent is."""
+        """The agent's position."""
         ram = self.ram()
         return Position(int(ram[RAM["room"]]), int(ram[RAM["x"]]), int(ram[RAM["y"]]))
 
@@ -200,20 +200,20 @@ class Emulator:
         return self.ale.getScreenRGB()
 
     def save(self) -> Snapshot:
-        """The state, to be restored exactly."""
+        """The current state, for :meth:`restore`."""
         return Snapshot(self.ale.cloneState(), self.seen, self.screen)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Back to a state saved by this emulator or another; ``screen_rgb`` shows it from the next step on."""
+        """Return to a state saved by this or another emulator; ``screen_rgb`` shows it after the next step."""
         self.ale.restoreState(snapshot.state)
         self.seen, self.screen = snapshot.seen, snapshot.screen
 
     def place(self, room: int, x: int, y: int, *, phase: int = 2, settle: int = 4) -> Snapshot | None:
-        """Spec B5: the agent at (x, y) of a room, with the torch, its enemies ``phase`` frames old.
+        """Spec B5: place the agent at (x, y) of a room, with the torch, ``phase`` frames after entering.
 
-        The room is entered through its side, as if the agent came from the neighbour: writing the room's number alone
-        draws half a room. Of places in the air the agent falls. Afterwards it waits for ``settle`` agent steps; four or
-        more fill the stack with what the place looks like. None where it did not live to see that, or left the room.
+        The agent enters through the room's side, from its neighbour: writing the room's number alone draws half a room.
+        From places in the air it falls. Then it waits for ``settle`` agent steps; four or more fill the stack with
+        frames of the place. None if it died meanwhile or left the room.
         """
         if room not in self._entered:
             self._entered[room] = self._enter(room)
@@ -252,28 +252,28 @@ class Emulator:
 
 
 def pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The middle of the agent in the console's picture: column, row (n, 2) for positions (n, 3) of room, x, y."""
+    """The agent's middle in the console's picture: column, row (n, 2), for positions (n, 3) of room, x, y."""
     columns = positions[:, 1] + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2
     rows = SPRITE_TOP - positions[:, 2] + (SPRITE_HEIGHT - 1) / 2
     return np.stack([columns, rows], axis=1)
 
 
 def observed_pixel(positions: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The same in an 84x84 observation, which is that picture made smaller: row, column (n, 2).
+    """The agent's middle in an 84x84 observation, the resized picture: row, column (n, 2).
 
-    Where the agent is in an observation, a test reads off the emulator.
+    A test compares it with the emulator.
     """
     return (pixel(positions)[:, ::-1] + 0.5) * (np.array(OBSERVATION_SHAPE[:2]) / SCREEN) - 0.5
 
 
 def picture(emulator: Emulator, room: int) -> NDArray[np.uint8]:
-    """A room as the console shows it, enemies and all, but for the agent: uint8 (210, 160, 3).
+    """A room as the console shows it, with enemies but without the agent: uint8 (210, 160, 3).
 
     Of three pictures with the agent at three places, two agree on every pixel.
     """
     shots = []
     for x in THREE_PLACES:
         emulator.place(room, x, EDGE_Y, settle=0)
-        emulator.frames(NOOP, 1)  # the screen shows what was written from the next frame on
+        emulator.frames(NOOP, 1)  # the next frame shows what was written
         shots.append(emulator.screen_rgb())
     return np.median(shots, axis=0).astype(np.uint8)

@@ -1,7 +1,7 @@
-"""The training engine of Montezuma's Revenge: many emulators stepped together, states by id, frames kept once each.
+"""The training engine of Montezuma's Revenge: many emulators stepped together, states by id, each frame kept once.
 
-An observation is four frames of which a step makes one: states share them. The newest ``memory`` states are kept, the
-frames of older ones are forgotten.
+An observation is four frames, and each step adds one, so states share frames. The newest ``memory`` states are kept;
+the frames of older ones are forgotten.
 """
 
 import json
@@ -21,19 +21,19 @@ from hypogoal.domains.base import TurnEngine
 from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, draw_start, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import ladder_named
 
-MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and what is not yet in it
+MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
 ROOM, X, Y, DYING = (game.RAM[name] for name in ("room", "x", "y", "dying"))
 
 
 class MontezumaEngine(TurnEngine):
     """Many games that begin at one ladder, stepped together.
 
-    Ids 0 .. S-1 are the S start states, for ever; every step of every environment gets a new one. The images of the
-    newest ``memory`` of these can be had, positions, labels and who is alive of all.
+    Ids 0 .. S-1 always are the S start states; every step of every environment gets a new id. Images are available for
+    the newest ``memory`` of these; positions, labels and whether the agent is alive for all.
 
-    Arguments are those of ``MontezumaLadder``, and ``count``, of environments (E); ``start`` may also be some ladders,
-    comma-separated, with ``start_states`` of each, and ``seed`` is also of which one each episode begins with. An image
-    is 7 kB, taken when first needed. No such ladder, too few start states, too small a memory, or no emulator is a
+    Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``start`` may also be several
+    ladders, comma-separated, with ``start_states`` each; ``seed`` also draws the one each episode begins with. A frame
+    is 7 kB, allocated on first use. An unknown ladder, too few start states, too small a memory, or no emulator is a
     ``UserError``.
     """
 
@@ -64,10 +64,10 @@ class MontezumaEngine(TurnEngine):
             make_starts(self._emulators[0], ladder_named(name), start_states, seed, along=along)
             for name in start.split(",")
         ]
-        # draw_start counts on those at the top to come first.
+        # draw_start expects those at the top first.
         self.starts: list[Start] = sorted(chain(*of_ladders), key=attrgetter("on_the_way"))
         self._rng = rng_for(seed, "start-of-episode")
-        self._seen: list[game.Frames] = []  # a ring; a frame is in the stacks of four states, but only once in memory
+        self._seen: list[game.Frames] = []  # a ring; four states' stacks share a frame in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
@@ -100,19 +100,19 @@ class MontezumaEngine(TurnEngine):
         return state, reward, over or (self.end_at_death and not alive), elapsed >= self.max_steps
 
     def _place(self, state: int) -> int:
-        """Where in the ring a state is, or will be."""
+        """A state's place in the ring."""
         return (state - len(self.starts)) % self.memory
 
-    def _known(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _checked(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         if len(ids) and not 0 <= ids.min() <= ids.max() < self.n_states:
             raise ValueError(f"ids are 0 to {self.n_states - 1}, not {ids.min()} to {ids.max()}")
         return ids
 
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Observations uint8 (n, 84, 84, 4) of states (n,); a ``ValueError`` where one is not there, or forgotten."""
+        """Observations uint8 (n, 84, 84, 4) of states (n,); ``ValueError`` if one is unknown or forgotten."""
         fixed, oldest = len(self.starts), self.oldest
         out = self.room_for(len(ids), out)
-        for image, state in zip(out, self._known(ids).tolist(), strict=True):
+        for image, state in zip(out, self._checked(ids).tolist(), strict=True):
             if fixed <= state < oldest:
                 raise ValueError(f"state {state} is forgotten; the oldest kept is {oldest}")
             seen = self.starts[state].snapshot.seen if state < fixed else self._seen[self._place(state)]
@@ -120,20 +120,20 @@ class MontezumaEngine(TurnEngine):
         return out
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._known(ids)].astype(np.int64)
+        return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._checked(ids)].astype(np.int64)
 
     def alive(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether the agent is not dying and the game is not over, bool (n,); of forgotten states too."""
-        return np.frombuffer(self._alive, np.bool_)[self._known(ids)]
+        """Whether the agent is not dying and the game is not over, bool (n,), also in forgotten states."""
+        return np.frombuffer(self._alive, np.bool_)[self._checked(ids)]
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         return labels_of(self.positions(ids), self.alive(ids))
 
     def snapshot(self) -> dict[str, NDArray[Any]]:
-        """What a resumed run needs to go on exactly. Nearly all of it is the frames in memory, 7 kB a state."""
+        """All that a resumed run needs. Nearly all of it is the frames in memory, 7 kB per state."""
         saved = [emulator.save() for emulator in self._emulators]
         states = [np.frombuffer(each.state.serialize(), np.uint8) for each in saved]
-        frames: dict[int, NDArray[np.uint8]] = {}  # by address: each once, in the order of first use
+        frames: dict[int, NDArray[np.uint8]] = {}  # by address, in the order of first use
         stacks = [*self._seen, *(each.seen for each in saved)]
         for seen in stacks:
             frames.update((id(frame), frame) for frame in seen)
@@ -164,8 +164,8 @@ class MontezumaEngine(TurnEngine):
             len(self._positions) != 3 * len(self._alive)
             or len(snapshot["stacks"]) != min(played, self.memory) + self.count
         ):
-            raise Unlike("at /loop/engine: its states, positions and stacks are not as many")
-        frames = [frame.copy() for frame in snapshot["frames"]]  # to be freed one by one
+            raise Unlike("at /loop/engine: its states, positions and stacks differ in number")
+        frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
         stacks = [tuple(frames[row] for row in rows) for rows in snapshot["stacks"].tolist()]
         self._seen = stacks[: -self.count]
         states = np.split(snapshot["states"], np.cumsum(snapshot["state_sizes"])[:-1])

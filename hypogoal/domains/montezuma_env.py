@@ -1,6 +1,6 @@
-"""Spec B4, D4: Montezuma's Revenge from the top of a ladder on, as a Gymnasium environment; where episodes begin.
+"""Spec B4, D4: Montezuma's Revenge from the top of a ladder, as a Gymnasium environment, and its start states.
 
-This is the reference: the training engine (``montezuma_engine.py``) is tested to be exact to it.
+This is the reference: tests compare the training engine (``montezuma_engine.py``) with it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,8 +20,8 @@ from hypogoal.domains.montezuma_ladders import REACH, SUB_GOAL, Ladder, at_base,
 SUB_GOALS = (SUB_GOAL,)
 MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
 START_STATES = 32
-PHASES = range(2, 258)  # frames that the agent is kept waiting, from which the start states' are drawn
-TRIES = 4  # phases tried for each start state wanted
+PHASES = range(2, 258)  # frames that the agent may wait before it starts
+TRIES = 4  # phases tried per start state
 FRAMES_PER_SECOND = 60
 
 
@@ -32,18 +32,18 @@ class Start:
     snapshot: game.Snapshot
     position: game.Position  # of the agent
     on_the_way: bool  # down, not at the top
-    picture: NDArray[np.uint8]  # the console's, (210, 160, 3): a restored emulator has none before its first step
+    picture: NDArray[np.uint8]  # the console's, (210, 160, 3): a restored emulator has none until its first step
 
 
 def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int, *, along: float = 0.0) -> list[Start]:
-    """Spec D4: states at the top of a ladder from which the scripted descent lives, and some on the way down.
+    """Spec D4: states at the top of a ladder from which the scripted descent survives, and some on the way down.
 
-    They differ in the phase of what moves, drawn from ``seed``. No two look the same if ``TRIES`` phases for each of
-    them offer so many looks. The top of 14-22 has one only: its states differ in what is out of sight.
+    They differ in the phase of what moves, drawn from ``seed``, and look different if ``TRIES`` phases per state offer
+    enough different looks. The top of 14-22 has one look only; its states differ out of sight.
 
-    The same seed gives the same states, those at the top first, whatever was played before; the emulator is left in
-    some other state. ``along`` is the share of those on the way down, at random steps of the scripted descent; between
-    0 and 1 there is at least one of each kind. Fewer such states, or no share, is a ``UserError``.
+    The same seed gives the same states, those at the top first, whatever was played before; the emulator's state is
+    changed. ``along`` is the share of states on the way down, at random steps of the scripted descent; strictly between
+    0 and 1 there is at least one of each kind. Too few such states, or an invalid share, is a ``UserError``.
     """
     if not 0.0 <= along <= 1.0 or count < (2 if 0.0 < along < 1.0 else 1):
         do = "Give along a share, 0 to 1, and one state or more of each kind."
@@ -53,29 +53,29 @@ def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int, 
     tops = _looking_different(_tops(emulator, ladder, TRIES * count, rng), count)
     starts = [*tops[: count - ways], *_looking_different(_ways_down(emulator, ladder, tops, rng), ways)]
     if len(starts) < count:
-        what = f"only {len(starts)} of {count} start states survive the descent"
-        raise UserError(what, ladder.name, "Ask for fewer.")
+        fault = f"only {len(starts)} of {count} start states survive the descent"
+        raise UserError(fault, ladder.name, "Ask for fewer.")
     return starts
 
 
 def _tops(emulator: game.Emulator, ladder: Ladder, tries: int, rng: np.random.Generator) -> Iterator[Start]:
-    """The top in random phases, where the descent from it lives."""
+    """The top in random phases from which the descent survives."""
     for phase in rng.permutation(PHASES)[:tries].tolist():
         snapshot = emulator.place(*ladder.top, phase=phase)
         if snapshot is None or emulator.position() != ladder.top:
             continue
         start = _start(emulator, on_the_way=False)
         emulator.screens = False
-        lives = descend(emulator, ladder)
+        survives = descend(emulator, ladder)
         emulator.screens = True
-        if lives:
+        if survives:
             yield start
 
 
 def _ways_down(
     emulator: game.Emulator, ladder: Ladder, tops: Sequence[Start], rng: np.random.Generator
 ) -> Iterator[Start]:
-    """Random steps of the descents from ``tops``, but for the last: that is the base."""
+    """Random steps of the descents from ``tops``, without the last, which is the base."""
     for number in rng.permutation(len(tops) * (ladder.steps_down - 1)).tolist():
         top, steps = divmod(number, ladder.steps_down - 1)
         emulator.restore(tops[top].snapshot)
@@ -89,7 +89,7 @@ def _start(emulator: game.Emulator, *, on_the_way: bool) -> Start:
 
 
 def _looking_different(starts: Iterator[Start], count: int) -> list[Start]:
-    """The first ``count`` that look different; others make up for those that are missing when no more come."""
+    """The first ``count`` that look different, filled up with others if there are too few."""
     chosen: dict[bytes, Start] = {}
     others: list[Start] = []
     while len(chosen) < count and (start := next(starts, None)) is not None:
@@ -102,7 +102,7 @@ def _looking_different(starts: Iterator[Start], count: int) -> list[Start]:
 
 
 def descend(emulator: game.Emulator, ladder: Ladder) -> bool:
-    """The scripted descent: DOWN from the top to the base. Whether the agent gets there alive."""
+    """The scripted descent: DOWN from the top to the base. Returns whether the agent arrives alive."""
     for _ in range(ladder.steps_down):
         emulator.step(game.DOWN)
         if not emulator.alive():
@@ -111,7 +111,7 @@ def descend(emulator: game.Emulator, ladder: Ladder) -> bool:
 
 
 def draw_start(starts: Sequence[Start], along: float, rng: np.random.Generator) -> int:
-    """The number of the start state that an episode begins with: with probability ``along`` one on the way down."""
+    """Draw an episode's start state, by number: with probability ``along`` one on the way down."""
     tops = sum(not start.on_the_way for start in starts)
     if along and rng.random() < along:
         return int(rng.integers(tops, len(starts)))
@@ -124,21 +124,21 @@ def labels_of(positions: NDArray[np.int64], alive: NDArray[np.bool_]) -> NDArray
 
 
 class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
-    """Montezuma's Revenge from the top of a ladder on. Gymnasium id ``hypogoal/MontezumaLadder-v0``.
+    """Montezuma's Revenge from the top of a ladder. Gymnasium id ``hypogoal/MontezumaLadder-v0``.
 
-    An observation is the last four agent steps' frames, uint8 (84, 84, 4), grey, the oldest first; 18 actions, each
-    played for four frames; the reward is the game's. ``info`` has ``labels`` (sub-goal: whether it is reached),
-    ``position`` (room, x, y in the RAM's units) and ``alive``.
+    An observation is the last four agent steps' frames, uint8 (84, 84, 4), grey, oldest first; 18 actions, each
+    played for four frames; the reward is the game's. ``info`` has ``labels`` (sub-goal: whether it holds),
+    ``position`` (room, x, y in RAM units) and ``alive``.
 
     Args:
         start: the ladder, see ``montezuma_ladders.LADDERS``.
         max_steps: agent steps after which an episode is truncated.
-        end_at_death: an episode terminates when the agent begins to die; False, when the game is over.
+        end_at_death: True, an episode terminates when the agent begins to die; False, when the game is over.
         along: the share of episodes that begin somewhere on the way down instead of at the top.
         render_mode: None, or ``rgb_array``: the console's picture, uint8 (210, 160, 3).
-        start_states: how many states episodes begin with; see ``make_starts``.
-        start_seed: of those states. ``reset(seed)`` draws one of them, ``reset(options={"start_state": n})`` takes the
-            n-th.
+        start_states: the number of start states, see ``make_starts``.
+        start_seed: draws those states. ``reset(seed)`` draws one of them, ``reset(options={"start_state": n})`` takes
+            the n-th.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND // game.FRAME_SKIP}  # noqa: RUF012
@@ -162,7 +162,7 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         self._picture: NDArray[np.uint8] | None = None
 
     def get_action_meanings(self) -> list[str]:
-        """What the actions are called, as Gymnasium's Atari environments tell it."""
+        """The actions' names, as in Gymnasium's Atari environments."""
         import ale_py
 
         return [ale_py.Action(number).name for number in range(game.N_ACTIONS)]

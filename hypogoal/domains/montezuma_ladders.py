@@ -1,7 +1,7 @@
-"""The ladders of Montezuma's Revenge: where they are, when one is climbed down, and how far it is (Spec B4, B5, F3).
+"""The ladders of Montezuma's Revenge: their positions, when one is climbed down, and distances (Spec B4, B5, F3).
 
-Positions are the RAM's (see ``montezuma_emulator``). They were read off the emulator while the agent climbed down; a
-test marked ``atari`` plays every descent again.
+Positions are in RAM units (see ``montezuma_emulator``), read off the emulator while the agent climbed down; a test
+marked ``atari`` repeats every descent.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma_emulator import FIRST_ROOM_OF_ROW, ROOMS, Position, row_of
 
 SUB_GOAL = "climb-down-ladder"
-REACH = 2  # at a base: this far from it at most, in x and in y
+REACH = 2  # at a base: at most this far from it, in x and in y
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Ladder:
     top: Position
     base: Position
     steps_down: int  # agent steps of DOWN from the top to the base
-    runs_on: bool = False  # the base is the top of the next ladder; by Spec B5 such states get no label
+    runs_on: bool = False  # the base is the top of the next ladder; by Spec B5 such states are not labelled
 
 
 LADDERS = (
@@ -47,37 +47,37 @@ BY_NAME = {ladder.name: ladder for ladder in LADDERS}
 GROUPS: tuple[tuple[int, ...], ...] = ((1,), (2, 6), (0, 4, 10), (3, 9), (7, 13, 21), (5, 11, 19), (14, 22))
 BASES, TOPS = [ladder.base for ladder in LADDERS], [ladder.top for ladder in LADDERS]
 
-# The rooms side by side and row upon row, in one plane. Each row begins half a step of the pyramid further left: the
-# room below room c of a row is c + 1 of the next.
+# The rooms side by side and row upon row, in one plane. Each row begins half a step of the pyramid further left: below
+# room c of a row lies room c + 1 of the next.
 ROOM_WIDTH, ROOM_HEIGHT = 149, 121  # so that crossing, x 149 to 1, y 134 to 254, is one unit
-SHAFT_EXIT, SHAFT_ENTRY = 134, 254  # y where one leaves a room through its floor, and where one then is
+SHAFT_EXIT, SHAFT_ENTRY = 134, 254  # y on leaving a room through its floor, and y right after
 # Neighbours with a wall between them, tried at y 235. Doors that take a key count as open.
 WALLS = frozenset({(9, 10), (20, 21)})
-FAR = 10**9  # more than any way is long
+FAR = 10**9  # longer than any path
 
 
 def ladder_named(name: str) -> Ladder:
-    """A ladder by its name; a ``UserError`` where there is none."""
+    """A ladder by name; ``UserError`` if unknown."""
     if name not in BY_NAME:
         raise UserError("unknown ladder", name, f"Choose one of {', '.join(BY_NAME)}.")
     return BY_NAME[name]
 
 
 def within(positions: NDArray[np.integer], places: Sequence[Position], reach: int) -> NDArray[np.bool_]:
-    """Which positions (n, 3) of room, x, y are at which places (m): that far at most, in x and in y; bool (n, m)."""
-    away = np.abs(positions[:, None] - np.array(places))
-    near: NDArray[np.bool_] = (away[..., 1:] <= reach).all(-1)
-    return near & (away[..., 0] == 0)
+    """Whether positions (n, 3) of room, x, y are within ``reach``, in x and in y, of places (m); bool (n, m)."""
+    distance = np.abs(positions[:, None] - np.array(places))
+    near: NDArray[np.bool_] = (distance[..., 1:] <= reach).all(-1)
+    return near & (distance[..., 0] == 0)
 
 
 def ladders_of(positions: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The index in ``LADDERS`` of the base that positions (n, 3) are at, -1 for none; int64 (n,)."""
+    """The index in ``LADDERS`` of the base at which positions (n, 3) are, -1 for none; int64 (n,)."""
     at = within(positions, BASES, REACH)
     return np.where(at.any(1), at.argmax(1), -1)
 
 
 def at_base(positions: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Spec B4: whether positions (n, 3) are at the base of a ladder, bool (n,); whether alive is not looked at."""
+    """Spec B4: whether positions (n, 3) are at the base of a ladder, alive or not; bool (n,)."""
     return ladders_of(positions) >= 0
 
 
@@ -90,7 +90,7 @@ def plane(positions: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @cache
 def _regions() -> NDArray[np.int64]:
-    """Per room the number of its region: rooms that one walks between, side by side."""
+    """The region of each room, by number: the agent can walk between the rooms of a region."""
     region = [0]
     for room in range(1, ROOMS):
         together = row_of(room) == row_of(room - 1) and (room - 1, room) not in WALLS
@@ -112,17 +112,17 @@ def _landmarks() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64
     joined[out, into] = joined[into, out] = True
     away = np.where(joined, np.abs(at[:, None] - at).sum(2), FAR)
     distance = np.where(np.arange(len(positions)) < len(BASES), 0, FAR)
-    for _ in positions:  # Bellman and Ford: no shortest way has more legs than there are landmarks
+    for _ in positions:  # Bellman-Ford: a shortest path has at most as many legs as there are landmarks
         distance = (away + distance).min(1)
     return region, at, distance
 
 
 def distance_to_base(positions: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Spec F3: Manhattan distance from positions (n, 3) to the nearest base, on a way through the rooms; int (n,).
+    """Spec F3: the Manhattan distance from positions (n, 3) to the nearest base, through the rooms; int (n,).
 
-    Within a row of the pyramid one goes sideways from room to room, except where ``WALLS`` stand, and up and down
-    freely; from row to row only through the nine ladders that join rooms. Platforms and walls inside a room are not
-    looked at, so that this is the least it can be. 0 at a base's own position.
+    Paths go sideways from room to room within a row of the pyramid, except through ``WALLS``, freely up and down, and
+    from row to row only through the nine ladders that join rooms. Platforms and walls inside a room are ignored, so it
+    is a lower bound. 0 at a base itself.
     """
     region, at, onwards = _landmarks()
     away = np.abs(plane(positions)[:, None] - at).sum(2) + onwards

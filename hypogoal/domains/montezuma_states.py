@@ -1,6 +1,4 @@
-"""States of one room of Montezuma's Revenge: how they are brought about, by scripted rollouts and random play, which
-are kept, of what kind they are, and their labels (Spec B4, B5, B7).
-"""
+"""States of a room of Montezuma's Revenge from scripted or random play, with kinds and labels (Spec B4, B5, B7)."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -33,45 +31,45 @@ from hypogoal.domains.montezuma_ladders import (
 
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DYING, ELSEWHERE = range(len(KINDS))
-NEAR = 12  # of a base, in the RAM's units, in x and in y
-LADDER_POSES = (game.ON_LADDER, 0)  # climbing, holding still; on ropes they are 14 and 4
-ON_GROUND = 255  # what the RAM says of the jump when there is none
+NEAR = 12  # from a base, in RAM units, in x and in y
+LADDER_POSES = (game.ON_LADDER, 0)  # climbing, holding still; on ropes 14 and 4
+ON_GROUND = 255  # the RAM's value for the jump without one
 
-# Of a room's states at least these shares are of these kinds, as far as the rollouts brought them about.
-SHARES = {BASE: 0.2, NEAR_BASE: 0.15, CLIMBING: 0.15, TOP: 0.05, JUMPING: 0.1, DYING: 0.1}
-SPARE = 1.25  # times as many as are wanted are gathered, to choose from
-# A room is played in until these shares of the wanted states are positive, at all its bases and at each.
+# The least shares of a room's states by kind, as far as the rollouts reached them.
+KIND_SHARES = {BASE: 0.2, NEAR_BASE: 0.15, CLIMBING: 0.15, TOP: 0.05, JUMPING: 0.1, DYING: 0.1}
+SPARE = 1.25  # states to gather, relative to those to keep
+# Play in a room until these shares of the states to keep are positive, at all its bases and at each.
 FEWEST_POSITIVES, FEWEST_AT_A_BASE = 0.1, 0.02
-MOST_STEPS = 60  # agent steps for each wanted state, after which a room is given up; two to four are usual
-HELD_OUT_EACH = 3  # one in so many stacks may be held out
+MOST_STEPS = 60  # agent steps per state to keep, after which a room is given up; two to four are usual
+HELD_OUT_EACH = 3  # every third stack, by digest, is for the held-out set
 
 ROLLOUT_STEPS = 40
 RANDOM_STEPS = 200
-SETTLE = 4  # agent steps that fill the stack with what the start looks like
-PHASES = (2, 200)  # frames that the room's enemies have been moving before the first step
+SETTLE = 4  # agent steps that fill the stack with frames of the start
+PHASES = (2, 200)  # frames for which the room's enemies move before the first step
 ROLLOUTS_PER_PHASE = 4
-STARTS = {"base": 0.5, "ladder": 0.15, "top": 0.1, "anywhere": 0.25}  # shares, among those that a room has
+STARTS = {"base": 0.5, "ladder": 0.15, "top": 0.1, "anywhere": 0.25}  # shares, among the kinds that a room has
 
 LONGEST_REPEAT = 8  # agent steps of one action
-JITTER = 0.1  # share of the steps on which another action comes in between
+JITTER = 0.1  # share of the steps with another action in between
 HEADINGS = (game.DOWN, game.UP, game.LEFT, game.RIGHT)
-HEADING = 0.7  # share of the actions that are one of the headings; the others are any
-CLOSE = 1  # how far from a base, in the RAM's units, an agent that wants to be there stays where it is
-STEPS_ASIDE = 3  # walked at most from a base or top before a rollout begins
-HELD = 0.5  # share of the starts at a base where the agent holds it, against the conveyor belt in room 1
-STRIDE = 4  # how far the agent walks and climbs in an agent step, in the RAM's units
+HEADING = 0.7  # share of the actions that are a heading; the others are any action
+CLOSE = 1  # distance from a base, in RAM units, at which an agent that heads for it stops
+STEPS_ASIDE = 3  # most steps from a base or top before a rollout begins
+HELD = 0.5  # share of the starts at a base where the agent stays there, against the conveyor belt in room 1
+STRIDE = 4  # RAM units that the agent walks or climbs in an agent step
 
-# Where the agent can be put.
-BLACK_SHARE = 0.95  # of the agent's box, where it stands in the open; its feet are all in the open
+# Where the agent can be placed.
+BLACK_SHARE = 0.95  # of the agent's box if it stands in the open; the rows of its feet are all black
 FEET = 4  # rows
-SNAP = 3  # of the row in which one enters, the floor is drawn so much lower in some rooms
+SNAP = 3  # in some rooms the floor is drawn so much below the row of entry
 LAVA_ROOMS = (10, 18, 20, 22)
-LAVA_BELOW = 220  # y; nobody stands on lava, unless put there
+LAVA_BELOW = 220  # y; the agent stands on lava only if placed there
 
 
 @dataclass(frozen=True)
 class RoomStates:
-    """States of a room or of several."""
+    """States of one or several rooms."""
 
     observations: NDArray[np.uint8]  # (n, 84, 84, 4)
     ram: NDArray[np.uint8]  # (n, 128), the console's memory
@@ -89,7 +87,7 @@ def labels_of(ram: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def kinds_of(ram: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Each state's kind, an index into ``KINDS``, int64 (n,): dying if it is, else the first of them that fits."""
+    """Each state's kind, an index into ``KINDS``, int64 (n,): dying first, else the first that fits."""
     positions = positions_of(ram)
     fits = {
         DYING: ram[:, RAM["dying"]] > 0,
@@ -103,10 +101,10 @@ def kinds_of(ram: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def origins_of(states: RoomStates) -> dict[str, NDArray[np.int64]]:
-    """Where each state comes from, int64 (n,) each.
+    """The states' origins, int64 (n,) each.
 
     room, x, y; group 1..7 of the room (0: it has no ladder); kind, an index into ``KINDS``; ladder, see ``ladders_of``;
-    dying 0 or 1; action, 0..17, that led to the last frame, and previous_action, that led to the one before it.
+    dying, 0 or 1; action, 0..17, that led to the last frame, and previous_action, that led to the one before.
     """
     positions = positions_of(states.ram)
     group = np.zeros(len(positions), np.int64)
@@ -128,26 +126,26 @@ def origins_of(states: RoomStates) -> dict[str, NDArray[np.int64]]:
 def may_be_held_out(looks: bytes) -> bool:
     """Whether a stack is for testing, by its digest; all others are for training.
 
-    The stack's own bytes decide. So no stack is ever on both sides, and yet what is held out does not depend on what
-    is labelled.
+    Only the stack's bytes decide, so no stack is ever on both sides, and the held-out set does not depend on which
+    states are labelled.
     """
     return looks[0] % HELD_OUT_EACH == 0
 
 
 @cache
 def emulator_of_process() -> Emulator:
-    """One emulator for all rooms that a process plays in; what a room gives does not depend on those before it."""
+    """One emulator for all rooms of a process; a room's states do not depend on the rooms before it."""
     return Emulator()
 
 
 def gather(
     room: int, wanted: int, seed: int, stream: tuple[str | int, ...], *, play: str, held_out: bool, runs_on: bool
 ) -> RoomStates:
-    """``wanted`` states of a room, all different: rollouts until there are enough, and of what they show a choice.
+    """``wanted`` different states of a room: rollouts until there are enough, then a choice among them.
 
-    ``seed`` and ``stream`` are of everything that is random here, see ``rng_for``; ``play``, a name in ``PLAYS``, is
-    how the agent plays; ``held_out``, which side of ``may_be_held_out``; ``runs_on``, whether to keep states at bases
-    of ladders that run on through the floor. A room that does not show so many different states is a ``UserError``.
+    ``seed`` and ``stream`` determine all randomness, see ``rng_for``; ``play``, a name in ``PLAYS``, is how the agent
+    plays; ``held_out``, the side of ``may_be_held_out``; ``runs_on``, whether to keep states at bases of ladders that
+    continue through the floor. A room with too few different states is a ``UserError``.
     """
     rng = rng_for(seed, *stream, room)
     bases = [
@@ -161,15 +159,15 @@ def gather(
         each = positives.values()
         return not each or (sum(each) >= FEWEST_POSITIVES * wanted and min(each) >= FEWEST_AT_A_BASE * wanted)
 
-    met: set[bytes] = set()
+    seen: set[bytes] = set()
     pool: list[Shown] = []
     for step, shown in enumerate(PLAYS[play](emulator_of_process(), room, rng)):
         if enough() or step == MOST_STEPS * wanted:
             break
         looks = digest(shown.stack)
-        if looks in met or may_be_held_out(looks) != held_out:
+        if looks in seen or may_be_held_out(looks) != held_out:
             continue
-        met.add(looks)
+        seen.add(looks)
         ladder = int(ladders_of(positions_of(shown.ram[None]))[0])
         if ladder >= 0 and LADDERS[ladder].runs_on and not runs_on:
             continue
@@ -177,8 +175,8 @@ def gather(
         if ladder in positives and shown.ram[RAM["dying"]] == 0:
             positives[ladder] += 1
     if len(pool) < wanted:
-        what = f"room {room} does not show {wanted} different states"
-        raise UserError(what, f"{len(pool)} in {step} steps", "Ask for fewer.")
+        fault = f"room {room} does not show {wanted} different states"
+        raise UserError(fault, f"{len(pool)} in {step} steps", "Ask for fewer.")
     ram = np.stack([shown.ram for shown in pool])
     chosen = [pool[index] for index in choose(kinds_of(ram), positions_of(ram), wanted, rng)]
     return RoomStates(
@@ -191,31 +189,32 @@ def gather(
 def choose(
     kinds: NDArray[np.int64], positions: NDArray[np.int64], wanted: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Indices, in order, of ``wanted`` of n states: of each kind its share, spread over positions; others at random."""
+    """Ordered indices of ``wanted`` of n states: each kind's share, spread over positions; the others at random."""
     order = rng.permutation(len(kinds))
-    latest: dict[tuple[int, ...], int] = {}  # kind and position -> turn of the last state so far
-    turns = np.empty(len(kinds), np.int64)  # of those of its kind and position, the how manyth a state is
+    latest: dict[tuple[int, ...], int] = {}  # by kind and position, the last rank so far
+    ranks = np.empty(len(kinds), np.int64)  # within its kind and position
     for index in order.tolist():
         same = (int(kinds[index]), *positions[index].tolist())
-        turns[index] = latest[same] = latest.get(same, -1) + 1
-    spread = order[np.argsort(turns[order], kind="stable")]
-    first = np.concatenate([spread[kinds[spread] == kind][: int(share * wanted)] for kind, share in SHARES.items()])
+        ranks[index] = latest[same] = latest.get(same, -1) + 1
+    spread = order[np.argsort(ranks[order], kind="stable")]
+    shares = [spread[kinds[spread] == kind][: int(share * wanted)] for kind, share in KIND_SHARES.items()]
+    first = np.concatenate(shares)
     others = order[~np.isin(order, first)][: wanted - len(first)]
     return np.sort(np.concatenate([first, others]))
 
 
 class Placing(NamedTuple):
-    """Where a rollout begins: the agent is put there, then plays ``action`` for so many agent steps, unseen."""
+    """Where a rollout begins: the agent is placed there, then plays ``action`` for ``steps`` agent steps, undrawn."""
 
     x: int
     y: int
     action: int = game.NOOP
     steps: int = 0
-    hold: bool = False  # while the stack fills, it goes back to the base that it is near, instead of doing nothing
+    hold: bool = False  # while the stack fills, return to the nearby base instead of doing nothing
 
 
 class Shown(NamedTuple):
-    """One state of a rollout: what is seen, uint8 (84, 84, 4), the RAM, uint8 (128,), and the last two actions."""
+    """One state of a rollout: the observation, uint8 (84, 84, 4), the RAM, uint8 (128,), and the last two actions."""
 
     stack: NDArray[np.uint8]
     ram: NDArray[np.uint8]
@@ -224,10 +223,10 @@ class Shown(NamedTuple):
 
 
 def expert_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iterator[Shown]:
-    """Spec B5: the states of rollouts from around a room's bases, ladders, tops and platforms; without end.
+    """Spec B5: endlessly, the states of rollouts from around a room's bases, ladders, tops and platforms.
 
-    Actions are repeated, most of them headings; some are chosen to get to a base. A rollout ends when the agent leaves
-    the room, or when it would come to life again after a death.
+    Actions are repeated, most of them headings; some lead to a base. A rollout ends when the agent leaves the room or
+    would revive after a death.
     """
     bases = [base for base in BASES if base.room == room]
     starts = _starts(emulator, room, rng)
@@ -243,7 +242,7 @@ def expert_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iter
 
 
 def random_play(emulator: Emulator, room: int, rng: np.random.Generator) -> Iterator[Shown]:
-    """Spec B7: the states of random actions, each as likely, from the sides of a room; without end."""
+    """Spec B7: endlessly, the states of uniform-random actions from the sides of a room."""
     places = standing_places(emulator, room)
     row = places[places[:, 1] == places[:, 1].max()]
     sides = [Placing(*row[row[:, 0].argmin()].tolist()), Placing(*row[row[:, 0].argmax()].tolist())]
@@ -283,7 +282,7 @@ def _expert_actions(emulator: Emulator, bases: Sequence[Position], rng: np.rando
 
 
 def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, int]:
-    """An action that brings the agent to the nearest base or holds it there, and for how many agent steps."""
+    """An action that moves the agent to the nearest base or holds it there, and its number of agent steps."""
     base = min(bases, key=lambda base: abs(position.x - base.x) + abs(position.y - base.y))
     aside = base.x - position.x
     if abs(aside) > CLOSE:
@@ -292,7 +291,7 @@ def _towards_base(position: Position, bases: Sequence[Position]) -> tuple[int, i
 
 
 def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> game.Snapshot:
-    """The room with its enemies at some phase; the agent is put in its place later."""
+    """The room with its enemies at a random phase; the agent is placed later."""
     while True:
         scene = emulator.place(
             room, game.RIGHT_EDGE, game.EDGE_Y, phase=int(rng.integers(*PHASES, endpoint=True)), settle=0
@@ -302,7 +301,7 @@ def _scene(emulator: Emulator, room: int, rng: np.random.Generator) -> game.Snap
 
 
 def _begin(emulator: Emulator, room: int, start: Placing, bases: Sequence[Position] = ()) -> tuple[int, int] | None:
-    """Bring the agent to its start and fill the stack: the last two actions, None where it is not alive in the room."""
+    """Bring the agent to its start and fill the stack; the last two actions, None unless it is alive in the room."""
     emulator.write("x", start.x)
     emulator.write("y", start.y)
     emulator.frames(start.action, game.FRAME_SKIP * start.steps)
@@ -315,7 +314,7 @@ def _begin(emulator: Emulator, room: int, start: Placing, bases: Sequence[Positi
 
 
 def _starts(emulator: Emulator, room: int, rng: np.random.Generator) -> dict[str, Callable[[], Placing]]:
-    """For each kind of start that the room has, what draws one. Where it has several ladders, they take turns."""
+    """A function for each kind of start that the room has, which draws one. Several ladders take turns."""
     places = standing_places(emulator, room)
     bases = _in_turn([base for base in BASES if base.room == room], rng)
     tops = _in_turn([top for top in TOPS if top.room == room], rng)
@@ -342,11 +341,10 @@ def _starts(emulator: Emulator, room: int, rng: np.random.Generator) -> dict[str
 
 
 def standing_places(emulator: Emulator, room: int) -> NDArray[np.int64]:
-    """Places x, y (n, 2) of a room where an agent that is put there stands on something, in the open.
+    """Places x, y (n, 2) of a room where an agent placed there stands on something, in the open.
 
-    Of all places many are inside walls, where the game never looks, and where the agent can climb about. So the
-    agent's box has to be black, with something under its feet. Room 15 is black nowhere: of it the row in which one
-    enters is taken.
+    Many places lie inside walls, where the game does not stop the agent from climbing about. So the agent's box must be
+    black, with something under its feet. Room 15 has no black places; for it, the row of entry is taken.
     """
     black = (game.picture(emulator, room) == 0).all(2)
     x = np.arange(game.LEFT_EDGE, game.RIGHT_EDGE + 1)
@@ -367,12 +365,12 @@ def standing_places(emulator: Emulator, room: int) -> NDArray[np.int64]:
 
 
 def _in_turn(things: Sequence[Any], rng: np.random.Generator) -> Iterator[Any] | None:
-    """One after the other, over and over, in a random order; None where there are none."""
+    """Cycles through the things in a random order; None if there are none."""
     return cycle([things[index] for index in rng.permutation(len(things)).tolist()]) if things else None
 
 
 def _climbs(ladder: Ladder) -> list[tuple[Position, int, int]]:
-    """From where a ladder is climbed, which way, and for how many agent steps at most without leaving the room."""
+    """Both climbs of a ladder: the start, the action, and the most agent steps without leaving the room."""
     one_room = ladder.top.room == ladder.base.room
     up = (ladder.top.y if one_room else SHAFT_ENTRY) - ladder.base.y
     down = ladder.top.y - (ladder.base.y if one_room else SHAFT_EXIT)

@@ -1,7 +1,7 @@
-"""What an observation is taken for, by its shape and type (the table in docs/own-domain.md); pictures made smaller.
+"""How an observation is read, by its shape and type (the table in docs/own-domain.md), and how pictures are resized.
 
-Environments and imported arrays share these rules. What could be several things is refused, or warned of, with the
-expression that makes it a picture.
+Environments and imported arrays share these rules. An ambiguous observation is refused, or comes with a warning; both
+name the expression that makes it a picture.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ MOST_CHANNELS = 16  # an axis as short as this may hold channels or frames; the 
 
 
 class Arrangement(NamedTuple):
-    """How an observation becomes a picture (H, W, C) of ``shape``: ``cast`` to bytes, its axes in another order.
+    """How an observation becomes a picture (H, W, C) of ``shape``: ``cast`` to bytes, then its axes reordered.
 
-    ``axes`` are those of height and width, then those that become channels: frames, and last colours.
+    ``axes`` are height and width, then those that become channels: frames, and colours last.
     """
 
     cast: str
@@ -30,7 +30,7 @@ class Arrangement(NamedTuple):
     shape: tuple[int, ...]
 
     def expression(self, *, batch: bool = False) -> str:
-        """Of x, one observation or, with ``batch``, several (N, ...)."""
+        """As a Python expression of x, an observation, or with ``batch`` several (N, ...)."""
         if self.axes == (0, 1):
             return f"{self.cast}[..., None]"
         if self.axes == (0, 1, 2):
@@ -40,15 +40,15 @@ class Arrangement(NamedTuple):
         return moved if len(self.axes) == 3 else f"{moved}.reshape{(-1, *self.shape) if batch else self.shape}"
 
     def arrange(self, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Observations (N, ...), bytes already, as pictures (N, H, W, C)."""
+        """Observations (N, ...) of bytes as pictures (N, H, W, C)."""
         moved = values.transpose(0, *(axis + 1 for axis in self.axes))
         return moved.reshape(len(values), *self.shape)
 
 
 class Reading(NamedTuple):
-    """What an observation is taken for: ``dtype``, PICTURE or NUMBERS, of ``shape``; refused if there is a ``fault``.
+    """How an observation is read: ``dtype`` PICTURE or NUMBERS, ``shape``, and the ``fault`` for which it is refused.
 
-    ``doubt`` is a warning. Of both, ``picture`` is how it becomes a picture; None if nobody can say.
+    ``doubt`` is a warning. With a fault or a doubt, ``picture`` is how it becomes a picture; None if that is unclear.
     """
 
     dtype: np.dtype[Any]
@@ -59,7 +59,7 @@ class Reading(NamedTuple):
 
 
 def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any], top: float = 1.0) -> Reading:
-    """What an observation of this shape and type, a number or a truth value per entry, up to ``top``, is taken for."""
+    """The reading of an observation of this shape and type, with numbers or truth values up to ``top``."""
     if len(shape) < 2:
         return Reading(NUMBERS, shape or (1,))
     casts = {"f": "x.round()" if 1 < top < np.inf else "(255 * x).round()", "b": "(255 * x)"}
@@ -67,7 +67,7 @@ def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any], top: float = 1.0) -
     picture = _arrangement(shape, cast)
     if dtype == PICTURE:
         return Reading(PICTURE, picture.shape if picture else shape, _byte_fault(shape), picture=picture)
-    if not any(min(pair) > MOST_CHANNELS for pair in pairwise(shape)):  # it has not the shape of a picture
+    if not any(min(pair) > MOST_CHANNELS for pair in pairwise(shape)):  # not shaped like a picture
         return Reading(NUMBERS, shape)
     if dtype.kind == "f":
         remedy = f": of pictures give {picture.expression()}" if picture else ""
@@ -76,7 +76,7 @@ def reading_of(shape: tuple[int, ...], dtype: np.dtype[Any], top: float = 1.0) -
 
 
 def _byte_fault(shape: tuple[int, ...]) -> str:
-    """Why uint8 of this shape is refused; empty where it is a picture."""
+    """Why uint8 of this shape is refused; empty if it is a picture."""
     if len(shape) > 3:
         return "are stacks of pictures"
     if channels_first(shape):
@@ -87,9 +87,9 @@ def _byte_fault(shape: tuple[int, ...]) -> str:
 
 
 def channels_first(shape: tuple[int, ...]) -> bool:
-    """Whether a shape is (C, H, W) rather than (H, W, C): few "rows", and more columns and "channels" than that.
+    """Whether a shape is (C, H, W) rather than (H, W, C): its first axis is short, the other two are long.
 
-    Small grids with many planes, (7, 7, 20), are what they say.
+    Small grids with many planes, such as (7, 7, 20), are (H, W, C).
     """
     if len(shape) != 3 or min(shape[1:]) <= MOST_CHANNELS:
         return False
@@ -97,7 +97,7 @@ def channels_first(shape: tuple[int, ...]) -> bool:
 
 
 def _arrangement(shape: tuple[int, ...], cast: str) -> Arrangement | None:
-    """How an observation of two axes or more becomes a picture; None where what came out would be refused again."""
+    """How an observation of two axes or more becomes a picture; None if the result would be refused again."""
     if len(shape) == 2:
         return Arrangement(cast, (0, 1), (*shape, 1))
     if len(shape) == 3 and not channels_first(shape):
@@ -111,14 +111,14 @@ def _arrangement(shape: tuple[int, ...], cast: str) -> Arrangement | None:
 
 
 def shrunk_picture(picture: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """A picture uint8 (H, W, C) in the same proportion, its longer side ``longest`` pixels; one no larger as it is."""
+    """A picture uint8 (H, W, C) scaled down so that its longer side has at most ``longest`` pixels."""
     height, width = picture.shape[:2]
     scale = min(1.0, longest / max(height, width))
     return resized_picture(picture, max(1, round(height * scale)), max(1, round(width * scale)))
 
 
 def resized_picture(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """A picture uint8 (H, W, C) in ``height`` x ``width`` pixels, each the mean of the area that it covers."""
+    """A picture uint8 (H, W, C) resized to ``height`` x ``width`` pixels, each the mean of the area that it covers."""
     if picture.shape[:2] == (height, width):
         return picture
     channels = map(Image.fromarray, np.moveaxis(picture, -1, 0))

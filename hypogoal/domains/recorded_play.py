@@ -1,4 +1,4 @@
-"""Recorded play, from which states are collected: the actions of episodes, as JSON or a Minari dataset (Spec B7)."""
+"""Recorded play to collect states from: the actions of episodes, as JSON or a Minari dataset (Spec B7)."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ DO = 'Give {"layout_seed": 0, "actions": [2, 5]}, a list of these, or a Minari d
 
 
 class Recorded(NamedTuple):
-    """What was played after ``reset(seed=layout_seed)``, and where that is written."""
+    """The actions played after ``reset(seed=layout_seed)``, and the file and episode they come from."""
 
     layout_seed: int
     actions: tuple[int, ...]
@@ -20,17 +20,17 @@ class Recorded(NamedTuple):
 
 
 def read_play(path: Path) -> list[Recorded]:
-    """The episodes in a JSON file or a Minari dataset's folder; what is neither is a ``UserError``."""
-    told: Any = _minari(path) if path.is_dir() else read_json(path, "recorded play is", DO)
-    found = []
-    for number, episode in enumerate(told if isinstance(told, list) else [told]):
+    """The episodes in a JSON file or a Minari dataset's folder; anything else is a ``UserError``."""
+    content: Any = _minari(path) if path.is_dir() else read_json(path, "recorded play is", DO)
+    episodes = []
+    for number, episode in enumerate(content if isinstance(content, list) else [content]):
         where = f"{path}, episode {number}"
         seed, actions = (episode.get(key) if isinstance(episode, dict) else None for key in ("layout_seed", "actions"))
         numbers: list[Any] = [seed, *actions] if isinstance(actions, list) and actions else []
         if not numbers or any(type(value) is not int or value < 0 for value in numbers):
             raise UserError("recorded play needs a layout seed and actions", where, DO)
-        found.append(Recorded(numbers[0], tuple(numbers[1:]), where))
-    return found
+        episodes.append(Recorded(numbers[0], tuple(numbers[1:]), where))
+    return episodes
 
 
 def _minari(path: Path) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The states that an ensemble is trained on, drawn in batches and run through the members."""
+"""The states that an ensemble is trained on: drawn in batches and passed through the members."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.networks import as_input, at_once
 
-CHUNK = 256  # states at once where no gradient is kept
+EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
 LADDER_POSITIVES = 3 / 8  # share of a batch of batch_kind=per-ladder: 24 of 64, 8 of each of room 1's three ladders
 
 
-class Seen(NamedTuple):
-    """What K networks make of groups of states: for each network and group, logits (B, 2) and the features (B, D),
-    the last hidden layer's outputs, that these are made of.
+class Outputs(NamedTuple):
+    """K networks' outputs for groups of states: by network and group, logits (B, 2) and features (B, D), the last
+    hidden layer's outputs.
     """
 
     logits: list[list[Tensor]]
@@ -35,18 +35,18 @@ class Seen(NamedTuple):
 
 
 class TrainingStates:
-    """Labelled states followed by unlabelled ones, one numbering for both.
+    """Labelled states followed by unlabelled ones, numbered in that order.
 
     Args:
-        observations, labels: what members see of them, (N, h, w, C) or (N, *shape), and (N,).
-        unlabelled: of as many.
+        observations, labels: the members' view of the labelled states, (N, h, w, C) or (N, *shape), and labels (N,).
+        unlabelled: the same of the unlabelled states.
         network: any of the networks that will see them (their layers decide how images are stored).
-        trunk: what the networks share and see states by. Of a ``frozen`` one the features of all states are computed
-            here, once, and kept in memory; where states are changed at random, those of each batch are.
-        ladders: (N,), at which ladder each labelled state is, where batches are drawn by them.
-        grey: whether the shades of each state of a training batch are mapped at random.
-        context: whether, before that, what is around its middle is replaced in most: :func:`.changes.other_context`.
-        jitter: by how many pixels at most each of them is moved at random; the images have that margin on every side.
+        trunk: the layers that the networks share. If it is ``frozen``, the features of all states are computed once
+            and kept in memory, or for each batch if states are changed at random.
+        ladders: (N,), each labelled state's ladder, if batches are drawn by ladder.
+        grey: whether a random function maps the shades of each state of a training batch.
+        context: whether most states' surroundings are replaced before that: :func:`.changes.other_context`.
+        jitter: the most pixels by which each state is moved at random; images have this margin on every side.
 
     Raises:
         UserError: shapes that do not fit, or labels of one class only.
@@ -76,17 +76,17 @@ class TrainingStates:
         self._labelled = observations
         images = np.concatenate([observations, unlabelled])
         self._grey, self._jitter, self._context = grey, jitter, context
-        tables = device.type == "cpu" and not (grey or jitter)  # of patches, which change with the images
+        tables = device.type == "cpu" and not (grey or jitter)  # changed images have changed patches
         self._tables = patches.make_tables(images, trunk or network) if tables else None
         self._images = torch.from_numpy(images).to(device) if self._tables is None else None
         self._targets = torch.from_numpy(labels.astype(np.int64)).to(device)
         self._trunk, self._features = trunk, None
-        self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # that all networks learn
+        self.shared = [*trunk.parameters()] if trunk is not None and not frozen else []  # trained by all networks
         if trunk is not None and frozen and not (grey or jitter):
-            size = at_once(CHUNK, images.shape[1:])
+            size = at_once(EVALUATED_AT_ONCE, images.shape[1:])
             chunks = [np.arange(at, min(at + size, len(images))) for at in range(0, len(images), size)]
             with torch.no_grad():
-                self._features = torch.cat([_forward(trunk, self._seen([chunk]), [len(chunk)]) for chunk in chunks])
+                self._features = torch.cat([_forward(trunk, self._inputs([chunk]), [len(chunk)]) for chunk in chunks])
             self._tables = self._images = None
 
     def forward(
@@ -95,62 +95,62 @@ class TrainingStates:
         *groups: NDArray[np.int64],
         counted: Sequence[bool] = (),
         changes: Sequence[np.random.Generator] = (),
-    ) -> Seen:
-        """What each network makes of groups of states (B,) each.
+    ) -> Outputs:
+        """Each network's outputs for groups of states (B,).
 
-        BatchNorm sees each group on its own; all else takes them together, which reads the weights once. In training
-        mode its running statistics take in the groups that are ``counted``, all where that is empty. With ``changes``,
-        a generator for each group, states are changed at random, see ``grey`` and ``jitter``: what one group draws does
-        not depend on the others.
+        BatchNorm sees each group on its own; all other layers take them together, which reads the weights once. In
+        training mode, BatchNorm's running statistics include the ``counted`` groups, all if that is empty. With
+        ``changes``, a generator per group, states are changed at random, see ``grey`` and ``jitter``; a group's draws
+        do not depend on the others.
         """
-        sizes, seen = [len(group) for group in groups], self._seen(groups, changes)
+        sizes, inputs = [len(group) for group in groups], self._inputs(groups, changes)
         if self._trunk is not None and self._features is None:
-            seen = _forward(self._trunk, seen, sizes, counted)
-        features = [_forward(nn.Sequential(*list(network)[:-1]), seen, sizes, counted) for network in networks]
+            inputs = _forward(self._trunk, inputs, sizes, counted)
+        features = [_forward(nn.Sequential(*list(network)[:-1]), inputs, sizes, counted) for network in networks]
         logits = [network[-1](hidden) for network, hidden in zip(networks, features, strict=True)]
-        return Seen(*([list(rows.split(sizes)) for rows in of_networks] for of_networks in (logits, features)))
+        return Outputs(*([list(rows.split(sizes)) for rows in of_networks] for of_networks in (logits, features)))
 
-    def _seen(
+    def _inputs(
         self, groups: Sequence[NDArray[np.int64]], changes: Sequence[np.random.Generator] = ()
     ) -> Tensor | patches.Batch:
-        """Groups of states as networks see them: images, their patches, or the features that a fixed trunk makes."""
+        """The networks' inputs for groups of states: images, their patches, or a frozen trunk's features."""
         if self._tables is not None:
             return patches.take(self._tables, *groups)
         if self._features is not None:
             return self._features[torch.from_numpy(np.concatenate(groups)).to(self.device)]
         if changes and (self._grey or self._jitter):
-            return torch.cat([self._inputs(*group) for group in zip(groups, changes, strict=True)])
-        return self._inputs(np.concatenate(groups), None)
+            return torch.cat([self._images_of(*group) for group in zip(groups, changes, strict=True)])
+        return self._images_of(np.concatenate(groups), None)
 
     def input_gradients(self, networks: Sequence[nn.Sequential], states: NDArray[np.int64]) -> Tensor:
-        """Gradients float (K, B, numbers) of each network's logit gap (yes minus no) by what it sees of states.
+        """Gradients float (K, B, numbers) of each network's log-odds with respect to its inputs for states.
 
-        They can be differentiated. In training mode BatchNorm uses the batch's statistics and its running ones stay as
-        they are, so a gradient includes what a state does to the others of its batch.
+        They can be differentiated. In training mode BatchNorm uses the batch's statistics and leaves its running ones
+        alone, so a gradient includes a state's effect on the others of its batch.
         """
         inputs = as_input(torch.from_numpy(self._labelled[states]).to(self.device))
         if self._jitter:
             inputs = inputs[:, :, self._jitter : -self._jitter, self._jitter : -self._jitter]
         inputs = inputs.requires_grad_()
-        with sdpa_kernel(SDPBackend.MATH):  # the one way to attend whose gradient can be differentiated
-            seen = inputs if self._trunk is None else _forward(self._trunk, inputs, [len(states)], [False])
-            logits = [_forward(network, seen, [len(states)], [False]) for network in networks]
+        with sdpa_kernel(SDPBackend.MATH):  # the only attention with a differentiable gradient
+            hidden = inputs if self._trunk is None else _forward(self._trunk, inputs, [len(states)], [False])
+            logits = [_forward(network, hidden, [len(states)], [False]) for network in networks]
         gaps = [(each[:, 1] - each[:, 0]).sum() for each in logits]
         return torch.stack([torch.autograd.grad(gap, inputs, create_graph=True)[0].flatten(1) for gap in gaps])
 
     def count_in(
         self, networks: Sequence[nn.Sequential], states: NDArray[np.int64], changes: np.random.Generator | None = None
     ) -> None:
-        """BatchNorm's running statistics of networks in training mode take states (B,) in; nothing else is computed."""
+        """Update BatchNorm's running statistics, of networks in training mode, with states (B,), and nothing else."""
         first = [_up_to_last_norm(network) for network in (networks if self._trunk is None else [self._trunk])]
         if not any(len(network) for network in first):
             return
         with torch.no_grad():
-            seen = self._seen([states], [changes] if changes else [])
+            inputs = self._inputs([states], [changes] if changes else [])
             for network in first:
-                _forward(network, seen, [len(states)])
+                _forward(network, inputs, [len(states)])
 
-    def _inputs(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
+    def _images_of(self, states: NDArray[np.int64], changes: np.random.Generator | None) -> Tensor:
         assert self._images is not None
         images = self._images[torch.from_numpy(states).to(self.device)]
         if self._context and changes is not None:
@@ -170,34 +170,34 @@ class TrainingStates:
         """Each trained network's logits, float (F, M, 2), of all unlabelled states, in evaluation mode."""
         if not networks:
             return torch.zeros(0, self.n_unlabelled, 2, device=self.device)
-        every = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
+        states = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
         for network in networks:
             network.eval()
         with torch.no_grad():
-            size = at_once(CHUNK, self._labelled.shape[1:])
-            chunks = [self.forward(networks, every[at : at + size]).logits for at in range(0, len(every), size)]
+            size = at_once(EVALUATED_AT_ONCE, self._labelled.shape[1:])
+            chunks = [self.forward(networks, states[at : at + size]).logits for at in range(0, len(states), size)]
         return torch.stack([torch.cat([chunk[member][0] for chunk in chunks]) for member in range(len(networks))])
 
     def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """``config.steps`` times: labelled states (B,) and unlabelled (B,), see ``batch_kind`` and ``class_balance``.
+        """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see ``batch_kind``, ``class_balance``.
 
-        Every state of a pool is drawn once before any is drawn again. Without unlabelled states theirs are
-        empty.
+        Every state of a pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no
+        such states.
         """
         draws = [_draw(pools, count, seed, name) for pools, count, name in self._pools(config)]
         for _ in range(config.steps):
-            *labelled, others = (next(draw) for draw in draws)
-            yield np.concatenate(labelled), others
+            *labelled, unlabelled = (next(draw) for draw in draws)
+            yield np.concatenate(labelled), unlabelled
 
     def _pools(self, config: EnsembleConfig) -> list[tuple[list[NDArray[np.int64]], int, str]]:
-        """What a batch is made of: states that take turns, how many of them, and a name; last the unlabelled."""
+        """The parts of a batch, the unlabelled last: pools of states that take turns, a count, and a name."""
         positives, negatives = np.flatnonzero(self.labels), np.flatnonzero(~self.labels)
         if config.batch_kind == "per-ladder":
             assert self.ladders is not None
             count = min(max(1, round(LADDER_POSITIVES * config.batch_size)), config.batch_size - 1)
             ladders = self.ladders[positives]
-            each = [positives[ladders == ladder] for ladder in np.unique(ladders)]
-            labelled = [(each, count, "positives"), ([negatives], config.batch_size - count, "negatives")]
+            by_ladder = [positives[ladders == ladder] for ladder in np.unique(ladders)]
+            labelled = [(by_ladder, count, "positives"), ([negatives], config.batch_size - count, "negatives")]
         elif config.class_balance == "batch":
             half = config.batch_size // 2
             labelled = [([positives], half, "positives"), ([negatives], config.batch_size - half, "negatives")]
@@ -208,7 +208,7 @@ class TrainingStates:
 
 
 def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> Iterator[NDArray[np.int64]]:
-    """Without end: ``count`` items of the pools in turn; each is shuffled anew whenever it has been gone through."""
+    """Endlessly, ``count`` items of the pools in turn; a pool is shuffled again once all its items were drawn."""
     rngs = [rng_for(seed, name, *([number] if len(pools) > 1 else [])) for number in range(len(pools))]
     streams = [chain.from_iterable(map(rng.permutation, repeat(pool))) for rng, pool in zip(rngs, pools, strict=True)]
     turn = 0
@@ -219,7 +219,7 @@ def _draw(pools: list[NDArray[np.int64]], count: int, seed: int, name: str) -> I
 
 
 def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor:
-    """Images (B, H, W, C) without a margin on every side, the middle or, each on its own, somewhere at random."""
+    """Images (B, H, W, C) without their margin: the middle, or with ``rng`` a random place for each."""
     count, height, width = images.shape[:3]
     size = 2 * margin + 1
     corners = np.full((count, 2), margin) if rng is None else rng.integers(size, size=(count, 2))
@@ -230,33 +230,33 @@ def _cut(images: Tensor, margin: int, rng: np.random.Generator | None) -> Tensor
 
 
 def _forward(
-    network: nn.Sequential, seen: Tensor | patches.Batch, sizes: Sequence[int], counted: Sequence[bool] = ()
+    network: nn.Sequential, values: Tensor | patches.Batch, sizes: Sequence[int], counted: Sequence[bool] = ()
 ) -> Tensor:
-    """What a network makes of groups of inputs, one after the other; BatchNorm sees each on its own."""
-    if isinstance(seen, patches.Batch):
-        return patches.forward(network, seen, counted)
+    """A network's outputs for consecutive groups of inputs; BatchNorm sees each group on its own."""
+    if isinstance(values, patches.Batch):
+        return patches.forward(network, values, counted)
     for layer in network:
         if norms := _norms(layer):
-            groups = zip(seen.split(list(sizes)), counted or [True] * len(sizes), strict=True)
-            made = [layer(group) if counts else _uncounted(layer, norms, group) for group, counts in groups]
-        seen = torch.cat(made) if norms else layer(seen)
-    return seen
+            groups = zip(values.split(list(sizes)), counted or [True] * len(sizes), strict=True)
+            normed = [layer(group) if counts else _uncounted(layer, norms, group) for group, counts in groups]
+        values = torch.cat(normed) if norms else layer(values)
+    return values
 
 
 def _norms(layer: nn.Module) -> list[_BatchNorm]:
-    """The BatchNorms in a layer, or it, that are in training mode."""
+    """The BatchNorms of a layer, itself included, that are in training mode."""
     return [part for part in layer.modules() if isinstance(part, _BatchNorm) and part.training]
 
 
 def _uncounted(layer: nn.Module, norms: Sequence[_BatchNorm], inputs: Tensor) -> Tensor:
-    """What a layer makes of inputs by their own statistics, the running ones left alone."""
+    """A layer's outputs by the inputs' own statistics, without updating the running ones."""
     tracked = [norm.track_running_stats for norm in norms]
     for norm in norms:
         norm.track_running_stats = False
-    made: Tensor = layer(inputs)
+    outputs: Tensor = layer(inputs)
     for norm, tracks in zip(norms, tracked, strict=True):
         norm.track_running_stats = tracks
-    return made
+    return outputs
 
 
 def _up_to_last_norm(network: nn.Sequential) -> nn.Sequential:

@@ -1,18 +1,18 @@
-"""What training states are changed by at random: shades, and what is around the agent (beyond the paper)."""
+"""Random changes of training states: their shades, and the agent's surroundings (beyond the paper)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Of augment=grey-context: how many states are changed, how many of those get a pattern, and the pixels that stay up,
-# down, left and right of the agent.
+# augment=grey-context: the share of states that change, the share of those that get a pattern, and the pixels kept
+# above, below, left and right of the agent.
 CONTEXT_SHARE, PATTERN_SHARE, BRIGHTEST = 0.7, 0.8, 200
 NEAREST, FARTHEST = (4, 7, 4, 4), (14, 14, 15, 15)
-GREY_KNOTS = 8  # random steps of which a map of shades is made, straight in between
-GREY_DARKEST, GREY_BRIGHTEST = (0.0, 0.2), (0.7, 1.0)  # where black and white come to lie
+GREY_KNOTS = 8  # segments of a piecewise linear map of shades
+GREY_DARKEST, GREY_BRIGHTEST = (0.0, 0.2), (0.7, 1.0)  # ranges of the new black and white
 
 
 def grey_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Random rising maps of the shades 0..255 to 0..1, float32 (count, 256)."""
+    """Random increasing maps of the shades 0..255 to 0..1, float32 (count, 256)."""
     rises = rng.random((count, GREY_KNOTS)) ** 2 + 0.02  # squared: steep in places, nearly level in others
     risen = np.concatenate([np.zeros((count, 1)), rises.cumsum(1)], axis=1) / rises.sum(1, keepdims=True)
     darkest, brightest = rng.uniform(*GREY_DARKEST, (count, 1)), rng.uniform(*GREY_BRIGHTEST, (count, 1))
@@ -24,11 +24,10 @@ def grey_maps(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def other_context(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Images uint8 (B, H, W, C), most of which have other surroundings: a pattern, or one shade, alike in all frames.
+    """Images uint8 (B, H, W, C), most with other surroundings: a pattern, or one shade, the same in all frames.
 
-    What stays is a box around the middle, where the agent is, with its feet and the floor under them. All of the
-    outside changes, or its left, right or lower half. So a member cannot rest on what lies beside a sub-goal in the
-    labelled rooms.
+    A box around the agent in the middle stays, with its feet and the floor under them. All of the outside changes, or
+    its left, right or lower half. So a member cannot rely on the surroundings of a sub-goal in the labelled rooms.
     """
     images = images.copy()
     height, width = images.shape[1:3]
@@ -45,7 +44,7 @@ def other_context(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArra
 
 
 def pattern(height: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """A pattern (height, width, 1) in 0..255, of two shades or of many: pixels repeated like bricks, or blocks."""
+    """A pattern (height, width, 1) in 0..255 of two or more shades: repeated bricks, or blocks."""
     dark, bright = np.sort(rng.uniform(0, 255, size=2))
     bricks = rng.random() < 0.6
     cell = np.array((1, 1)) if bricks else rng.integers(1, (5, 8))

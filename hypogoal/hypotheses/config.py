@@ -1,4 +1,4 @@
-"""The settings of ensemble training, without PyTorch, so that ``hypogoal config`` answers at once."""
+"""The settings of ensemble training, without PyTorch, so that ``hypogoal config`` starts fast."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ BEYOND = "own: beyond the paper"
 
 @dataclass(frozen=True)
 class EnsembleConfig:
-    """What the members are, and how they learn. Spec C6: the defaults are DoorKey's values (Table 3)."""
+    """The members and their training. Spec C6: the defaults are DoorKey's values (Table 3)."""
 
     members: int = setting(3, "hypotheses per sub-goal (K); 1 is a single CNN", source="Table 3", low=1, high=64)
     diversity: str = setting(
@@ -20,7 +20,7 @@ class EnsembleConfig:
     diversity_weight: float = setting(1e-4, "weight of the diversity loss (alpha)", source="Table 3, Eq. (1)", low=0.0)
     schedule: str = setting(
         "simultaneous",
-        "all members at once (the double sum of Eq. (1)), or one after the other, each against those before it",
+        "all members at once (the double sum of Eq. (1)), or one after the other, each against the earlier ones",
         source="Eq. (1); sequential: D-BAT (arXiv:2202.04414)",
         choices=("simultaneous", "sequential"),
     )
@@ -32,7 +32,7 @@ class EnsembleConfig:
     )
     encoder: str = setting(
         "separate",
-        "network up to the last layer: separate, each member's own; shared, one that learns; frozen, one that does not",
+        "network up to the last layer: separate for each member; shared and trained; frozen, shared and untrained",
         source="the paper; shared: DivDis (arXiv:2202.03418)",
         choices=("separate", "shared", "frozen"),
     )
@@ -41,7 +41,7 @@ class EnsembleConfig:
         150,
         "gradient steps (for each member if sequential)",
         unit="batches",
-        source="own choice, the paper says none: docs/results/hypotheses-doorkey.md",
+        source="own choice, the paper has none: docs/results/hypotheses-doorkey.md",
         low=1,
         high=10_000_000,
     )
@@ -59,14 +59,14 @@ class EnsembleConfig:
     class_weight_positive: float = setting(0.5, "weight of positives in the cross entropy", source="Table 3", low=1e-6)
     class_balance: str = setting(
         "batch",
-        "batch: half of each labelled batch is positive, so that the class weights apply to what a member "
-        "sees; none: labelled states are drawn as they come",
-        source="own choice: with 8 positives of 1640, weights of 0.5 and 0.5 alone balance nothing",
+        "batch: half of each labelled batch is positive, so that the class weights apply; none: labelled states are "
+        "drawn as they come",
+        source="own choice: with none, go-to-goal (8 positives of 1,640) falls to .63 (DEV-13)",
         choices=("batch", "none"),
     )
     unlabelled_bn: bool = setting(
         True,
-        "unlabelled batches count in BatchNorm's running statistics too, so that these cover more than one layout",
+        "BatchNorm's running statistics include unlabelled batches, so that they cover more than one layout",
         source="the authors' code",
     )
     view: str = setting(
@@ -79,20 +79,20 @@ class EnsembleConfig:
     crop_width: int = setting(32, "width of the window of view=agent-crop", unit="pixels", source=BEYOND, low=1)
     localiser: str = setting(
         "learned",
-        "where the agent is (view=agent-crop): learned, from the observation; ram, from the game's memory (an oracle)",
+        "finds the agent (view=agent-crop): learned, from the observation; ram, from the game's memory (an oracle)",
         source=BEYOND,
         choices=("learned", "ram"),
     )
     augment: str = setting(
         "none",
-        "what is done to each state of a training batch: none; grey, a random increasing function maps its shades; "
-        "grey-context, before that the agent's surroundings are often replaced (view=agent-crop)",
+        "random changes of each state of a training batch: none; grey, an increasing function maps its shades; "
+        "grey-context, in addition the agent's surroundings are often replaced (view=agent-crop)",
         source=BEYOND,
         choices=("none", "grey", "grey-context"),
     )
     jitter: int = setting(
         0,
-        "each window of a training batch is moved at random by up to this much (view=agent-crop)",
+        "the most by which each window of a training batch is moved at random (view=agent-crop)",
         unit="pixels",
         source=BEYOND,
         low=0,
@@ -100,14 +100,14 @@ class EnsembleConfig:
     )
     batch_kind: str = setting(
         "plain",
-        "labelled batches: plain, as class_balance says; per-ladder, 3/8 positives, equally many from each ladder",
+        "labelled batches: plain, by class_balance; per-ladder, 3/8 positives, equally many from each ladder",
         source=BEYOND,
         choices=("plain", "per-ladder"),
     )
     threshold: str = setting(
         "0.5",
-        "a member says yes above 0.5; to 5 % of the unlabelled states; above the cut that best splits the unlabelled "
-        "states in two; or to half of its labelled positives",
+        "a prediction is positive above 0.5; for 5 % of the unlabelled states; above the cut that best splits the "
+        "unlabelled states in two; or for half of the labelled positives",
         source=f"{BEYOND}; unlabelled-split: Otsu 1979",
         choices=("0.5", "unlabelled-q95", "unlabelled-split", "positives-median"),
     )
@@ -115,11 +115,11 @@ class EnsembleConfig:
 
 @dataclass(frozen=True)
 class TrainEnsembleConfig(EnsembleConfig):
-    """Which sub-goals to train an ensemble for."""
+    """The settings of ``train-ensemble``: ensembles of some sub-goals."""
 
     sub_goals: tuple[str, ...] = setting((), "sub-goals to train, comma-separated; empty for all")
-    # Scores at many lengths cost about a fifth of one training (one cell); training anew for each of thirteen lengths
-    # would cost four trainings.
+    # Scores after many training lengths cost about a fifth of one training; one training per length, thirteen of them,
+    # would cost four.
     score_every: int = setting(
         0,
         "gradient steps between scores of the members on held-out states, in scores.jsonl; 0 for none",

@@ -1,11 +1,11 @@
 """What a member looks at in a state: DeepLift attributions, and a check that they are complete (Spec F2, Figures 2, 9).
 
 Members with layers for which DeepLift has no valid rules are explained by integrated gradients (Sundararajan et al.
-2017): means over ``STEPS`` states on the way from the baseline, complete up to what so few steps miss.
+2017): means over ``STEPS`` states between the baseline and the state, complete up to the error of so few steps.
 
-We attribute the log-odds of "reached", the difference of a member's two logits. Its sign is the verdict at a threshold
-of 0.5, so positive attributions speak for "reached" whatever the member says. A state's attributions, summed over
-pixels and frames, must equal its log-odds minus the baseline's; the error is reported.
+Attributed are the log-odds, the difference of a member's two logits. Their sign is the prediction at a threshold of
+0.5, so positive attributions speak for a positive prediction. A state's attributions, summed over pixels and frames,
+must equal its log-odds minus the baseline's; the error is reported.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hypogoal.hypotheses.networks import as_input, at_once
 
 DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
 STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together
-INSIDE = 64  # times as much as a plain pass DeepLift takes: both states, in double, and copies of what is pooled
+INSIDE = 64  # DeepLift's memory relative to a plain pass: both states, in double, with copies of pooled pixels
 RULED = (nn.Conv2d, nn.Linear, nn.BatchNorm2d, nn.ReLU, nn.AvgPool2d, nn.AdaptiveAvgPool2d, nn.Flatten, nn.Dropout)
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 class Attributions:
     """Attributions of every member on n states."""
 
-    values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), in log-odds; for "reached" where positive
-    log_odds: NDArray[np.float64]  # (n, K), each member's of each state
-    baseline_log_odds: NDArray[np.float64]  # (K,), of the baseline
+    values: NDArray[np.float64]  # (n, K, H, W, C), or (n, K, *shape), in log-odds
+    log_odds: NDArray[np.float64]  # (n, K)
+    baseline_log_odds: NDArray[np.float64]  # (K,)
     method: str = DEEP_LIFT
 
     def completeness_error(self) -> NDArray[np.float64]:
@@ -52,23 +52,22 @@ class Attributions:
 
 
 def mean_state(observations: Observations) -> Observations:
-    """The baseline: the mean of what is seen of observations, (N, ...) -> (...), of pictures rounded, uint8 (H, W, C).
+    """The baseline: the mean of viewed observations, (N, ...) -> (...); of pictures rounded, uint8 (H, W, C).
 
-    A black image would be a baseline that is a state of no domain: what all states share (walls, the floor) would get
-    most of the attribution, and what is black in a state (a pit, an open door) none. Against the mean state, what is
-    usual gets none, and what makes the state differ from the usual gets all.
+    Against a black image, which is a state of no domain, the things that all states share (walls, the floor) would get
+    most of the attribution, and black things (a pit, an open door) none. Against the mean state, only differences from
+    the usual get any.
     """
     mean = observations.mean(axis=0, dtype=np.float64)
     return (mean.round() if observations.dtype == PICTURE else mean).astype(observations.dtype)
 
 
 def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -> list[dict[str, Any]]:
-    """Spec F2: the check, state by state and member by member, of n states ``picked`` as (index, kind)."""
+    """Spec F2: the check by state and member, for n states ``picked`` as (index, kind)."""
     errors, sums = attributions.completeness_error(), attributions.sums()
     frames = np.abs(attributions.values).reshape(*sums.shape, -1, attributions.values.shape[-1]).sum(2)
-    everywhere = frames.sum(-1)
-    share = np.divide(frames[..., -1], everywhere, out=np.full_like(sums, np.nan), where=everywhere > 0)
-    every = range(attributions.values.shape[1])
+    total = frames.sum(-1)
+    share = np.divide(frames[..., -1], total, out=np.full_like(sums, np.nan), where=total > 0)
     columns = {
         "log_odds": attributions.log_odds,
         "baseline_log_odds": np.broadcast_to(attributions.baseline_log_odds, sums.shape),
@@ -77,7 +76,10 @@ def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -
         "last_frame": share,
     }
     members = [
-        [{"member": member, **{name: float(of[state, member]) for name, of in columns.items()}} for member in every]
+        [
+            {"member": member, **{name: float(values[state, member]) for name, values in columns.items()}}
+            for member in range(sums.shape[1])
+        ]
         for state in range(len(picked))
     ]
     method = attributions.method
@@ -85,48 +87,48 @@ def explanation(attributions: Attributions, picked: Sequence[tuple[int, str]]) -
 
 
 def method_of(member: nn.Module) -> str:
-    """How it is explained: by DeepLift where it is a chain of layers that its rules hold for, each used once."""
+    """How a member is explained: by DeepLift if it is a chain of layers with valid rules, each used once."""
     layers, example = list(member.children()), torch.zeros(1, 1, 1, 1)
     ruled = all(type(layer) in RULED or _window_of(layer, example) is not None for layer in layers)
     return DEEP_LIFT if ruled and len(layers) == len(member._modules) else INTEGRATED
 
 
 def attributed(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
-    """Spec F2: what every member goes by, by the method that is right for it; of what :func:`deep_lift` is given."""
+    """Spec F2: every member's attributions, by the method valid for it; arguments as for :func:`deep_lift`."""
     if method_of(ensemble.members[0]) == DEEP_LIFT:
         return deep_lift(ensemble, observations, baseline)
     from captum.attr import IntegratedGradients
 
     inputs, reference = as_input(torch.from_numpy(observations)), as_input(torch.from_numpy(baseline[None]))
-    found = []
+    parts = []
     for member in ensemble.members:
         network = nn.Sequential(member, _LogOdds(), nn.Flatten(0))
         size = at_once(AT_ONCE, inputs.shape[1:])
         values = IntegratedGradients(network).attribute(inputs, reference, n_steps=STEPS, internal_batch_size=size)
         with torch.no_grad():
-            found.append((_as_seen(values), network(inputs), network(reference)))
-    values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*found, strict=True))
+            parts.append((_as_observations(values), network(inputs), network(reference)))
+    values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*parts, strict=True))
     return Attributions(values, log_odds, baselines[0], INTEGRATED)
 
 
 def deep_lift(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
-    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) of every member, a plain ``nn.Sequential`` of modules
-    used once, on what members see of a few states (n, ...), compared with a baseline (...).
+    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) for every member, an ``nn.Sequential`` of modules used
+    once, on the members' view of a few states (n, ...), compared with a baseline (...).
     """
     inputs = as_input(torch.from_numpy(observations)).double().requires_grad_()
     reference = as_input(torch.from_numpy(baseline[None])).double()
-    found = [_of_member(member, inputs, reference) for member in ensemble.members]
-    values, log_odds, baselines = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
+    parts = [_of_member(member, inputs, reference) for member in ensemble.members]
+    values, log_odds, baselines = (np.stack(part, axis=-1) for part in zip(*parts, strict=True))
     return Attributions(np.moveaxis(values, -1, 1), log_odds, baselines[0])
 
 
 def _of_member(
     member: nn.Module, inputs: Tensor, reference: Tensor
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Attributions (n, ...), log-odds (n,) and the baseline's (1,); in double, where rounding is no matter."""
+    """Attributions (n, ...), log-odds (n,) and the baseline's (1,); in double, where rounding does not matter."""
     network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="IProgress not found")  # tqdm's, of a bar that nobody draws
+        warnings.filterwarnings("ignore", message="IProgress not found")  # from tqdm, about a bar that is never drawn
         from captum.attr import DeepLift
 
         warnings.filterwarnings("ignore", message=r"\s*Setting forward, backward hooks", category=UserWarning)
@@ -135,20 +137,20 @@ def _of_member(
         values = torch.cat([DeepLift(network).attribute(part, reference, target=0) for part in parts])
     with torch.no_grad():
         log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
-    return _as_seen(values.detach()).numpy(), log_odds.numpy(), baseline.numpy()
+    return _as_observations(values.detach()).numpy(), log_odds.numpy(), baseline.numpy()
 
 
-def _as_seen(values: Tensor) -> Tensor:
-    """In the order of observations what is in that of :func:`as_input`."""
+def _as_observations(values: Tensor) -> Tensor:
+    """Reorder axes from those of :func:`as_input` to those of observations."""
     return values.permute(0, 2, 3, 1) if values.ndim == 4 else values
 
 
 def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
-    """The log-odds (n, 1) of a member on (n, C, H, W), as a chain of modules that Captum's rules are right for.
+    """A member's log-odds (n, 1) on (n, C, H, W), as a chain of modules for which Captum's rules are valid.
 
-    Its rule for max pooling gives a pixel to the last of the windows that it is the maximum of, and loses what it gave
-    to the others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum
-    is taken over windows that do not overlap. ``example`` is an input, for the shapes inside.
+    Its rule for max pooling credits a pixel for the last window that it is the maximum of, and loses its credit for the
+    others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum is
+    taken over separate windows. ``example`` is an input, from which shapes follow.
     """
     layers: list[nn.Module] = []
     values = example
@@ -167,7 +169,7 @@ def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
 
 
 def _window_of(layer: nn.Module, values: Tensor) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Sides and strides of a pooling whose windows can be taken apart; None for any other module."""
+    """The sides and strides of a pooling whose windows can be separated; None for any other module."""
     height, width = values.shape[-2:] if values.ndim == 4 else (0, 0)
     if isinstance(layer, nn.AdaptiveMaxPool2d) and layer.output_size in (1, (1, 1)):
         return (height, width), (1, 1)
@@ -188,7 +190,7 @@ class _Windows(nn.Module):
         self.side, self.stride = side, stride
 
     def forward(self, values: Tensor) -> Tensor:
-        """Copies of the pixels, window by window."""
+        """Copy the pixels, window by window."""
         windows = values.unfold(2, self.side[0], self.stride[0]).unfold(3, self.side[1], self.stride[1])
         return windows.reshape(len(values), -1, self.side[0] * self.side[1])
 
@@ -197,5 +199,5 @@ class _LogOdds(nn.Module):
     """Logits (n, 2) -> log-odds (n, 1)."""
 
     def forward(self, logits: Tensor) -> Tensor:
-        """Their difference."""
+        """The difference of the logits."""
         return logits[:, 1:] - logits[:, :1]

@@ -1,4 +1,4 @@
-"""An ensemble of K members: each is one hypothesis about which features make a sub-goal. And its file."""
+"""An ensemble of K members, each a hypothesis about the features that make a sub-goal, and its file."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, RamLocaliser
 from hypogoal.hypotheses.networks import (
     NETWORKS,
-    another,
     as_input,
     at_once,
     build_network,
     folded,
     network_for,
+    redrawn,
     reordered,
 )
 from hypogoal.hypotheses.views import AgentView, FullView
 
-THRESHOLD = 0.5  # of the probability, where none was chosen
-CHUNK = 64  # images at once in a plain forward pass: what fits a CPU's cache; on a GPU 16 times as many
-PATCH_CHUNK = 4096  # images at once where few patches are distinct
-FOLD_FROM = 32  # images from which making BatchNorm part of the convolutions pays
+THRESHOLD = 0.5  # of the probability, unless another is set
+IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many
+PATCH_CHUNK = 4096  # images with few distinct patches
+FOLD_FROM = 32  # images from which folding BatchNorm into the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
 NO_OBSERVATIONS = "these observations do not fit the ensemble"
 
@@ -47,18 +47,18 @@ class Ensemble(nn.Module):
         observation_shape: of one observation, (H, W, C) for pictures.
         members: K, at least 1.
         generator: draws the initial weights.
-        view: what members see of an observation; None: all of a picture.
+        view: what members see of an observation; None: a whole picture.
         encoder: as in ``TrainEnsembleConfig``.
-        hidden_width: likewise.
+        hidden_width: as in ``TrainEnsembleConfig``.
 
     Attributes:
-        members: K ``nn.Sequential``, from what ``networks.as_input`` makes of the view (for pictures float
-            (N, C, h, w) in 0..1) to logits (N, 2).
-        trunk: the encoder that members share, from the same input to (N, F); None where each has its own.
+        members: K ``nn.Sequential``, from ``networks.as_input`` of the view (for pictures float (N, C, h, w) in 0..1)
+            to logits (N, 2).
+        trunk: the encoder that members share, from the same input to (N, F); None if each has its own.
         frozen: whether the trunk is frozen, and so always in evaluation mode.
-        parts: the trunk, run once, and the K networks behind it; ``networks`` where there is no trunk.
-        networks: the members in the order of layers that is fastest; weights and BatchNorm statistics are shared.
-        thresholds: float32 (K,), the probabilities above which members say yes.
+        parts: the trunk, run once, and the K networks behind it, which are ``networks`` without a trunk.
+        networks: the members with their layers in the fastest order; weights and BatchNorm statistics are shared.
+        thresholds: float32 (K,), the probabilities above which members' predictions are positive.
 
     Raises:
         UserError: unknown network, or images too small for it.
@@ -88,11 +88,11 @@ class Ensemble(nn.Module):
         if encoder == "separate":
             self.members: nn.ModuleList | tuple[nn.Sequential, ...] = nn.ModuleList(networks)
         else:
-            layers, own = list(networks[0]), 3 if hidden_width else 1
-            self.trunk = nn.Sequential(*layers[:-own])
-            heads = [nn.Sequential(*layers[-own:])]
-            heads += (another(heads[0], generator) for _ in range(members - 1))
-            networks = [nn.Sequential(*layers[:-own], *head) for head in heads]
+            layers, head_layers = list(networks[0]), 3 if hidden_width else 1
+            self.trunk = nn.Sequential(*layers[:-head_layers])
+            heads = [nn.Sequential(*layers[-head_layers:])]
+            heads += (redrawn(heads[0], generator) for _ in range(members - 1))
+            networks = [nn.Sequential(*layers[:-head_layers], *head) for head in heads]
             self.heads, self.members = nn.ModuleList(heads), tuple(networks)
             if self.frozen:
                 self.trunk.requires_grad_(False)
@@ -102,15 +102,15 @@ class Ensemble(nn.Module):
         self.train()
 
     def __repr__(self) -> str:
-        seen = f"observations {self.view.dtype} {self.observation_shape}"
-        return f"Ensemble({len(self)} members, network {self.network!r}, {seen})"
+        observations = f"observations {self.view.dtype} {self.observation_shape}"
+        return f"Ensemble({len(self)} members, network {self.network!r}, {observations})"
 
     def __len__(self) -> int:
         """K, the number of members."""
         return len(self.members)
 
     def train(self, mode: bool = True) -> Self:
-        """Training or evaluation mode; of a frozen trunk always the latter."""
+        """Set training or evaluation mode; a frozen trunk stays in evaluation mode."""
         super().train(mode)
         if self.trunk is not None and self.frozen:
             self.trunk.eval()
@@ -118,21 +118,21 @@ class Ensemble(nn.Module):
 
     @property
     def needs_positions(self) -> bool:
-        """Whether predictions need the agent's positions (localiser=ram): an oracle, wherever it is shown."""
+        """Whether predictions need the agent's positions (localiser=ram), which makes them an oracle."""
         return self.view.needs_positions
 
     def thresholds_as_log_odds(self) -> NDArray[np.float32]:
-        """The thresholds (K,) of :meth:`log_odds`, with the same verdicts up to rounding."""
-        chance = self.thresholds.cpu().numpy().astype(np.float64)
-        log_odds: NDArray[np.float32] = (np.log(chance) - np.log1p(-chance)).astype(np.float32)
+        """The thresholds (K,) as log-odds, with the same predictions up to rounding."""
+        probabilities = self.thresholds.cpu().numpy().astype(np.float64)
+        log_odds: NDArray[np.float32] = (np.log(probabilities) - np.log1p(-probabilities)).astype(np.float32)
         return log_odds
 
     def set_thresholds(self, thresholds: NDArray[np.float32]) -> None:
-        """The probabilities (K,) above which the members' verdicts are yes."""
+        """Set the probabilities (K,) above which predictions are positive."""
         self.thresholds.copy_(torch.from_numpy(thresholds))
 
     def see(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> Any:
-        """What the members see of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
+        """The members' view of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
 
         For observations other than pictures: float32 (N, *shape), standardised.
         """
@@ -143,32 +143,32 @@ class Ensemble(nn.Module):
         if self.view.dtype == NUMBERS and observations.dtype == np.float64:
             observations = observations.astype(NUMBERS)
         if observations.dtype != self.view.dtype or observations.shape[1:] != self.observation_shape:
-            given = f"{observations.dtype} {observations.shape}"
-            wanted = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
-            raise UserError(NO_OBSERVATIONS, given, f"Give {wanted}.")
+            kind = f"{observations.dtype} {observations.shape}"
+            expected = f"{self.view.dtype} (N, {', '.join(map(str, self.observation_shape))})"
+            raise UserError(NO_OBSERVATIONS, kind, f"Give {expected}.")
         if self.needs_positions and (positions is None or positions.shape != (len(observations), 3)):
-            given = "none" if positions is None else f"{positions.dtype} {positions.shape}"
+            kind = "none" if positions is None else f"{positions.dtype} {positions.shape}"
             do = "Give int64 (N, 3) of room, x, y, or train with localiser=learned."
-            raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", given, do)
-        return np.ascontiguousarray(self.view.see(observations, positions))  # flipped pictures are no tensors
+            raise UserError("this ensemble was trained with localiser=ram: it needs the agent's positions", kind, do)
+        return np.ascontiguousarray(self.view.see(observations, positions))  # torch takes no flipped arrays
 
     def verdicts(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
-        """Whether each member says that the sub-goal is reached: bool (N, K); see :meth:`predict`.
+        """Every member's prediction, whether the sub-goal holds: bool (N, K); see :meth:`predict`.
 
-        Within rounding of its threshold, some 1e-6, a member's verdict may depend on the states judged with it.
+        Within rounding of its threshold, some 1e-6, a prediction may depend on the other states of the call.
         """
-        says_yes: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
-        return says_yes
+        positive: NDArray[np.bool_] = self.predict(observations, positions) > self.thresholds.cpu().numpy()
+        return positive
 
     def predict(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
-        """Every member's probability that the sub-goal is reached.
+        """Every member's probability that the sub-goal holds.
 
         Args:
             observations: uint8 (N, H, W, C), or float32 of any shape, as in training; or a list of N.
-            positions: int64 (N, 3) of room, x, y; only where ``needs_positions``.
+            positions: int64 (N, 3) of room, x, y; only if ``needs_positions``.
 
         Returns:
-            float32 (N, K). Up to rounding a state's row does not depend on the others.
+            float32 (N, K). Up to rounding, a state's row does not depend on the others.
 
         Raises:
             UserError: observations of another shape or type, or missing positions.
@@ -178,23 +178,23 @@ class Ensemble(nn.Module):
         return probabilities
 
     def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
-        """How much each member's logit of yes is above that of no: float32 (N, K); see :meth:`predict`."""
+        """Every member's log-odds that the sub-goal holds: float32 (N, K); see :meth:`predict`."""
         both = self.logits(observations, positions)
         gaps: NDArray[np.float32] = both[..., 1] - both[..., 0]
         return gaps
 
     def logits(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
-        """Every member's logits of no and of yes: float32 (N, K, 2); see :meth:`predict`."""
+        """Every member's logits of negative and positive: float32 (N, K, 2); see :meth:`predict`."""
         observations = self.see(observations, positions)
         was_training = self.training
         if was_training:
             self.eval()
         logits = np.empty((len(observations), len(self), 2), dtype=np.float32)
-        chunk = PATCH_CHUNK if self.thresholds.device.type == "cpu" else CHUNK * 16
+        chunk = PATCH_CHUNK if self.thresholds.device.type == "cpu" else IMAGES_AT_ONCE * 16
         with torch.inference_mode():
             for start in range(0, len(observations), chunk):
-                some = observations[start : start + chunk]
-                logits[start : start + chunk] = self._logits(some).transpose(0, 1).cpu().numpy()
+                part = self._logits(observations[start : start + chunk])
+                logits[start : start + chunk] = part.transpose(0, 1).cpu().numpy()
         if was_training:
             self.train()
         return logits
@@ -203,19 +203,19 @@ class Ensemble(nn.Module):
         """Spec F2, Figure 2: what each member looks at in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
 
         The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
-        (N, K, *what members see; (H, W, C) for pictures) in log-odds, positive for "reached": a state's sum is its
-        log-odds minus the baseline's. ``UserError`` as for :meth:`predict`, or where there are no states.
+        (N, K, *the shape of the view; (H, W, C) for pictures) in log-odds: a state's sum is its log-odds minus the
+        baseline's. ``UserError`` as for :meth:`predict`, or without states.
         """
         from hypogoal.hypotheses.deep_lift import AT_ONCE, attributed, mean_state
 
         if not (len(observations) and len(against)):
             raise UserError("attributions need states, and others to compare with", None, "Give one or more of each.")
-        seen, baseline, still = self.see(observations), mean_state(self.see(against)), copy.deepcopy(self).cpu().eval()
+        seen, baseline, fixed = self.see(observations), mean_state(self.see(against)), copy.deepcopy(self).cpu().eval()
         parts = (seen[start : start + AT_ONCE] for start in range(0, len(seen), AT_ONCE))
-        return np.concatenate([attributed(still, part, baseline).values.astype(np.float32) for part in parts])
+        return np.concatenate([attributed(fixed, part, baseline).values.astype(np.float32) for part in parts])
 
     def _logits(self, observations: Observations) -> Tensor:
-        """(K, N, 2), each image's distinct patches computed once where that pays."""
+        """Logits (K, N, 2); computes each distinct patch once if that pays."""
         trunk, heads = self.parts
         device = self.thresholds.device
         if device.type == "cpu" and len(observations) >= PATCHES_FROM:
@@ -225,7 +225,7 @@ class Ensemble(nn.Module):
                 return _logits(trunk, heads, batch)
         if len(observations) >= FOLD_FROM:
             trunk, heads = trunk and folded(trunk), tuple(folded(head) for head in heads)
-        chunk = at_once(CHUNK, observations.shape[1:]) if device.type == "cpu" else len(observations)
+        chunk = at_once(IMAGES_AT_ONCE, observations.shape[1:]) if device.type == "cpu" else len(observations)
         logits = []
         for start in range(0, len(observations), chunk):
             inputs = as_input(torch.from_numpy(observations[start : start + chunk]).to(device))
@@ -233,7 +233,7 @@ class Ensemble(nn.Module):
         return torch.cat(logits, dim=1)
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and BatchNorm statistics by name: contiguous CPU tensors, ready for safetensors."""
+        """Weights and BatchNorm statistics by name, as contiguous CPU tensors for safetensors."""
         return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in self.state_dict().items()}
 
     @classmethod
@@ -246,15 +246,15 @@ class Ensemble(nn.Module):
         view: FullView | AgentView | None = None,
         **settings: Any,
     ) -> Ensemble:
-        """The ensemble that ``state()`` was taken from, in evaluation mode; a ``UserError`` where it is no such state.
+        """The ensemble with this ``state()``, in evaluation mode; a ``UserError`` if it does not fit.
 
-        A state without thresholds is of an ensemble from before there were any: 0.5.
+        A state without thresholds, from an early version, gets 0.5.
         """
         where = f"network {network!r}, {members} members, observation shape {tuple(observation_shape)}"
         numbers = {name.split(".")[1] for name in state if name.startswith(("members.", "heads."))}
         if len(numbers) != members:
-            what = f"the weights do not fit the ensemble (of {len(numbers)} members)"
-            raise UserError(what, where, "Train it again.")
+            fault = f"the weights do not fit the ensemble (of {len(numbers)} members)"
+            raise UserError(fault, where, "Train it again.")
         state = {"thresholds": torch.full((members,), THRESHOLD), **state}
 
         def make() -> Ensemble:
@@ -264,23 +264,23 @@ class Ensemble(nn.Module):
 
 
 def _logits(trunk: nn.Sequential | None, heads: tuple[nn.Sequential, ...], images: Tensor | patches.Batch) -> Tensor:
-    """(K, N, 2) of images or their patches: what each head makes of them, or of what the trunk makes of them once."""
-    made = [
+    """Logits (K, N, 2) of images or their patches: each head's, behind the trunk, if any, which runs once."""
+    outputs = [
         patches.forward(network, images) if isinstance(images, patches.Batch) else network(images)
         for network in (heads if trunk is None else [trunk])
     ]
-    return torch.stack(made if trunk is None else [head(made[0]) for head in heads])
+    return torch.stack(outputs if trunk is None else [head(outputs[0]) for head in heads])
 
 
 def write_ensemble(folder: Path, sub_goal: str, ensemble: Ensemble) -> None:
-    """``<sub-goal>.safetensors`` into ``folder``."""
+    """Write ``<sub-goal>.safetensors`` to ``folder``."""
     save_tensors(folder / f"{sub_goal}.safetensors", ensemble.state())
 
 
 def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ensemble:
-    """The ensemble of one sub-goal, from an ensemble artefact's folder and its manifest's configuration.
+    """One sub-goal's ensemble, from an ensemble artefact's folder and its manifest's configuration.
 
-    A sub-goal that it does not have, or weights that are missing or damaged, are a ``UserError``.
+    An unknown sub-goal, or missing or damaged weights, are a ``UserError``.
     """
     if sub_goal not in config["sub_goals"]:
         raise UserError("unknown sub-goal", sub_goal, f"{folder} has {', '.join(config['sub_goals'])}.")
@@ -300,10 +300,10 @@ def read_ensemble(folder: Path, config: Mapping[str, Any], sub_goal: str) -> Ens
 def _view(
     observation_shape: tuple[int, ...], config: Mapping[str, Any], state: Mapping[str, Tensor]
 ) -> FullView | AgentView:
-    """The view that the settings say, its weights not yet loaded; ensembles from before there were any see all."""
+    """The view that the settings ask for, without its weights; early ensembles have no such settings and see all."""
     if config.get("observation_dtype") == str(NUMBERS):
         mean, deviation = (state[f"view.{name}"].numpy() for name in ("mean", "deviation"))
-        if mean.shape != observation_shape:  # a manifest may ask for terabytes
+        if mean.shape != observation_shape:  # a damaged manifest may ask for terabytes
             raise ValueError(observation_shape)
         return FullView(observation_shape, (mean, deviation))
     if config.get("view", "full") == "full":

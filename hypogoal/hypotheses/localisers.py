@@ -1,4 +1,4 @@
-"""Where the agent is in an observation: from the game's memory (an oracle), or learned (beyond the paper)."""
+"""Finding the agent in an observation: from the game's memory (an oracle), or learned (beyond the paper)."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.hypotheses.changes import grey_maps, pattern
 from hypogoal.hypotheses.networks import folded
 
-CELL = 4  # pixels: the side of a heat-map's cell
+HEAT_CELL = 4  # pixels: the side of a heat-map's cell
 FEATURES = 32  # of a cell
-CHUNK = 64  # states at once where no gradient is kept
+LOCATED_AT_ONCE = 64  # states, when no gradient is kept
 STEPS, BATCH, LEARNING_RATE, L2_WEIGHT = 1500, 24, 2e-3, 1e-4
-HELD_SHARE = 0.35  # of the labelled states are shown as if nothing moved
+HELD_SHARE = 0.35  # of the labelled states are shown without motion
 FARTHEST_SHIFT = 20  # pixels
-# From the agent, rows and columns: where clutter begins; the agent is 8 x 4 pixels.
+# Rows and columns from the agent, 8 x 4 pixels, at which clutter begins.
 NEAREST, FARTHEST = (6, 4), (13, 11)
-PATTERNS, PATTERN_SHARE = 3, 0.7  # at most so many, in this share of the states
-BLOBS = 2  # at most
-GREY_SHARE = 0.5  # of the states get their shades changed
+PATTERNS, PATTERN_SHARE = 3, 0.7  # most patterns in a state, and the share of states with any
+BLOBS = 2  # most in a state
+GREY_SHARE = 0.5  # of the states get other shades
 
 
-Pixels = Callable[[NDArray[np.int64]], NDArray[np.float64]]  # positions (N, 3) -> row and column (N, 2)
+AgentPixels = Callable[[NDArray[np.int64]], NDArray[np.float64]]  # positions (N, 3) -> row and column (N, 2)
 
 
 class RamLocaliser(nn.Module):
     """The agent's pixel from its position in the game's memory, by the domain's ``agent_pixels``.
 
-    What is seen is not looked at: an oracle, to be called one wherever its results are shown.
+    It ignores the observation: an oracle, which must be named so wherever its results are shown.
     """
 
     needs_positions = True
 
-    def __init__(self, pixels: Pixels):
+    def __init__(self, pixels: AgentPixels):
         super().__init__()
         self.pixels = pixels
 
@@ -51,11 +51,10 @@ class RamLocaliser(nn.Module):
 
 
 class LearnedLocaliser(nn.Module):
-    """The agent's pixel from what is seen, (H, W, C) with the latest frame last: the peak of a heat-map.
+    """The agent's pixel from the observation, (H, W, C) with the latest frame last: the peak of a heat-map.
 
-    A fully convolutional network looks at the last frame, where the agent has its looks, and at the differences between
-    the frames, where all that moves stands out: (N, C, H, W) -> (N, 1, rows, columns), logits of cells of 4 x 4 pixels.
-    One to be loaded where None is given.
+    A fully convolutional network sees the last frame, for the agent's looks, and the differences between frames, for
+    its motion: (N, C, H, W) -> (N, 1, rows, columns), logits of cells of 4 x 4 pixels. None: a network to be loaded.
     """
 
     needs_positions = False
@@ -71,8 +70,8 @@ class LearnedLocaliser(nn.Module):
         places = np.empty((len(observations), 2))
         device = next(self.network.parameters()).device
         with torch.inference_mode():
-            for start in range(0, len(observations), CHUNK):
-                chunk = slice(start, start + CHUNK)
+            for start in range(0, len(observations), LOCATED_AT_ONCE):
+                chunk = slice(start, start + LOCATED_AT_ONCE)
                 images = torch.from_numpy(observations[chunk]).to(device, torch.float32)
                 places[chunk] = _peaks(self.network(_as_heat_input(images))[:, 0]).cpu().numpy()
         return places
@@ -90,35 +89,35 @@ def fit_localiser(
     *,
     steps: int = STEPS,
 ) -> LearnedLocaliser:
-    """A localiser from states (N, H, W, C) of which the agent's place is known, and others of which its actions are.
+    """A localiser, trained on states (N, H, W, C) with known agent positions and on others with known actions.
 
-    It has to find the agent in rooms that it never saw. So each labelled state is mirrored, shifted, filled with
-    made-up patterns and moving things around the agent, and its shades are changed: what stays is the agent, whose row
-    and column in the last frame are ``pixels`` (N, 2), and how it moves.
-    In unlabelled states (M, H, W, C), of which there may be none, the agent is what tells which ``actions`` (M, 2), 0
-    or more, led to the last frame and to the one before it: each cell of the heat-map guesses them, and the heat-map, a
-    distribution over cells, says which guess counts (inverse dynamics with attention). So it learns that enemies are
-    not the agent. On one CPU the same arguments give the same bytes.
+    It must find the agent in rooms that it never saw. So each labelled state is mirrored, shifted, filled with random
+    patterns and moving things around the agent, and its shades are changed. What stays is the agent and its motion;
+    its row and column in the last frame are ``pixels`` (N, 2).
+    In unlabelled states (M, H, W, C), if any, the agent reveals the ``actions`` (M, 2), 0 or more, that led to the last
+    frame and to the one before: each cell of the heat-map predicts them, and the heat-map, a distribution over cells,
+    weights the predictions (inverse dynamics with attention). So it learns that enemies are not the agent. On one CPU
+    the same arguments give the same bytes.
     """
     n_actions = int(actions.max(initial=0)) + 1
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_for(seed, "weights"))
         network = _heat_network(observations.shape[3])
-        guesses = nn.Conv2d(FEATURES, 2 * n_actions, kernel_size=1)
-    weights = [*network.parameters(), *guesses.parameters()]
+        action_layer = nn.Conv2d(FEATURES, 2 * n_actions, kernel_size=1)
+    weights = [*network.parameters(), *action_layer.parameters()]
     optimiser = torch.optim.Adam(weights, LEARNING_RATE, weight_decay=L2_WEIGHT)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, steps)
     rng = rng_for(seed, "states")
     for _ in range(steps):
         drawn = rng.integers(len(observations), size=BATCH)
         images, places = _changed(_held(observations[drawn], rng), pixels[drawn], rng)
-        others = rng.integers(max(len(unlabelled), 1), size=BATCH if len(unlabelled) else 0)
-        images = np.concatenate([images, _moved(unlabelled[others], rng)])
+        extra = rng.integers(max(len(unlabelled), 1), size=BATCH if len(unlabelled) else 0)
+        images = np.concatenate([images, _moved(unlabelled[extra], rng)])
         features = network[:-1](_as_heat_input(torch.from_numpy(images)))
         heat = network[-1](features)[:, 0]
         loss = _heat_loss(heat[:BATCH], places)
-        if len(others):
-            loss = loss + _action_loss(heat[BATCH:], guesses(features[BATCH:]), torch.from_numpy(actions[others]))
+        if len(extra):
+            loss = loss + _action_loss(heat[BATCH:], action_layer(features[BATCH:]), torch.from_numpy(actions[extra]))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -127,26 +126,26 @@ def fit_localiser(
 
 
 def _held(observations: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Some of the states uint8 (B, H, W, C) with their last frame in place of all: an agent that stands still."""
+    """Replace all frames of some states uint8 (B, H, W, C) by their last: an agent that stands still."""
     held = rng.random(len(observations)) < HELD_SHARE
     observations[held] = observations[held][..., -1:]
     return observations
 
 
 def _heat_loss(heat: Tensor, places: NDArray[np.float64]) -> Tensor:
-    """Cross entropy of heat-maps (B, rows, columns) as distributions over cells; agents out of sight do not count."""
-    cells = np.floor((places + 0.5) / CELL).astype(np.int64)
+    """Cross entropy of heat-maps (B, rows, columns) as distributions over cells; ignores agents out of sight."""
+    cells = np.floor((places + 0.5) / HEAT_CELL).astype(np.int64)
     seen = ((cells >= 0) & (cells < heat.shape[1:])).all(1)
     cell = torch.from_numpy((cells[:, 0] * heat.shape[2] + cells[:, 1])[seen])
     return functional.cross_entropy(heat.flatten(start_dim=1)[torch.from_numpy(seen)], cell)
 
 
-def _action_loss(heat: Tensor, guesses: Tensor, actions: Tensor) -> Tensor:
-    """-log of the probability of both actions (B, 2), cells guessing them (B, 2 * n_actions, rows, columns)."""
+def _action_loss(heat: Tensor, logits: Tensor, actions: Tensor) -> Tensor:
+    """-log of the probability of both actions (B, 2), by the cells' logits (B, 2 * n_actions, rows, columns)."""
     count = len(heat)
     shares = heat.flatten(start_dim=1).log_softmax(dim=1)
-    each = guesses.view(count, 2, -1, shares.shape[1]).log_softmax(dim=2)
-    both = each[torch.arange(count)[:, None], torch.arange(2), actions].sum(dim=1)
+    by_cell = logits.view(count, 2, -1, shares.shape[1]).log_softmax(dim=2)
+    both = by_cell[torch.arange(count)[:, None], torch.arange(2), actions].sum(dim=1)
     return -torch.logsumexp(shares + both, dim=1).mean()
 
 
@@ -180,13 +179,13 @@ def _peaks(heat: Tensor) -> Tensor:
     shares = around[torch.arange(count), cell[:, 0], cell[:, 1]].flatten(start_dim=1).softmax(dim=1).view(count, 3, 3)
     offsets = torch.tensor([-1.0, 0.0, 1.0], device=heat.device)
     refined = cell + torch.stack([shares.sum(dim=2) @ offsets, shares.sum(dim=1) @ offsets], dim=1)
-    return (refined + 0.5) * CELL - 0.5
+    return (refined + 0.5) * HEAT_CELL - 0.5
 
 
 def _changed(
     observations: NDArray[np.uint8], pixels: NDArray[np.float64], rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """States float32 (B, H, W, C) in 0..255 of which only the agent is as it was, and where it is now (B, 2)."""
+    """States float32 (B, H, W, C) in 0..255 with all but the agent changed, and the agent's new places (B, 2)."""
     images, places = observations.astype(np.float32), pixels.copy()
     height, width = images.shape[1:3]
     for image, place in zip(images, places, strict=True):
@@ -209,7 +208,7 @@ def _changed(
 
 
 def _moved(observations: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.float32]:
-    """States float32 (B, H, W, C) in 0..255, shifted and some of their shades changed."""
+    """States float32 (B, H, W, C) in 0..255, shifted, some with other shades."""
     images = observations.astype(np.float32)
     for image in images:
         _shift(image, rng)
@@ -223,7 +222,7 @@ def _change_shades(image: NDArray[np.float32], rng: np.random.Generator) -> None
 
 
 def _shift(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Move an image (H, W, C) over black; by how much down and to the right (2,)."""
+    """Shift an image (H, W, C) over black; returns the shift down and to the right (2,)."""
     shift = rng.integers(-FARTHEST_SHIFT, FARTHEST_SHIFT, size=2, endpoint=True)
     down, right = shift.tolist()
     height, width = image.shape[:2]
@@ -234,14 +233,14 @@ def _shift(image: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.i
 
 
 def _box(first: NDArray[np.floating | np.integer], last: NDArray[np.floating | np.integer]) -> tuple[slice, slice]:
-    """From the first row and column to before the last, as far as they are not negative."""
+    """The box from the first row and column up to the last, exclusive, without negative ones."""
     top, left = np.maximum(first, 0).astype(np.int64).tolist()
     bottom, right = np.maximum(last, 0).astype(np.int64).tolist()
     return slice(top, bottom), slice(left, right)
 
 
 def _add_blob(image: NDArray[np.float32], free: NDArray[np.bool_], rng: np.random.Generator) -> None:
-    """A spotted or striped thing that moves from frame to frame through an image (H, W, C), where that is free."""
+    """Draw a spotted or striped thing that moves through the frames of an image (H, W, C), where it is free."""
     height, width, frames = image.shape
     striped = rng.random() < 0.3
     size = rng.integers((8, 3), (20, 12)) if striped else rng.integers(3, 12, size=2)

@@ -1,13 +1,13 @@
 """Spec C5: member networks, chosen by name.
 
-Each is an ``nn.Sequential`` from float (N, C, H, W) in 0..1, or what else :func:`as_input` gives, to logits (N, 2),
-column 1 being "sub-goal reached". Ours are of plain modules used once: DeepLift is right only of such, and with each
-ReLU before its MaxPool; the same in an order that is faster to train is :func:`reordered`. An own one may begin with
-any module, an encoder.
+Each is an ``nn.Sequential`` from :func:`as_input`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2), with
+"positive" in column 1. Built-in networks consist of plain modules used once, each ReLU before its MaxPool: DeepLift is
+valid for no others. :func:`reordered` has an order that is faster to train. A user's network may begin with any module,
+an encoder.
 
-The paper says how many layers of which kind there are, not their sizes. The sizes are those of the authors'
-public code (github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models); its dropout of
-0.1 in DoorKey's network is left out, since the paper has none.
+The paper states the number and kinds of layers, not their sizes. These come from the authors' public code
+(github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models), without its dropout of 0.1 in DoorKey's
+network, which the paper does not have.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from hypogoal.dataset import NUMBERS, PICTURE
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
-MOST_NUMBERS = 2**24  # of the states that a network is given at once where no gradient is kept: some 400 MB inside
-MOST_PIXELS = 1024  # of a side, up to which it is looked for how large an image must be
-ENTRY_POINTS = "hypogoal.networks"  # through which other packages add networks
+MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
+MOST_PIXELS = 1024  # the largest side to try in the search for the smallest image
+ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
 
 
 def _convolution(channels: int, features: int, kernel: int, stride: int) -> list[nn.Module]:
@@ -65,16 +65,16 @@ def montezuma(channels: int) -> Parts:
 def montezuma_crop(channels: int) -> Parts:
     """Windows of 24x32 pixels around Montezuma's agent: two convolutions (+ BatchNorm + ReLU), two dense layers.
 
-    Beyond the paper. Its Montezuma network needs 36x36 pixels, of which its first layer sees a quarter of the places.
-    Here the first layer looks at every other pixel, since the agent is 4 pixels wide and a ladder's rung 1 high; the
-    second sees 13x13 pixels, the agent and what it stands on. Where in the window things are is left to the dense
-    layers: the base of a ladder and its middle differ in nothing else. A twentieth of the paper's multiplications.
+    Beyond the paper, whose Montezuma network needs 36x36 pixels and has a stride of 4 in its first layer. Here the
+    stride is 2, since the agent is 4 pixels wide and a ladder's rung 1 high; the second layer sees 13x13 pixels, the
+    agent and what it stands on. Positions in the window are left to the dense layers: a ladder's base and its middle
+    differ in nothing else. It has a twentieth of the paper's multiplications.
     """
     return [*_convolution(channels, 16, 5, 2), *_convolution(16, 32, 5, 2)], (64,)
 
 
 def tiles(channels: int) -> Parts:
-    """Pictures of 8x8 tiles: a layer that reads tiles, one of 3x3 tiles, one hidden dense layer; from 24x24 pixels."""
+    """Pictures of 8x8 tiles: a layer that reads tiles, one of 3x3 tiles, a hidden dense layer; from 24x24 pixels."""
     return [*_convolution(channels, 16, 8, 8), *_convolution(16, 16, 3, 1)], (64,)
 
 
@@ -90,46 +90,47 @@ NETWORKS: dict[str, Callable[[int], Parts]] = {
     "tiles": tiles,
     "mlp": mlp,
 }
-"""By name: number of channels, the last axis -> convolutional part, and widths of the hidden dense layers behind it."""
+"""By name: channels (size of the last axis) -> convolutional part, and widths of the hidden dense layers behind it."""
 
 
 def network_for(name: str, dtype: np.dtype[Any]) -> str:
-    """``auto`` by what observations are; any other name as it is."""
+    """Resolve ``auto`` by the type of observations; any other name stays."""
     return {PICTURE: "doorkey", NUMBERS: "mlp"}[dtype] if name == AUTO else name
 
 
 def load_network(name: str) -> Callable[[tuple[int, ...]], Parts]:
-    """What makes network ``name`` of a shape: of :data:`NETWORKS`, an entry point, or ``module:function``.
+    """A function from an observation shape to network ``name``: of :data:`NETWORKS`, an entry point, or
+    ``module:function``.
 
-    No such network, one that cannot be loaded, or code that the user did not allow (see :mod:`hypogoal.core.own_code`)
-    is a ``UserError``.
+    An unknown network, one that cannot be loaded, or code that the user did not allow (see
+    :mod:`hypogoal.core.own_code`) is a ``UserError``.
     """
     if name in NETWORKS:
         return lambda shape: NETWORKS[name](shape[-1])
     built_in = {network: f"{__name__}:{function.__name__}" for network, function in NETWORKS.items()}
-    made_for = load_own(name, "network", ENTRY_POINTS, built_in)
-    if not callable(made_for):
+    function = load_own(name, "network", ENTRY_POINTS, built_in)
+    if not callable(function):
         raise UserError("this is not a member network", name, "Give a function of channels or of observation_shape.")
-    return _checked(name, made_for)
+    return _checked(name, function)
 
 
-def _checked(name: str, made_for: Callable[..., Parts | nn.Module]) -> Callable[[tuple[int, ...]], Parts]:
-    """A network of someone's own: what :data:`NETWORKS` give, or an encoder, what :func:`as_input` gives -> (N, F).
+def _checked(name: str, function: Callable[..., Parts | nn.Module]) -> Callable[[tuple[int, ...]], Parts]:
+    """A user's network: parts as in :data:`NETWORKS`, or an encoder, :func:`as_input` -> (N, F).
 
-    It is given the observations' shape where its argument is called ``observation_shape``, else their channels.
+    Its function gets the observations' shape if its argument is called ``observation_shape``, else their channels.
     """
 
     def checked(shape: tuple[int, ...]) -> Parts:
-        with UsersCode(f"the network {name!r}", made_for) as code:
-            made = made_for(shape if "observation_shape" in inspect.signature(made_for).parameters else shape[-1])
-            if isinstance(made, nn.Module):
+        with UsersCode(f"the network {name!r}", function) as code:
+            network = function(shape if "observation_shape" in inspect.signature(function).parameters else shape[-1])
+            if isinstance(network, nn.Module):
                 with torch.no_grad():
-                    features = made.eval()(as_input(torch.zeros(1, *shape)))
+                    features = network.eval()(as_input(torch.zeros(1, *shape)))
                 kind, size = getattr(features, "dtype", type(features)), tuple(getattr(features, "shape", ()))
                 if kind != torch.float32 or size[:-1] != (1,) or not all(size):
                     code.refuse(f"is an encoder that makes {kind} {size} of a state", "Make features, float32 (N, F).")
-                return keeping([made], code), ()
-            layers, hidden = made
+                return keeping([network], code), ()
+            layers, hidden = network
             widths = bool(hidden) and all((as_number(width) or 0) > 0 for width in hidden)
             if not widths or not all(isinstance(layer, nn.Module) for layer in layers):
                 code.refuse(f"gave layers {layers} and widths {hidden}", "Give (modules, hidden widths above 0).")
@@ -147,18 +148,18 @@ def _checked(name: str, made_for: Callable[..., Parts | nn.Module]) -> Callable[
 def build_network(
     name: str, observation_shape: tuple[int, ...], generator: torch.Generator, hidden_width: int = 0
 ) -> nn.Sequential:
-    """A member network, what :func:`as_input` gives -> logits (N, 2), on the CPU, for observations of this shape.
+    """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
 
-    ``generator`` draws the initial weights (PyTorch's default distributions); before the last layer there is one of
-    ``hidden_width`` units. An unknown network (see :func:`load_network`), or observations that it does not take, images
-    too small for it, say, are a ``UserError``.
+    ``generator`` draws the initial weights (PyTorch's default distributions); ``hidden_width`` above 0 adds a layer of
+    that width before the last. An unknown network (see :func:`load_network`), or observations that it does not take,
+    for example images too small for it, are a ``UserError``.
     """
     parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
     channels = observation_shape[-1]
     sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
-    with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global state: lend it ours
+    with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
         torch.manual_seed(seed)
         layers, hidden = parts_of(observation_shape)
         features = _features(layers, *sizes)
@@ -168,12 +169,12 @@ def build_network(
         if features is None:
             side = smallest_side(layers, channels)
             if side is None:
-                what = f"the network {name!r} takes no images of {channels} channels"
-                raise UserError(what, where, "Its layers must take (N, channels, height, width).")
+                fault = f"the network {name!r} takes no images of {channels} channels"
+                raise UserError(fault, where, "Its layers must take (N, channels, height, width).")
             raise UserError(f"images too small for the network {name!r}", where, _way_out(side, observation_shape))
         if not isinstance(features, Tensor):
-            what = f"the network {name!r} makes {features!r} of images, not a tensor"  # type: ignore[unreachable]
-            raise UserError(what, where, "Make a tensor.")
+            fault = f"the network {name!r} makes {features!r} of images, not a tensor"  # type: ignore[unreachable]
+            raise UserError(fault, where, "Make a tensor.")
         layers.append(nn.Flatten())
         *widths, last = filter(None, (features.numel(), *hidden, hidden_width))
         for inputs, outputs in pairwise((*widths, last)):
@@ -182,17 +183,17 @@ def build_network(
     return nn.Sequential(*layers).train()
 
 
-def another(head: nn.Sequential, generator: torch.Generator) -> nn.Sequential:
-    """The same dense layers with weights of their own, drawn as PyTorch does."""
-    made = copy.deepcopy(head)
-    for layer in (layer for layer in made if isinstance(layer, nn.Linear)):
+def redrawn(head: nn.Sequential, generator: torch.Generator) -> nn.Sequential:
+    """A copy of dense layers with new weights, drawn as PyTorch does."""
+    head = copy.deepcopy(head)
+    for layer in (layer for layer in head if isinstance(layer, nn.Linear)):
         for value in layer.parameters():
             nn.init.uniform_(value, -(layer.in_features**-0.5), layer.in_features**-0.5, generator=generator)
-    return made
+    return head
 
 
 def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
-    """What a convolutional part makes of an input (1, *sizes); None where it does not take that, too small an image."""
+    """A convolutional part's output for an input (1, *sizes); None if it takes none of this size."""
     try:
         with torch.no_grad():
             return nn.Sequential(*layers).eval()(torch.zeros(1, *sizes))
@@ -201,7 +202,7 @@ def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
 
 
 def smallest_side(layers: list[nn.Module], channels: int) -> int | None:
-    """The side, in pixels, of the smallest square image that a convolutional part takes; None where it takes none."""
+    """The side, in pixels, of the smallest square image that a convolutional part takes; None if it takes none."""
     takes = 1
     while _features(layers, channels, takes, takes) is None:
         takes *= 2
@@ -211,21 +212,21 @@ def smallest_side(layers: list[nn.Module], channels: int) -> int | None:
 
 
 def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
-    """What to do with images smaller than ``side`` pixels, which networks take them as they are among it."""
+    """What to do with images smaller than ``side`` pixels; names the networks that take them as they are."""
     height, width, channels = observation_shape
-    ways = ["give larger ones"]
+    remedies = ["give larger ones"]
     for name, parts_of in NETWORKS.items():
         if _features(parts_of(channels)[0], channels, height, width) is not None:
-            ways.append(f"--set network={name}")
-    own = "a network of your own (--set network=module:function)"
-    return f"It takes {side}x{side} pixels: {', '.join(ways)}, or {own}."
+            remedies.append(f"--set network={name}")
+    users = "a network of your own (--set network=module:function)"
+    return f"It takes {side}x{side} pixels: {', '.join(remedies)}, or {users}."
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:
     """The same function with each ReLU after its MaxPool; the modules, and so the weights, are shared.
 
-    ReLU is monotone, so the order does not matter to values or gradients, but behind the pooling it has a
-    quarter of the work. Only attribution needs the other order.
+    ReLU is monotone, so the order changes neither values nor gradients, but behind the pooling it has a quarter of the
+    work. Only attribution needs the other order.
     """
     layers = list(network)
     for index, (layer, following) in enumerate(pairwise(network)):
@@ -235,7 +236,7 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
 
 
 def folded(network: nn.Sequential) -> nn.Sequential:
-    """The same function in evaluation mode, each BatchNorm made part of (a copy of) the convolution before it."""
+    """The same function in evaluation mode, each BatchNorm folded into (a copy of) the convolution before it."""
     layers: list[nn.Module] = []
     for layer in network:
         before = layers[-1] if layers else None
@@ -247,14 +248,14 @@ def folded(network: nn.Sequential) -> nn.Sequential:
 
 
 def as_input(observations: Tensor) -> Tensor:
-    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the memory order (channels last) it came in.
+    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
 
-    What is no picture stays as it is, but that of (N, H, W, C) the last axis comes first, too.
+    Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too.
     """
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
 
 
 def at_once(most: int, shape: tuple[int, ...]) -> int:
-    """How many states of this shape a network is given at once: ``most``, or fewer of large ones."""
+    """How many states of this shape to pass through a network at once: ``most``, or fewer if they are large."""
     return max(1, min(most, MOST_NUMBERS // prod(shape)))

@@ -1,9 +1,9 @@
-"""Convolutions over images that are made of few distinct patches: each distinct patch is computed once.
+"""Convolutions over images made of few distinct patches: each distinct patch is computed once.
 
-A grid world's image repeats a few tiles, so of the thousands of places where a convolution or a pooling
-looks in a batch of images, few differ. Here a layer works on a table of the distinct patches, and BatchNorm
-weighs each by how often it occurs. Up to rounding this is the plain network, values, gradients and running
-statistics alike, several times faster on a CPU.
+A grid world's image repeats a few tiles, so of the thousands of patches that a convolution or pooling sees in a batch
+of images, few differ. Here a layer works on a table of the distinct patches, and BatchNorm weights each by its
+frequency. Up to rounding, values, gradients and running statistics are those of the plain network, several times faster
+on a CPU.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-WORTHWHILE = 0.5  # share of the plain network's work in convolutions, above which gathering patches eats up the gain
-SAMPLE = 64  # images from which that is judged,
-SAMPLE_PIXELS = 2**19  # or as many as have so many pixels: each takes some 250 bytes
-LOOKUP_PER_VALUE = 4  # size of a table that ranks values; where it would be larger, sorting them is faster
+WORTHWHILE = 0.5  # of the plain network's work in convolutions; above, gathering patches costs more than it saves
+SAMPLE = 64  # images from which that is estimated,
+SAMPLE_PIXELS = 2**19  # or fewer images, within this number of pixels: each takes some 250 bytes
+LOOKUP_PER_VALUE = 4  # table entries per value to rank; beyond, sorting is faster
 
 
 @dataclass(frozen=True)
 class Level:
-    """What one convolution or pooling looks at in N images, by patch ids."""
+    """The patches that one convolution or pooling sees in N images, by id."""
 
     parts: NDArray[np.int32]  # (U, k * k), each distinct patch as patch ids of the level below (colours for the first)
-    rows: NDArray[np.int32]  # (R, W), distinct rows of places: the patch at each
+    rows: NDArray[np.int32]  # (R, W), distinct rows of places: the patch at each place
     lines: NDArray[np.int32]  # (N, H), each image as indices of rows
 
 
@@ -43,24 +43,24 @@ class Tables:
 
 @dataclass(frozen=True)
 class Batch:
-    """The patches that occur in groups of images; those of a group follow those of the group before it.
+    """The patches in groups of images, group after group.
 
-    BatchNorm sees each group on its own, everything else all of them at once.
+    BatchNorm sees each group on its own; all other layers see all groups at once.
     """
 
     first: Tensor  # float32 (U, k * k, C), the patches of the first level
     parts: tuple[Tensor, ...]  # for each level above it int64 (U * k * k,), indices of the level below
-    # For each level and group float32 (1, U), the share of the group's places where each patch lies; they sum to 1.
+    # For each level and group float32 (1, U), each patch's share of the group's places; they sum to 1.
     shares: tuple[tuple[Tensor, ...], ...]
-    places: tuple[tuple[int, ...], ...]  # for each level and group, how many places there are
+    places: tuple[tuple[int, ...], ...]  # for each level and group, the number of places
     last: Tensor  # int64 (B, H * W), the last level's patch at each place of all images
 
 
 def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
-    """(kernel size, stride) of each convolution and pooling; None where a layer is of no supported kind."""
+    """(kernel size, stride) of each convolution and pooling; None if a layer is not supported."""
     windows = []
     for layer in network:
-        if type(layer) is nn.Conv2d or type(layer) is nn.MaxPool2d:  # no class that computes something else
+        if type(layer) is nn.Conv2d or type(layer) is nn.MaxPool2d:  # no subclass, which may compute something else
             kernel, stride = _side(layer.kernel_size), _side(layer.stride)
             plain = min(kernel, stride) > 0 and _side(layer.padding) == 0 and _side(layer.dilation) == 1
             if not plain or getattr(layer, "groups", 1) != 1 or getattr(layer, "ceil_mode", False):
@@ -75,25 +75,25 @@ def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
 
 
 def _side(size: object) -> int:
-    """The side of a square window; -1 for one that is not square."""
+    """The side of a square window; -1 if it is not square."""
     if isinstance(size, int):
         return size
     return size[0] if isinstance(size, tuple) and size[0] == size[1] else -1
 
 
 def make_tables(observations: NDArray[Any], network: nn.Sequential) -> Tables | None:
-    """The distinct patches of images uint8 (N, H, W, C) as ``network`` looks at them.
+    """The distinct patches of images uint8 (N, H, W, C) as ``network`` sees them.
 
-    None where too few repeat to be worthwhile, or where the network has layers that tables do not know.
+    None if too few repeat to be worthwhile, or if the network has unsupported layers.
     """
     windows = windows_of(network)
     if windows is None or len(observations) == 0 or observations.dtype != np.uint8:
         return None
-    judged = max(1, min(SAMPLE, len(observations), SAMPLE_PIXELS // prod(observations.shape[1:3])))
-    spread = np.linspace(0, len(observations) - 1, judged).astype(np.int64)
+    count = max(1, min(SAMPLE, len(observations), SAMPLE_PIXELS // prod(observations.shape[1:3])))
+    spread = np.linspace(0, len(observations) - 1, count).astype(np.int64)
     sample = _tables(observations[spread], windows)
     spatial = [layer for layer in network if isinstance(layer, (nn.Conv2d, nn.MaxPool2d))]
-    work = [  # of each at one place: multiplications, or comparisons
+    work = [  # multiplications, or comparisons, of each layer at one place
         layer.weight.numel() if isinstance(layer, nn.Conv2d) else kernel**2
         for layer, (kernel, _) in zip(spatial, windows, strict=True)
     ]
@@ -119,12 +119,12 @@ def _tables(observations: NDArray[np.uint8], windows: Sequence[tuple[int, int]])
 
 
 def _strided(values: NDArray[np.int32], kernel: int, stride: int) -> list[NDArray[np.int32]]:
-    """For each offset in a window, the values (..., W) there: ``kernel`` arrays (..., number of windows)."""
+    """For each offset in a window, the values (..., W) at that offset: ``kernel`` arrays (..., number of windows)."""
     return [values[..., offset : values.shape[-1] - kernel + offset + 1 : stride] for offset in range(kernel)]
 
 
 def _join(pieces: Sequence[NDArray[np.int32]], bound: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Ids of the distinct tuples that pieces, of ids below ``bound``, form place by place, and the tuples."""
+    """Join pieces, of ids below ``bound``, place by place into tuples; the distinct tuples' ids, and the tuples."""
     ids, tuples = pieces[0], np.arange(bound, dtype=np.int32)[:, None]
     for piece in pieces[1:]:
         ids, distinct = _rank(ids.astype(np.int64) * bound + piece, len(tuples) * bound)
@@ -134,7 +134,7 @@ def _join(pieces: Sequence[NDArray[np.int32]], bound: int) -> tuple[NDArray[np.i
 
 
 def _rank(values: NDArray[np.int64], bound: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Values in 0..bound-1 -> (each one's rank among the distinct ones, the distinct ones in order)."""
+    """Values in 0..bound-1 -> (their ranks among the distinct values, the distinct values in order)."""
     if bound > LOOKUP_PER_VALUE * values.size:
         distinct, ranks = np.unique(values, return_inverse=True)
         return ranks.reshape(values.shape).astype(np.int32), distinct
@@ -144,7 +144,7 @@ def _rank(values: NDArray[np.int64], bound: int) -> tuple[NDArray[np.int32], NDA
 
 
 def _distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Items (N, bytes) -> (index among the distinct ones (N,), the distinct ones in order of appearance)."""
+    """Items (N, bytes) -> (indices of distinct items (N,), the distinct items in order of appearance)."""
     whole: list[bytes] = np.ascontiguousarray(items).view(f"V{items.shape[1]}").ravel().tolist()
     index_of = {item: index for index, item in enumerate(dict.fromkeys(whole))}
     index = np.fromiter(map(index_of.__getitem__, whole), np.int32, len(whole))
@@ -152,15 +152,15 @@ def _distinct_items(items: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArra
 
 
 def take(tables: Tables, *groups: NDArray[np.int64]) -> Batch:
-    """The patches that occur in groups of images, given by index (B,); an image that is given twice counts twice."""
+    """The patches in groups of images, by index (B,); repeated images count repeatedly."""
     levels = len(tables.levels)
     parts: list[list[NDArray[np.int64]]] = [[] for _ in range(levels)]
     shares: list[list[Tensor]] = [[] for _ in range(levels)]
     places: list[list[int]] = [[] for _ in range(levels)]
-    before = [0] * levels  # patches of the groups before, at each level
+    before = [0] * levels  # patches of the earlier groups, at each level
     last = []
     for images in groups:
-        used = np.arange(len(tables.colours))  # of the level below; all colours are there for all groups
+        used = np.arange(len(tables.colours))  # ids of the level below; every group has all colours
         offset = 0
         for index, level in enumerate(tables.levels):
             ids = level.rows[level.lines[images]]
@@ -184,7 +184,7 @@ def take(tables: Tables, *groups: NDArray[np.int64]) -> Batch:
 
 
 def _positions(values: NDArray[np.int32], among: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where each value is in the sorted ``among``, which has them all."""
+    """The index of each value in the sorted ``among``, which has them all."""
     if among[-1] < LOOKUP_PER_VALUE * values.size:
         position = np.empty(int(among[-1]) + 1, dtype=np.int64)
         position[among] = np.arange(len(among))
@@ -193,22 +193,22 @@ def _positions(values: NDArray[np.int32], among: NDArray[np.int64]) -> NDArray[n
 
 
 def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) -> Tensor:
-    """Logits (B, 2) that ``network`` gives the images of ``batch``, in its training or evaluation mode.
+    """The logits (B, 2) of ``network`` for the images of ``batch``, in training or evaluation mode.
 
-    Its layers are ones that ``windows_of`` knows. In training mode BatchNorm's running statistics take in the groups
-    that are ``counted``, all where that is empty.
+    ``windows_of`` must support its layers. In training mode, BatchNorm's running statistics include the ``counted``
+    groups, all if that is empty.
     """
     rows, level = batch.first, -1
     for layer in network:
         if isinstance(layer, (nn.Conv2d, nn.MaxPool2d)):
             level += 1
             window = _side(layer.kernel_size) ** 2
-            seen = rows.index_select(0, batch.parts[level - 1]).view(-1, window, rows.shape[1]) if level else rows
+            windows = rows.index_select(0, batch.parts[level - 1]).view(-1, window, rows.shape[1]) if level else rows
             if isinstance(layer, nn.MaxPool2d):
-                rows = seen.max(dim=1).values
+                rows = windows.max(dim=1).values
             else:
                 weight = layer.weight.permute(2, 3, 1, 0).reshape(-1, layer.out_channels)
-                flat = seen.view(-1, len(weight))
+                flat = windows.view(-1, len(weight))
                 rows = flat @ weight if layer.bias is None else torch.addmm(layer.bias, flat, weight)
         elif isinstance(layer, nn.BatchNorm2d):
             rows = _batch_norm(layer, rows, batch.shares[level], batch.places[level], counted)
@@ -224,7 +224,7 @@ def forward(network: nn.Sequential, batch: Batch, counted: Sequence[bool] = ()) 
 def _batch_norm(
     layer: nn.BatchNorm2d, rows: Tensor, shares: Sequence[Tensor], places: Sequence[int], counted: Sequence[bool]
 ) -> Tensor:
-    """BatchNorm of rows (U, C), group after group; each row stands for its share of its group's places."""
+    """BatchNorm of rows (U, C), group after group; each row is weighted by its share of its group's places."""
     if not layer.training:
         running_mean, running_var = layer.running_mean, layer.running_var
         assert running_mean is not None

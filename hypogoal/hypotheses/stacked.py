@@ -1,4 +1,4 @@
-"""Many member networks as one: for a few states at a time, where calling each member costs more than its arithmetic."""
+"""Many member networks as one, for a few states at a time: calling each member would cost more than its arithmetic."""
 
 from __future__ import annotations
 
@@ -14,63 +14,62 @@ from torch.nn import functional
 
 from hypogoal.core.compute import tensor
 from hypogoal.dataset import Observations
-from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble
+from hypogoal.hypotheses.known_windows import KnownWindows, split_of
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.hypotheses.views import FullView
-from hypogoal.hypotheses.windows import KnownWindows, split_of
 
-CHUNK = 64  # images at once: what fits a CPU's cache
-WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # the same for all members at once
+WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
 
 
 class StackedMembers:
     """All members of several ensembles with the same network, for prediction only.
 
-    The first convolution's filters stand side by side, later ones are grouped, dense layers are batched products.
-    Up to rounding the same as each ensemble's ``log_odds`` (a test asserts it). Networks with layers of other kinds, or
-    an encoder that members share, are not ``joined``: each ensemble predicts by itself.
+    The first convolution's filters are concatenated, later ones grouped; dense layers are batched products. Up to
+    rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers, or with a
+    shared encoder, are not ``joined``: each ensemble predicts by itself.
 
     The G ensembles have K members each, one network and observation shape, views of one shape, and one device.
-    ``repeats``: states are of a grid world, so what convolutions make of windows is kept, see :mod:`.windows`; where
-    members do not see all of a state, or on a GPU, it makes no difference.
+    ``repeats``: states come from a grid world, so the convolutions' outputs for windows are kept, see
+    :mod:`.known_windows`; it has no effect where members see a part of a state, or on a GPU.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble], *, repeats: bool = False):
         self.ensembles = tuple(ensembles)
         self.device = ensembles[0].thresholds.device
         self.needs_positions = any(ensemble.needs_positions for ensemble in ensembles)
-        whole = [isinstance(ensemble.view, FullView) and ensemble.view.standard is None for ensemble in ensembles]
-        self._one_view = all(whole)
+        plain = [isinstance(ensemble.view, FullView) and ensemble.view.standard is None for ensemble in ensembles]
+        self._one_view = all(plain)
         networks = [folded(network) for ensemble in ensembles for network in ensemble.eval().networks]
         self.count = len(networks)
         self.joined = ensembles[0].trunk is None and _can_be_joined(networks[0])
         self._steps: list[tuple[nn.Module, list[Tensor]]] = []
-        self._known: KnownWindows | None = None
+        self._windows: KnownWindows | None = None
         if not self.joined:
             return
         for layers in zip(*networks, strict=True):
             self._steps.append((layers[0], _stack(list(layers))))
         split = split_of(networks[0]) if repeats and self._one_view and self.device.type == "cpu" else None
-        self._known = KnownWindows(partial(self._apply, 0, split[0]), *split[1:]) if split else None
+        self._windows = KnownWindows(partial(self._apply, 0, split[0]), *split[1:]) if split else None
         self._first = split[0] if split else 0  # of the layers behind the windows
 
     def log_odds(self, observations: Observations, positions: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
-        """Of every member, float32 (N, G*K), ensemble by ensemble; as of :meth:`Ensemble.log_odds`."""
+        """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
         if not self.joined:
             return np.concatenate([ensemble.log_odds(observations, positions) for ensemble in self.ensembles], axis=1)
         seen = self._see(observations, positions)
         rows = [np.empty((0, self.count), dtype=np.float32)]
         with torch.inference_mode():
-            chunk = at_once(CHUNK, seen.shape[1:])
+            chunk = at_once(IMAGES_AT_ONCE, seen.shape[1:])
             for start in range(0, len(seen), chunk):
                 logits = self._logits(seen[start : start + chunk])
                 rows.append((logits[..., 1] - logits[..., 0]).T.cpu().numpy())
         return np.concatenate(rows)
 
     def _see(self, observations: Observations, positions: NDArray[np.int64] | None) -> Any:
-        """What the ensembles see, uint8 (N, h, w, C), or (N, h, w, G*C) where each sees in its own way.
+        """The ensembles' view, uint8 (N, h, w, C), or (N, h, w, G*C) if their views differ.
 
-        Of no pictures, float32 (N, G*n, ...).
+        For non-image observations, float32 (N, G*n, ...).
         """
         if self._one_view:
             return self.ensembles[0].see(observations)
@@ -78,12 +77,12 @@ class StackedMembers:
         return np.concatenate(seen, axis=-1 if observations.ndim == 4 else 1)
 
     def _logits(self, seen: Any) -> Tensor:
-        """What :meth:`_see` gives -> (members, N, 2)."""
-        x = self._known.of(seen) if self._known is not None else as_input(tensor(seen, self.device))
+        """What :meth:`_see` returns -> logits (members, N, 2)."""
+        x = self._windows.of(seen) if self._windows is not None else as_input(tensor(seen, self.device))
         return self._apply(self._first, len(self._steps), x)
 
     def _apply(self, first: int, end: int, x: Tensor) -> Tensor:
-        """Some of the layers: ``first`` and those behind it, before ``end``."""
+        """Apply the layers from ``first`` up to ``end``, exclusive."""
         groups = self.count if first else 1 if self._one_view else len(self.ensembles)
         for layer, weights in self._steps[first:end]:
             if isinstance(layer, nn.Conv2d):
@@ -92,7 +91,7 @@ class StackedMembers:
                 groups = self.count
             elif isinstance(layer, nn.Flatten):
                 x = x.reshape(len(x), groups, -1).transpose(0, 1)
-                if groups < self.count:  # nothing before it was a member's own
+                if groups < self.count:  # all layers before were shared
                     x = x.repeat_interleave(self.count // groups, dim=0)
             elif isinstance(layer, nn.Linear):
                 x = torch.baddbmm(weights[1], x, weights[0])
@@ -116,7 +115,7 @@ def _can_be_joined(network: nn.Sequential) -> bool:
 
 
 def _stack(layers: list[nn.Module]) -> list[Tensor]:
-    """The weights of the same layer of every member, joined as :meth:`StackedMembers._logits` needs them."""
+    """Join the weights of one layer of every member as :meth:`StackedMembers._apply` needs them."""
     first = layers[0]
     state = [layer.state_dict() for layer in layers]
 

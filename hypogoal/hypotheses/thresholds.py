@@ -1,6 +1,6 @@
-"""Where a member says yes: rules that set its threshold without a label of another context, by name (beyond the paper).
+"""Rules by name that set members' thresholds without labels from other contexts (beyond the paper).
 
-What each is worth on DoorKey: ``docs/results/thresholds-doorkey.md``.
+Their results on DoorKey: ``docs/results/thresholds-doorkey.md``.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 PAPER = "0.5"
-CERTAIN = 1e-12  # probabilities nearer to 0 or 1 are taken as this near
+CERTAIN = 1e-12  # probabilities are clipped this far from 0 and 1
 Probabilities = NDArray[np.float32]  # (states,), one member's
 Rule = Callable[[Probabilities, Probabilities, Probabilities], np.floating]
 
 
 def log_odds_of(probabilities: NDArray[Any]) -> NDArray[np.float64]:
-    """Of probabilities (...,), always finite."""
+    """The log-odds of probabilities (...,), always finite."""
     exact = probabilities.astype(np.float64).clip(CERTAIN, 1 - CERTAIN)
     return np.asarray(np.log(exact) - np.log1p(-exact))
 
 
 def _unlabelled_q95(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Yes to 5 % of the unlabelled states.
+    """Predict 5 % of the unlabelled states positive.
 
-    Members of a crop are sure of what is no base and unsure of what is one in a room they do not know.
+    In unknown rooms, members that see a window are sure of negatives and unsure of bases.
     """
     return np.quantile(unlabelled, 0.95, method="higher")
 
 
 def unlabelled_split(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Otsu (1979): the cut of the unlabelled states' logits into two classes that leaves least variance within them."""
+    """Otsu (1979): the cut of the unlabelled states' log-odds into two classes with the least variance within."""
     logits = log_odds_of(np.sort(unlabelled))
     if len(logits) < 2:
         return np.float64(0.5)
@@ -44,9 +44,9 @@ def unlabelled_split(positives: Probabilities, negatives: Probabilities, unlabel
 
 
 def _positives_median(positives: Probabilities, negatives: Probabilities, unlabelled: Probabilities) -> np.floating:
-    """Yes to half of the labelled positives.
+    """Predict half of the labelled positives positive.
 
-    A policy looks for its classifier's mistakes: what it needs is that yes is right, not that each base is found.
+    A policy exploits its classifier's false positives, so precision matters more than recall.
     """
     return np.median(positives)
 
@@ -65,15 +65,17 @@ def thresholds(
 ) -> NDArray[np.float32]:
     """The thresholds float32 (K,) that a rule sets.
 
-    A threshold stays below 1: a member that is certain of more states than the rule grants goes on saying yes to them.
-    The state whose probability it is lies at its edge: see :meth:`Ensemble.verdicts`.
+    A threshold stays below 1, so a member that is certain of more states than the rule allows still predicts them
+    positive. The prediction for the state whose probability is the threshold depends on rounding, see
+    :meth:`Ensemble.verdicts`.
 
     Args:
         name: of the rule.
         labelled: float32 (N, K), the members' probabilities of the labelled states.
-        labels: bool (N,), which of those are positives.
-        unlabelled: float32 (M, K).
+        labels: bool (N,), which of them are positive.
+        unlabelled: float32 (M, K), the members' probabilities of the unlabelled states.
     """
     rule = RULES[name]
-    rows = [rule(own[labels], own[~labels], other) for own, other in zip(labelled.T, unlabelled.T, strict=True)]
+    members = zip(labelled.T, unlabelled.T, strict=True)
+    rows = [rule(on_labelled[labels], on_labelled[~labels], on_unlabelled) for on_labelled, on_unlabelled in members]
     return np.minimum(np.array(rows, dtype=np.float32), np.nextafter(np.float32(1), np.float32(0)))

@@ -1,4 +1,4 @@
-"""What a training step takes, measured: the real network gets a few of the real states, in small batches."""
+"""The measured cost of a training step: the real network trains on a few of the real states, in small batches."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.training import Round
-from hypogoal.hypotheses.views import FullView, windows
+from hypogoal.hypotheses.views import FullView, cut_windows
 
 SECONDS = 0.3  # after which no larger batch is tried
-LEARNING = 3  # numbers beside each weight that learns: its gradient and two of Adam's
-BACKWARD = 0.5  # of what a member keeps for its gradients: as much again is made on the way back
+LEARNING = 3  # numbers per trained weight: its gradient and two of Adam's
+BACKWARD = 0.5  # memory of the backward pass, relative to what a member keeps for it
 
 
 class StepCost(NamedTuple):
-    """Bytes and seconds of a training step: a part that is always there, and one for each state of a batch."""
+    """Bytes and seconds of a training step: a constant part, and one for each state of a batch."""
 
     weights: float  # bytes of all members' weights
     memory: float
@@ -36,24 +36,24 @@ class StepCost(NamedTuple):
 
 
 def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SECONDS) -> StepCost:
-    """What a step on a CPU takes with states like these (N, *shape), N > 1, and as many unlabelled ones in a batch.
+    """The cost of a step on a CPU with states like these (N, *shape), N > 1, and as many unlabelled ones in a batch.
 
-    Batches grow from two states until ``seconds`` are over; a line through the first and the last is the answer. Of
-    members that share nothing one or two are tried: all take the same. An objective of the user's own is not called,
-    D-BAT is in its place. States that the network does not take are a ``UserError``.
+    Batches grow from two states until ``seconds`` are over; the result is a line through the first and the last.
+    Members that share nothing cost the same, so one or two are tried. D-BAT replaces a user's objective, which is not
+    called. States that the network does not take are a ``UserError``.
     """
     pictures = states.dtype != NUMBERS
     cut, margin = pictures and config.view == "agent-crop", config.jitter
-    if cut:  # in the middle, wherever the agent is
+    if cut:  # from the middle, wherever the agent is
         size = config.crop_height + 2 * margin, config.crop_width + 2 * margin
-        states = windows(states, np.tile(np.divide(states.shape[1:3], 2), (len(states), 1)), *size)
+        states = cut_windows(states, np.tile(np.divide(states.shape[1:3], 2), (len(states), 1)), *size)
     shape = (config.crop_height, config.crop_width, *states.shape[3:]) if cut else states.shape[1:]
     view = FullView(shape, None if pictures else standard_of(shape, states))
     states = states if pictures else view.see(states)
     separate, alone = config.encoder == "separate", config.schedule == "sequential"
     objective = config.diversity if config.diversity in OBJECTIVES else "dbat"
-    few = 1 if alone or load_objective(objective).pair_loss else 2  # a loss of all is 0 for one
-    members = min(few, config.members) if separate else config.members
+    least = 1 if alone or load_objective(objective).pair_loss else 2  # an ensemble loss is 0 for one member
+    members = min(least, config.members) if separate else config.members
     sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]
     sizes += [config.batch_size] * (sizes[-1] < config.batch_size)
     config = replace(config, diversity=objective, batch_kind="plain", steps=len(sizes) + 2)
@@ -73,7 +73,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
             frozen=ensemble.frozen,
         )
         training = Round(networks, [0] if alone else range(members), batches, config, 0, 0)
-        _tried(training, sizes[0], ensemble)  # the first step makes ready
+        _tried(training, sizes[0], ensemble)  # the first step allocates
         end, rows = time.process_time() + seconds, []
         for size in sizes:
             rows.append((size, *_tried(training, size, ensemble)))
@@ -83,7 +83,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     kept_each, seconds_each = (max(0.0, rise) / max(1, more - fewer) for rise in (most - less, later - sooner))
     weights = sum(weight.nbytes for weight in ensemble.parameters())
     learning = LEARNING * sum(weight.nbytes for weight in training.optimiser.param_groups[0]["params"])
-    times = config.members / members  # as many as were tried
+    times = config.members / members  # relative to those tried
     at_once = 1.0 if alone else times
     copies = at_once + BACKWARD / (members if separate else 1)
     return StepCost(
@@ -96,7 +96,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
 
 
 def _tried(training: Round, batch: int, ensemble: Ensemble) -> tuple[float, float]:
-    """Bytes that a step with such a batch keeps for its gradients, weights aside, and its seconds."""
+    """The bytes that a step with such a batch keeps for its gradients, without weights, and its seconds."""
     kept = {weight.untyped_storage().data_ptr(): 0 for weight in ensemble.parameters()}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def _tried(training: Round, batch: int, ensemble: Ensemble) -> tuple[float, floa
         return tensor
 
     training.config = replace(training.config, batch_size=batch)
-    begun = time.process_time()
+    start = time.process_time()
     with saved_tensors_hooks(keep, lambda tensor: tensor):
-        next(training.steps(None))
-    return float(sum(kept.values())), time.process_time() - begun
+        next(training.steps())
+    return float(sum(kept.values())), time.process_time() - start

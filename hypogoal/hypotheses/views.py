@@ -1,8 +1,9 @@
-"""What members see of an observation: all of it, or the neighbourhood of the agent (beyond the paper)."""
+"""What members see of an observation: all of it, or the agent's surroundings (beyond the paper)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,35 @@ from torch import Tensor, nn
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, Standard, standard_of, standardised
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.localisers import LearnedLocaliser, Localiser, Pixels, RamLocaliser, fit_localiser
+from hypogoal.hypotheses.localisers import AgentPixels, LearnedLocaliser, Localiser, RamLocaliser, fit_localiser
 
 Origins = Mapping[str, NDArray[np.int64]]
 POSITION, ACTIONS = ("room", "x", "y"), ("action", "previous_action")  # names of origins
-CHUNK = 1024  # states at once: so many crops are gathered from whole images at a time
+CUT_AT_ONCE = 1024  # windows cut from whole images at a time
+
+
+@dataclass(frozen=True)
+class StateOrigins:
+    """Where training states come from, as far as it is known.
+
+    Attributes:
+        labelled: int64 (N,) by name, of labelled states: ``ladder`` for batch_kind=per-ladder; ``room``, ``x``, ``y``
+            (and ``dying``) for view=agent-crop.
+        unlabelled: int64 (M,) by name: ``room``, ``x``, ``y`` for localiser=ram, ``action``, ``previous_action`` for
+            localiser=learned.
+        agent_pixels: the domain's function, for view=agent-crop.
+    """
+
+    labelled: Origins | None = None
+    unlabelled: Origins | None = None
+    agent_pixels: AgentPixels | None = None
+
+
+NO_ORIGINS = StateOrigins()
 
 
 class FullView(nn.Module):
-    """All of an observation: a picture as it is, the paper's view; of no picture each number by its ``standard``."""
+    """All of an observation: a picture as it is, the paper's view; numbers standardised by ``standard``."""
 
     needs_positions = False
     mean: Tensor
@@ -35,23 +56,23 @@ class FullView(nn.Module):
 
     @property
     def standard(self) -> Standard | None:
-        """Mean and deviation, (*shape), of numbers."""
+        """Mean and deviation (*shape) of numbers; None for pictures."""
         return (self.mean.cpu().numpy(), self.deviation.cpu().numpy()) if self.dtype == NUMBERS else None
 
     def see(
         self, observations: Observations, positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> Observations:
         """The observations (N, *shape)."""
-        assert not margin, "all of it has nothing around it"
+        assert not margin, "a full view has no margin"
         return standardised(observations, *self.standard) if self.standard else observations
 
 
 class AgentView(nn.Module):
-    """A window around the agent, whom the localiser finds; what is outside the image is 0.
+    """A window around the agent, found by the localiser; pixels outside the image are 0.
 
-    The same window for every frame of a stack, around where the agent is in the last. Its ``shape`` is (height, width,
-    C), in pixels, of pictures (H, W, C). ``needs_positions`` says whether the localiser reads positions, which no
-    policy may see: an oracle.
+    All frames of a stack share the window around the agent in the last frame. ``shape`` is (height, width, C), in
+    pixels, for pictures (H, W, C). ``needs_positions`` tells whether the localiser is an oracle that reads positions,
+    which no policy may see.
     """
 
     dtype, standard = PICTURE, None
@@ -65,26 +86,26 @@ class AgentView(nn.Module):
     def see(
         self, observations: Any, positions: NDArray[np.int64] | None = None, *, margin: int = 0
     ) -> NDArray[np.uint8]:
-        """Windows uint8 (N, height, width, C) of uint8 (N, H, W, C), with ``margin`` pixels more on every side.
+        """Windows uint8 (N, height, width, C) of uint8 (N, H, W, C), with ``margin`` more pixels on every side.
 
-        Positions are int64 (N, 3) of room, x, y, where the localiser reads them.
+        Positions, if the localiser reads them, are int64 (N, 3) of room, x, y.
         """
         height, width, channels = self.shape
         size = height + 2 * margin, width + 2 * margin
         seen = np.empty((len(observations), *size, channels), dtype=np.uint8)
-        for start in range(0, len(observations), CHUNK):
-            chunk = slice(start, start + CHUNK)
+        for start in range(0, len(observations), CUT_AT_ONCE):
+            chunk = slice(start, start + CUT_AT_ONCE)
             centres = self.localiser.locate(observations[chunk], None if positions is None else positions[chunk])
-            seen[chunk] = windows(observations[chunk], centres, *size)
+            seen[chunk] = cut_windows(observations[chunk], centres, *size)
         return seen
 
 
-def windows(
+def cut_windows(
     observations: NDArray[np.uint8], centres: NDArray[np.floating], height: int, width: int
 ) -> NDArray[np.uint8]:
-    """Windows uint8 (N, height, width, C) of images uint8 (N, H, W, C); 0 outside them.
+    """Windows uint8 (N, height, width, C) of images uint8 (N, H, W, C); 0 outside the images.
 
-    ``centres`` (N, 2) are row and column of the pixel in the middle; of an even number of pixels it is the one after.
+    ``centres`` (N, 2) are the row and column of the middle pixel, or of the second of two middle pixels.
     """
     corner = np.floor(centres + 0.5).astype(np.int64) - (height // 2, width // 2)
     rows, rows_inside = _indices(corner[:, 0], height, observations.shape[1])
@@ -95,24 +116,24 @@ def windows(
 
 
 def _indices(first: NDArray[np.int64], count: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """``count`` indices from each first on (N, count), clipped to 0..size-1, and which were inside."""
+    """``count`` indices from each ``first`` (N, count), clipped to 0..size-1, and which were inside."""
     indices = first[:, None] + np.arange(count)
     return indices.clip(0, size - 1), (indices >= 0) & (indices < size)
 
 
 def positions_of(origins: Origins | None) -> NDArray[np.int64] | None:
-    """Positions int64 (N, 3) of room, x, y from origins; None where these do not say them."""
+    """Positions int64 (N, 3) of room, x, y from origins; None if these lack them."""
     if origins is None or not all(name in origins for name in POSITION):
         return None
     return np.stack([origins[name] for name in POSITION], axis=1).astype(np.int64)
 
 
-def needed(origins: Origins | None, names: tuple[str, ...], why: str) -> Origins:
-    """The origins of states, which must say these; a ``UserError`` where one is missing."""
+def require_origins(origins: Origins | None, names: tuple[str, ...], setting: str) -> Origins:
+    """The origins of states, with all these names; a ``UserError`` if one is missing."""
     origins = origins or {}
     if missing := ", ".join(name for name in names if name not in origins):
         do = "Collect data that do, or change the setting."
-        raise UserError(f"the data do not say {missing} of each state", why, do)
+        raise UserError(f"the data do not say {missing} of each state", setting, do)
     return origins
 
 
@@ -121,18 +142,16 @@ def view_of(
     unlabelled: Any,
     config: EnsembleConfig,
     seed: int,
-    origins: Origins | None,
-    unlabelled_origins: Origins | None,
-    agent_pixels: Pixels | None,
+    origins: StateOrigins,
     *,
     fitted: bool,
 ) -> FullView | AgentView:
-    """What the members are to see; what learns of it is trained here, or where not ``fitted`` to be loaded."""
+    """The members' view; ``fitted`` trains its localiser and computes its standard, else these are to be loaded."""
     shape = observations.shape[1:]
     if observations.dtype == NUMBERS:
         for name, value in (("view", "full"), ("augment", "none"), ("jitter", 0)):
-            if (given := getattr(config, name)) != value:
-                raise UserError("these observations are not pictures", f"{name}={given}", f"Set {name}={value}.")
+            if (chosen := getattr(config, name)) != value:
+                raise UserError("these observations are not pictures", f"{name}={chosen}", f"Set {name}={value}.")
         return FullView(shape, standard_of(shape, *([observations, unlabelled] if fitted else [])))
     if config.view == "full":
         if config.jitter:
@@ -141,20 +160,22 @@ def view_of(
             do = "Set view=agent-crop or augment=grey."
             raise UserError("the surroundings of the agent are not known", f"augment={config.augment}", do)
         return FullView(shape)
-    if agent_pixels is None:
+    if origins.agent_pixels is None:
         raise UserError("the agent's place in these observations is not known", "view=agent-crop", "Set view=full.")
-    origins = needed(origins, POSITION, "view=agent-crop")
-    others = (POSITION if config.localiser == "ram" else ACTIONS) if len(unlabelled) else ()
-    unlabelled_origins = needed(unlabelled_origins, others, f"localiser={config.localiser}")
-    localiser: Localiser = RamLocaliser(agent_pixels) if config.localiser == "ram" else LearnedLocaliser(shape)
-    if config.localiser == "learned" and fitted:
-        # From labelled states in which the agent lives (dying it is elsewhere). Of unlabelled ones the localiser is
-        # told the agent's actions, which the agent knows, and not its positions.
-        positions = np.stack([origins[name] for name in POSITION], axis=1).astype(np.int64)
-        alive = np.flatnonzero(origins.get("dying", np.zeros(len(positions))) == 0)
-        none = np.zeros(0, dtype=np.int64)
-        actions = np.stack([unlabelled_origins.get(name, none) for name in ACTIONS], axis=1)
-        told = np.flatnonzero((actions >= 0).all(axis=1))
-        pixels = agent_pixels(positions[alive])
-        localiser = fit_localiser(observations[alive], pixels, unlabelled[told], actions[told], seed)
+    labelled = require_origins(origins.labelled, POSITION, "view=agent-crop")
+    names = (POSITION if config.localiser == "ram" else ACTIONS) if len(unlabelled) else ()
+    others = require_origins(origins.unlabelled, names, f"localiser={config.localiser}")
+    if config.localiser == "ram":
+        localiser: Localiser = RamLocaliser(origins.agent_pixels)
+    elif not fitted:
+        localiser = LearnedLocaliser(shape)
+    else:
+        # From labelled states with a living agent (a dying one is drawn elsewhere). Of unlabelled states the localiser
+        # gets the agent's actions, which the agent knows, but not its positions.
+        positions = np.stack([labelled[name] for name in POSITION], axis=1).astype(np.int64)
+        alive = np.flatnonzero(labelled.get("dying", np.zeros(len(positions))) == 0)
+        actions = np.stack([others.get(name, np.zeros(0, dtype=np.int64)) for name in ACTIONS], axis=1)
+        usable = np.flatnonzero((actions >= 0).all(axis=1))
+        pixels = origins.agent_pixels(positions[alive])
+        localiser = fit_localiser(observations[alive], pixels, unlabelled[usable], actions[usable], seed)
     return AgentView(shape, config.crop_height, config.crop_width, localiser)

@@ -1,4 +1,4 @@
-"""Sub-goal classifiers as Gymnasium wrappers: as a reward, and as the end of an episode, for anyone's agent."""
+"""Sub-goal classifiers as Gymnasium wrappers: as a reward or as the end of an episode, for any agent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import as_number
-from hypogoal.domains.gymnasium_engine import Look, look_of, stepped
+from hypogoal.domains.gymnasium_engine import Reader, reader_of, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 
 Env: TypeAlias = gymnasium.Env[Any, Any]
@@ -17,35 +17,35 @@ By: TypeAlias = str | SupportsIndex
 RULES = ("any", "vote", "all", "mean")
 
 
-def require_observations(env: Env, ensemble: Ensemble) -> Look:
-    """How to read an environment's observations; a ``UserError`` where they are not those that the ensemble knows."""
-    look, dtype, shape = look_of(env), ensemble.view.dtype, ensemble.observation_shape
-    if (look.shape, look.dtype) != (shape, dtype):
-        given = f"{look.dtype} {look.shape}, not {dtype} {shape}"
+def require_observations(env: Env, ensemble: Ensemble) -> Reader:
+    """A reader of an environment's observations; a ``UserError`` if the ensemble was trained on others."""
+    reader, dtype, shape = reader_of(env), ensemble.view.dtype, ensemble.observation_shape
+    if (reader.shape, reader.dtype) != (shape, dtype):
+        mismatch = f"{reader.dtype} {reader.shape}, not {dtype} {shape}"
         do = "Use the environment they were trained on, with its wrappers."
-        raise UserError("these members were trained on other observations", given, do)
-    return look
+        raise UserError("these members were trained on other observations", mismatch, do)
+    return reader
 
 
 class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """What both wrappers share: whether the sub-goal holds in an observation."""
+    """What both wrappers share: the rule for whether the sub-goal holds in an observation."""
 
     def __init__(self, env: Env, ensemble: Ensemble, by: By, **arguments: Any):
-        asked = by if isinstance(by, str) else as_number(by)
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, ensemble=ensemble, by=asked, **arguments)
+        rule = by if isinstance(by, str) else as_number(by)
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, ensemble=ensemble, by=rule, **arguments)
         gymnasium.Wrapper.__init__(self, env)
-        self._look = require_observations(env, ensemble)
+        self._reader = require_observations(env, ensemble)
         if ensemble.needs_positions:
             do = "Train it with localiser=learned."
             raise UserError("the ensemble needs the agent's positions (localiser=ram)", None, do)
-        if asked not in RULES and asked not in range(len(ensemble)):
+        if rule not in RULES and rule not in range(len(ensemble)):
             do = f"Choose one of {', '.join(RULES)}, or a member, 0 to {len(ensemble) - 1}."
             raise UserError("unknown rule for whether the sub-goal holds", f"by={by!r}", do)
-        self.ensemble, self.by = ensemble, asked
+        self.ensemble, self.by = ensemble, rule
 
     def holds(self, observation: Any) -> bool:
-        """Whether the sub-goal holds in an observation of the environment, by the members asked."""
-        observation = self._look.read(self.env, observation)
+        """Whether the sub-goal holds in an observation of the environment, by the chosen rule."""
+        observation = self._reader.read(self.env, observation)
         if self.by == "mean":
             return bool(self.ensemble.predict(observation[None])[0].mean() > 0.5)
         verdicts = self.ensemble.verdicts(observation[None])[0]
@@ -57,7 +57,7 @@ class _Subgoal(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 class SubgoalReward(_Subgoal):
     """Reward where a sub-goal's classifier fires (Spec D1): ``scale`` there, 0 elsewhere.
 
-    An agent can stay where it is rewarded. To prevent that, wrap the result in :class:`SubgoalTermination` too.
+    An agent can stay where it is rewarded; to prevent that, wrap the result in :class:`SubgoalTermination` too.
 
     Args:
         env: an environment with the observations that the ensemble was trained on.
@@ -67,7 +67,7 @@ class SubgoalReward(_Subgoal):
         scale: the reward.
         add: add to the environment's own reward instead of replacing it.
 
-    ``info["subgoal"]`` says whether the sub-goal holds.
+    ``info["subgoal"]`` is whether the sub-goal holds.
     """
 
     def __init__(self, env: Env, ensemble: Ensemble, by: By = "vote", *, scale: float = 1.0, add: bool = False):
@@ -75,7 +75,7 @@ class SubgoalReward(_Subgoal):
         self.scale, self.add = scale, add
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Like the environment's, with the reward changed."""
+        """The environment's step with the reward changed."""
         observation, reward, terminated, truncated, info = stepped(self.env, action)
         holds = self.holds(observation)
         bonus = self.scale if holds else 0.0
@@ -85,14 +85,14 @@ class SubgoalReward(_Subgoal):
 class SubgoalTermination(_Subgoal):
     """The episode terminates where a sub-goal's classifier fires (Spec D1); arguments as for :class:`SubgoalReward`.
 
-    ``info["subgoal"]`` says whether the sub-goal holds.
+    ``info["subgoal"]`` is whether the sub-goal holds.
     """
 
     def __init__(self, env: Env, ensemble: Ensemble, by: By = "vote"):
         super().__init__(env, ensemble, by)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Like the environment's, ``terminated`` where the sub-goal holds."""
+        """The environment's step, ``terminated`` where the sub-goal holds."""
         observation, reward, terminated, truncated, info = stepped(self.env, action)
         holds = self.holds(observation)
         return observation, reward, terminated or holds, truncated, info | {"subgoal": holds}

@@ -10,7 +10,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
-from hypogoal.hypotheses.views import AgentView, windows
+from hypogoal.hypotheses.views import AgentView, cut_windows
 
 SIDE = 42  # pixels, half of what is seen of Montezuma's Revenge
 
@@ -25,7 +25,7 @@ def localiser_of(ensemble: Ensemble) -> Localiser:
 
 def around_agent(localiser: Localiser, observations: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Windows uint8 (N, SIDE, SIDE, C) of observations uint8 (N, H, W, C)."""
-    return windows(observations, localiser.locate(observations), SIDE, SIDE)
+    return cut_windows(observations, localiser.locate(observations), SIDE, SIDE)
 
 
 class AgentWindows(Resumable):
@@ -52,7 +52,7 @@ class AgentWindows(Resumable):
         unknown = np.isnan(self._centres[fresh, 0])
         if unknown.any():
             self._centres[fresh[unknown]] = self.localiser.locate(whole[first[unknown]])
-        seen = windows(whole, self._centres[ids], SIDE, SIDE)
+        seen = cut_windows(whole, self._centres[ids], SIDE, SIDE)
         if out is None:
             return seen
         out[:] = seen

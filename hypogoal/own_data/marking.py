@@ -21,7 +21,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import inside, replacing, sync
 from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import open_dataset
-from hypogoal.domains.gymnasium_engine import begun, look_of, make_checked, stepped
+from hypogoal.domains.gymnasium_engine import begun, make_checked, reader_of, stepped
 from hypogoal.own_data.arrays import read_states
 from hypogoal.own_data.images import image_files, read_image, size_text
 
@@ -329,7 +329,7 @@ class Played(Source):
 
     def __init__(self, make: Callable[[], gymnasium.Env], layout_seed: int = 0):
         self._env = make_checked(make)
-        self._look = look_of(self._env)
+        self._look = reader_of(self._env)
         _require_images(self._look.dtype, self._env.observation_space)
         self._names = action_names(self._env)
         self._layout = layout_seed

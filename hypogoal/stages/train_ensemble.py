@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hypogoal.cards import create_artefact
 from hypogoal.core.artefacts import claim, open_artefact
-from hypogoal.core.checkpoints import FOLDER, Resumable, checkpoints_of, growing
+from hypogoal.core.checkpoints import FOLDER, checkpoints_of, growing
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
@@ -29,8 +29,8 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble, write_ensemble
 from hypogoal.hypotheses.networks import load_network, network_for
 from hypogoal.hypotheses.scores import best_threshold, halves, member_scores, ranking
 from hypogoal.hypotheses.thresholds import thresholds
-from hypogoal.hypotheses.training import fit
-from hypogoal.hypotheses.views import positions_of
+from hypogoal.hypotheses.training import Look, Watcher, fit
+from hypogoal.hypotheses.views import StateOrigins, positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
@@ -161,14 +161,15 @@ def score_rows(
             yield {"scope": scope, "member": member, **counts, **numbers}
 
 
-class _Report(Resumable):
+class _Report(Watcher):
     """Writes the losses of a sub-goal's ensemble down as they come, and remembers the last ones; its scores too."""
 
-    def __init__(self, sub_goal: str, log: MetricsLog, scores: MetricsLog):
+    def __init__(self, sub_goal: str, log: MetricsLog, scores: MetricsLog, look: Look, look_at: set[int]):
+        super().__init__(look=look, look_at=look_at)
         self.sub_goal, self.log, self.scores = sub_goal, log, scores
         self.numbers: dict[str, float] = {}
 
-    def __call__(self, step: int, losses: dict[str, float]) -> None:
+    def report(self, step: int, losses: dict[str, float]) -> None:
         self.numbers.update(losses)
         self.log.write(sub_goal=self.sub_goal, step=step, **losses)
 
@@ -190,17 +191,18 @@ def _train_one(
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
-    report = _Report(sub_goal, *(MetricsLog(folder.parent / FOLDER / f"{sub_goal}{part}") for part in PARTS.values()))
+    log, scores = (MetricsLog(folder.parent / FOLDER / f"{sub_goal}{part}") for part in PARTS.values())
     if not checkpoints.saved:
-        report.log.restore(0)
-        report.scores.restore(0)
+        log.restore(0)
+        scores.restore(0)
     steps = steps_of(config)
     heldout = dataset.heldout(sub_goal) if config.score_every else None
 
     def look(step: int, ensemble: Ensemble) -> None:
         for row in score_rows(ensemble, heldout, unlabelled, positions_of(origins)) if heldout else ():
-            report.scores.write(sub_goal=sub_goal, step=step, **row)
+            scores.write(sub_goal=sub_goal, step=step, **row)
 
+    report = _Report(sub_goal, log, scores, look, {*range(0, steps, config.score_every or steps), steps})
     domain = installed_domain(dataset.domain) if config.view == "agent-crop" else None
     ensemble = fit(
         split.observations,
@@ -209,11 +211,7 @@ def _train_one(
         config,
         seed_for(seed, "ensemble", sub_goal),
         report,
-        look=look,
-        look_at={*range(0, steps, config.score_every or steps), steps},
-        origins=split.origins,
-        unlabelled_origins=origins,
-        agent_pixels=domain.agent_pixels if domain and domain.sees_agent else None,
+        origins=StateOrigins(split.origins, origins, domain.agent_pixels if domain and domain.sees_agent else None),
         device=device,
         checkpoints=checkpoints,
     )

@@ -1,6 +1,6 @@
-"""The contracts of domains, diversity objectives and networks, as tests that users run on their own (Spec B6, C1).
+"""The contracts of domains, diversity objectives and networks, as tests that users run on theirs (Spec B6, C1).
 
-``hypogoal check`` prints a line for each. In your own test suite: ``require(check_domain(DOMAIN))``.
+``hypogoal check`` prints a line for each test. In your own test suite: ``require(check_domain(DOMAIN))``.
 """
 
 from hypogoal.testing.domains import check_domain

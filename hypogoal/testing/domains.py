@@ -1,4 +1,4 @@
-"""The contract of a domain, as a test that its author runs (Spec B6; see ``hypogoal.domains.base``)."""
+"""The contract of a domain, as tests for its author (Spec B6; see ``hypogoal.domains.base``)."""
 
 import dataclasses
 import math
@@ -36,11 +36,11 @@ from hypogoal.testing.verdict import Test, TimeUp, Verdict, promise, run
 
 COUNT, STEPS, MAX_STEPS = 3, 60, 25
 LEAST_STEPS = 4  # of those STEPS, however slow the environment is
-PLAYS = 6  # how often tests of an engine play so many steps
-SECONDS = 120.0  # that a check takes at most
-TIMED_SECONDS, TIMED_STEPS = 1.0, 5  # of play, whichever is shorter: then it is known what a step takes
-OF_ENGINE, OF_COLLECTING = 1 / 3, 0.8  # shares of the time that is left when it is planned
-GYMNASIUM_SAYS_NOT = ("is different from the unwrapped version",)  # of its checker's warnings: wrappers are the point
+PLAYS = 6  # how many times the tests of an engine play these steps
+SECONDS = 120.0  # the most that a check takes
+TIMED_SECONDS, TIMED_STEPS = 1.0, 5  # play needed to estimate a step's time, whichever is shorter
+ENGINE_SHARE, COLLECTING_SHARE = 1 / 3, 0.8  # of the time left when the check is planned
+IGNORED_WARNINGS = ("is different from the unwrapped version",)  # of Gymnasium's checker: wrappers are the point
 
 
 def check_domain(
@@ -53,12 +53,12 @@ def check_domain(
     name: str = "",
     progress: Progress | None = None,
 ) -> Iterator[Verdict]:
-    """Whether a domain keeps to what the stages rely on.
+    """Whether a domain keeps the promises that the stages rely on.
 
-    Plays a layout at random, and collects a few states twice, with ``config``, an instance of its ``config_class``
-    (None: the defaults). ``seed`` is for both. Of a slow domain it plays less, so that it takes no more than about
-    ``seconds``; what is then not looked at is a warning, and so is a sub-goal that play does not meet. ``name`` is what
-    the user calls the domain, ``progress`` where it is said how long this takes.
+    Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
+    (None: the defaults). ``seed`` is for both. It plays less of a slow domain, so that it takes at most about
+    ``seconds``; what it then skips is a warning, and so is a sub-goal that play does not reach. ``name`` is the user's
+    name for the domain; ``progress`` shows how long this takes.
     """
     clock = _Clock(seconds, progress or Progress("check", total=1, quiet=True))
     yield from run(_Contract(domain, config, layout_seed, seed, clock, name).tests())
@@ -66,7 +66,7 @@ def check_domain(
 
 
 class _Clock:
-    """The time that a check has, and what a step takes."""
+    """The time left for a check, and the time per step."""
 
     def __init__(self, seconds: float, progress: Progress):
         self.seconds, self.progress = seconds, progress
@@ -75,41 +75,41 @@ class _Clock:
 
     @property
     def left(self) -> float:
-        """Seconds."""
+        """Seconds left."""
         return self._end - monotonic()
 
     @property
     def pace(self) -> float:
-        """Seconds that a step of one environment takes, and what else comes with it: new episodes, labels."""
+        """Seconds per step of one environment, new episodes and labels included."""
         return self._spent / max(1, self._steps)
 
     @property
     def timed(self) -> bool:
-        """Whether enough was played to tell the pace."""
+        """Whether enough was played to estimate the pace."""
         return self._spent >= TIMED_SECONDS or self._steps >= TIMED_STEPS * COUNT
 
     def count(self, started: float) -> None:
-        """One more step of all environments, which began at ``started``."""
+        """Count a step of all environments that began at ``started``."""
         self._spent += monotonic() - started
         self._steps += COUNT
 
     def require(self) -> None:
-        """Stop here (``TimeUp``) if time is up."""
+        """Raise ``TimeUp`` if time is up."""
         if self.left < 0:
             do = "Give it more with --minutes, or seconds= in Python."
             raise TimeUp(f"the {duration(self.seconds)} that a check may take are over", None, do)
 
 
 class _Collecting(Progress):
-    """The progress of collecting, of which ``times`` are to come, as a part of a check's."""
+    """The progress of collecting, with ``times`` collections to come, as a part of a check's progress."""
 
     def __init__(self, clock: _Clock, times: int):
         super().__init__("collect", total=1, quiet=True)
         self._clock, self._times = clock, times
 
     def expect(self, total: int) -> None:
-        whole = self._clock.progress
-        whole.expect(whole.done + self._times * total)
+        check = self._clock.progress
+        check.expect(check.done + self._times * total)
 
     def update(self, done: int, **numbers: float) -> None:
         self._clock.progress.advance(done - self.done)
@@ -120,8 +120,8 @@ class _Collecting(Progress):
 class _Contract:
     def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int, clock: _Clock, name: str):
         self.domain, self.config, self.layout_seed, self.seed = domain, config, layout_seed, seed
-        self.clock, self.name, self.met_all = clock, name, True
-        self.count = STEPS  # that each test of an engine plays
+        self.clock, self.name, self.reached_all = clock, name, True
+        self.count = STEPS  # of each test of an engine
 
     def tests(self) -> Iterator[Test]:
         yield "names", self.names
@@ -145,20 +145,20 @@ class _Contract:
         return ", ".join(goals)
 
     def defaults(self) -> str:
-        """Of each stage settings that it has, with values that it takes."""
-        known = {"collect": self.domain.config_class, **CONFIGS}
+        """Each stage must have these settings and accept their values."""
+        configs = {"collect": self.domain.config_class, **CONFIGS}
         for stage, values in self.domain.defaults.items():
-            do = meant(str(stage), known) or f"The stages are {', '.join(known)}."
-            promise(stage in known, f"defaults are for {stage!r}, which is not a stage", do)
-            kept = isinstance(values, Mapping)
-            promise(kept, f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
-            from_values(known[stage], values, stage)
+            do = meant(str(stage), configs) or f"The stages are {', '.join(configs)}."
+            promise(stage in configs, f"defaults are for {stage!r}, which is not a stage", do)
+            is_table = isinstance(values, Mapping)
+            promise(is_table, f"defaults of {stage} are {values!r}", "Give a table: setting to value.")
+            from_values(configs[stage], values, stage)
         return ", ".join(f"{stage} {len(values)}" for stage, values in self.domain.defaults.items())
 
     def gymnasium(self) -> str:
-        """Gymnasium's own checker; what it does not like is whose layer first has it."""
+        """Gymnasium's own checker; a fault is attributed to the innermost wrapper that has it."""
         env = self.domain.make_env()
-        with warnings.catch_warnings(record=True) as given:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
                 _check_env(env)
@@ -168,8 +168,8 @@ class _Contract:
                 layer = culprit(env, _breaks)
                 with UsersCode("the environment", layer, method, failed="breaks Gymnasium's contract:"):
                     raise
-        for warning in given:
-            if not any(text in str(warning.message) for text in GYMNASIUM_SAYS_NOT):
+        for warning in caught:
+            if not any(text in str(warning.message) for text in IGNORED_WARNINGS):
                 warnings.warn(str(warning.message), stacklevel=2)
         return f"{env.observation_space}, {env.action_space}"
 
@@ -188,14 +188,14 @@ class _Contract:
         dtype = engine.observation_dtype
         text = f"observations are {dtype} in the engine, {self.domain.observation_dtype} in the domain"
         promise(dtype == self.domain.observation_dtype and dtype in (PICTURE, NUMBERS), text, "Give uint8 or float32.")
-        given = f"observation_shape is {shape}"
-        promise(len(shape) == 3 or dtype == NUMBERS, given, "Pictures are (height, width, channels).")
+        text = f"observation_shape is {shape}"
+        promise(len(shape) == 3 or dtype == NUMBERS, text, "Pictures are (height, width, channels).")
         if self.domain.doubt:
             warnings.warn(self.domain.doubt, stacklevel=2)
         _array(engine.reset(), np.int64, (COUNT,), "what reset() returns")
         _array(engine.ids, np.int64, (COUNT,), "ids")
-        known = bool((engine.ids >= 0).all() and (engine.ids < engine.n_states).all())
-        promise(known, f"ids {engine.ids} with n_states {engine.n_states}", "Ids are 0 .. n_states - 1.")
+        valid = bool((engine.ids >= 0).all() and (engine.ids < engine.n_states).all())
+        promise(valid, f"ids {engine.ids} with n_states {engine.n_states}", "Ids are 0 .. n_states - 1.")
         return f"{engine.n_actions} actions, {COUNT} environments"
 
     def images(self) -> str:
@@ -234,11 +234,11 @@ class _Contract:
         return f"{played} random steps, {ended} episodes ended"
 
     def labels(self) -> str:
-        """Of every state that random play meets, asked twice; and whether what is seen says them."""
+        """Labels of all states in random play: the same when computed twice, and determined by the observation."""
         engine, do = self.make_engine(), "A label is a function of the state now: count, keep and draw nothing in it."
         goals = len(self.domain.sub_goals)
         rows: dict[bytes, set[bytes]] = {}
-        met = np.zeros(goals, np.int64)
+        positives = np.zeros(goals, np.int64)
         for actions in self.actions(engine):
             ids = engine.step(actions).next_ids
             labels = engine.labels(ids)
@@ -246,14 +246,14 @@ class _Contract:
             changed = (engine.labels_now() != engine.labels(engine.ids)).any(0)
             named = ", ".join(goal for goal, other in zip(self.domain.sub_goals, changed, strict=True) if other)
             promise(not named, f"asked twice in the same state, labels differ: {named}", do)
-            met += labels.sum(0)
+            positives += labels.sum(0)
             for image, label in zip(engine.images(ids), labels, strict=True):
                 rows.setdefault(image.tobytes(), set()).add(label.tobytes())
-        torn = sum(len(labels) > 1 for labels in rows.values())
-        if torn:
-            text = f"{torn} of {len(rows)} observations came with different labels: no classifier can tell those apart"
+        ambiguous = sum(len(labels) > 1 for labels in rows.values())
+        if ambiguous:
+            text = f"{ambiguous} of {len(rows)} observations have different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=2)
-        counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, met, strict=True))
+        counts = ", ".join(f"{goal} {count}" for goal, count in zip(self.domain.sub_goals, positives, strict=True))
         return f"held in random play, of {self.count * COUNT} states: {counts}"
 
     def determinism(self) -> str:
@@ -280,24 +280,24 @@ class _Contract:
         return "a restored engine goes on as the one it was saved from"
 
     def collect(self, times: int) -> Collected:
-        """What is collected; so many ``times`` are to come."""
+        """Collect states; ``times`` counts this and the collections to come."""
         try:
             return self.domain.collect(self.small, self.seed, _Collecting(self.clock, times))
         except Unmet as error:
             if error.collected is None:
                 raise
-            self.met_all = False
+            self.reached_all = False
             return error.collected
 
     def collection(self) -> str:
         self.small = self.domain.small(self.config)
-        wanted = self.domain.collected_steps(self.small)
-        few = int(OF_COLLECTING * self.clock.left / 2 / self.clock.pace)
-        self.hurried = wanted > few
+        planned = self.domain.collected_steps(self.small)
+        affordable = int(COLLECTING_SHARE * self.clock.left / 2 / self.clock.pace)
+        self.hurried = planned > affordable
         if self.hurried:
-            self.small = self.domain.shortened(self.small, few)
+            self.small = self.domain.shortened(self.small, affordable)
             steps = self.domain.collected_steps(self.small)
-            text = f"played {steps:,} of the {wanted:,} steps that 'collect' plays, for want of time"
+            text = f"played {steps:,} of the {planned:,} steps that 'collect' plays, for want of time"
             warnings.warn(f"{text}: --minutes {self.minutes_for_all()} plays all", stacklevel=2)
         self.collected = self.collect(2)
         goals = len(self.domain.sub_goals)
@@ -307,7 +307,7 @@ class _Contract:
         for name, states in _sets(self.collected):
             count = len(states.observations)
             text, do = f"there are no {name} states", "Collect some: other seeds, or more steps."
-            promise(count > 0 or not self.met_all, text, do)
+            promise(count > 0 or not self.reached_all, text, do)
             if not count:
                 warnings.warn(f"{text}: 'collect' would stop here. {do}", stacklevel=2)
             kind, shape = self.domain.observation_dtype, self.domain.observation_shape
@@ -316,39 +316,42 @@ class _Contract:
             for origin, values in states.origins.items():
                 fits = values.shape == (count,) and values.dtype.kind in "iu"
                 promise(fits, f"{name} origin {origin} is {values.dtype} {values.shape}", f"Give int ({count},).")
-        found = ", ".join(f"{len(states.observations)} {name}" for name, states in _sets(self.collected))
+        counts = ", ".join(f"{len(states.observations)} {name}" for name, states in _sets(self.collected))
         size = self.domain.collected_bytes(self.config)
-        return f"{found}; 'collect' keeps up to {human(size)}, twice that in memory" if size else found
+        return f"{counts}; 'collect' keeps up to {human(size)}, twice that in memory" if size else counts
 
     def classes(self) -> str:
         text = []
         for column, goal in enumerate(self.domain.sub_goals):
             labelled, heldout = self.collected.labelled.labels[:, column], self.collected.heldout.labels[:, column]
             both = len(np.unique(labelled)) == 2
-            promise(both or not self.met_all, *_missing(goal, "labelled", labelled))
+            promise(both or not self.reached_all, *_missing(goal, "labelled", labelled))
             if not both:
-                warnings.warn(self.never_met(goal, bool(labelled.any())), stacklevel=2)
+                warnings.warn(self.never_reached(goal, bool(labelled.any())), stacklevel=2)
             if len(np.unique(heldout)) < 2:
                 warnings.warn(". ".join(_missing(goal, "held-out", heldout)), stacklevel=2)
             text.append(f"{goal} {int(labelled.sum())} of {len(labelled)}")
-        known = [len(np.unique(column)) > 1 for column in self.collected.labelled.labels.T]
-        goals = [goal for goal, both in zip(self.domain.sub_goals, known, strict=True) if both]
-        for line in hard_to_learn(self.collected.labelled.labels[:, known], goals):
+        complete = [len(np.unique(column)) > 1 for column in self.collected.labelled.labels.T]
+        goals = [goal for goal, both in zip(self.domain.sub_goals, complete, strict=True) if both]
+        for line in hard_to_learn(self.collected.labelled.labels[:, complete], goals):
             warnings.warn(f"{line}. {GET_MORE}", stacklevel=2)
         return f"positives among labelled: {', '.join(text)}"
 
     def collected_again(self) -> str:
         for (name, states), (_, again) in zip(_sets(self.collected), _sets(self.collect(1)), strict=True):
-            same = all(np.array_equal(getattr(states, of), getattr(again, of)) for of in ("observations", "labels"))
+            same = np.array_equal(states.observations, again.observations) and np.array_equal(
+                states.labels, again.labels
+            )
             promise(same, f"{name} states differ when collected again with seed {self.seed}", DETERMINISM)
         return "the same states for the same seed"
 
     def heldout(self) -> str:
-        states, known = self.collected.heldout, (self.collected.labelled, self.collected.unlabelled)
-        double = len(states.labels) - len(leave_out(states, *(of.observations for of in known)).labels)
-        if not double:
+        states, training = self.collected.heldout, (self.collected.labelled, self.collected.unlabelled)
+        kept = leave_out(states, *(part.observations for part in training))
+        repeated = len(states.labels) - len(kept.labels)
+        if not repeated:
             return "held-out states differ from those for learning"
-        text = f"{double} of {len(states.observations)} held-out states look like one of those for learning: "
+        text = f"{repeated} of {len(states.observations)} held-out states look like one of those for learning: "
         warnings.warn(f"{text}scores on them say less about other contexts", stacklevel=2)
         return "some are known"
 
@@ -361,20 +364,20 @@ class _Contract:
         build_network(name, tuple(self.domain.observation_shape), torch_generator(0, "check"))
         return f"member network {name!r} takes the observations"
 
-    def never_met(self, goal: str, always: bool) -> str:
-        """What to say of a sub-goal that held in none, or in each (``always``), of the labelled states."""
+    def never_reached(self, goal: str, always: bool) -> str:
+        """The warning about a sub-goal that held in none, or in all (``always``), of the labelled states."""
         text = f"{goal} held in {'every' if always else 'no'} state that play met on the labelled layouts, "
         text += "in the time that there was: " if self.hurried else "so 'collect' would stop here: "
         text += f"it is {'hard to leave' if always else 'rare'}, or its function errs"
         if self.domain.observation_dtype != PICTURE or not self.domain.has_env or not self.name:
             return f"{text}. {GET_MORE}"
         seeds = getattr(self.config, "labelled_seeds", (0,))[:1]
-        words = ("label", self.name, "--out", f"marks/{goal}", "--record", f"{goal}.json", "--layout-seed", *seeds)
+        arguments = ("label", self.name, "--out", f"marks/{goal}", "--record", f"{goal}.json", "--layout-seed", *seeds)
         do = f"Bring a policy that gets there, or play it by hand and give --play {goal}.json"
-        return f"{text}. {do}: {command(*words)}"
+        return f"{text}. {do}: {command(*arguments)}"
 
     def actions(self, engine: Engine, *, timed: bool = False) -> Iterator[NDArray[np.int64]]:
-        """The same random actions (E,) at every call; ``timed``: plan the check by how long the first ones take."""
+        """Random actions (E,), the same at every call; ``timed``: plan the check by the first steps' time."""
         rng = rng_for(self.seed, "check")
         number = 0
         while number < self.count:
@@ -382,18 +385,18 @@ class _Contract:
             started, number = monotonic(), number + 1
             yield rng.integers(engine.n_actions, size=COUNT)
             if timed:
-                known = self.clock.timed
+                planned = self.clock.timed
                 self.clock.count(started)
-                if self.clock.timed and not known:
+                if self.clock.timed and not planned:
                     self.plan()
             self.clock.progress.advance(COUNT)
 
     def plan(self) -> None:
-        """How many steps to play in the time that there is; says so."""
+        """Set and announce the number of steps to play in the time left."""
         pace, clock = self.clock.pace, self.clock
-        self.count = max(LEAST_STEPS, min(STEPS, int(OF_ENGINE * clock.left / (PLAYS * COUNT * pace))))
+        self.count = max(LEAST_STEPS, min(STEPS, int(ENGINE_SHARE * clock.left / (PLAYS * COUNT * pace))))
         engine, collecting = PLAYS * COUNT * self.count, 2 * self.domain.collected_steps(self.domain.small(self.config))
-        steps = engine + min(collecting, int(OF_COLLECTING * max(0.0, clock.left / pace - engine)))
+        steps = engine + min(collecting, int(COLLECTING_SHARE * max(0.0, clock.left / pace - engine)))
         clock.progress.resume(0)
         clock.progress.expect(steps)
         took = f"{1000 * pace:.2g} ms" if pace < 0.1 else f"{pace:.2g} s"
@@ -405,20 +408,20 @@ class _Contract:
                 say(text, err=True)
 
     def minutes_for_all(self) -> int:
-        """How long the check would take if it played all that it wants to."""
-        steps = PLAYS * COUNT * STEPS / OF_ENGINE + 2 * self.domain.collected_steps(self.domain.small(self.config))
-        return math.ceil(steps * self.clock.pace / OF_COLLECTING / 60)
+        """The minutes that the check would take without a limit."""
+        steps = PLAYS * COUNT * STEPS / ENGINE_SHARE + 2 * self.domain.collected_steps(self.domain.small(self.config))
+        return math.ceil(steps * self.clock.pace / COLLECTING_SHARE / 60)
 
 
 def _check_env(env: Any) -> None:
-    """Gymnasium's checker, but for closing, which makes it anew, and drawing."""
+    """Run Gymnasium's checker, except for rendering, and for closing, which makes the environment again."""
     from gymnasium.utils.env_checker import check_env
 
     check_env(env, skip_render_check=True, skip_close_check=True)
 
 
 def _breaks(env: Any) -> bool:
-    """Whether Gymnasium's checker does not like it."""
+    """Whether Gymnasium's checker rejects it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -436,7 +439,7 @@ def _sets(collected: Collected) -> list[tuple[str, States]]:
 
 
 def _missing(goal: str, name: str, labels: NDArray[np.bool_]) -> tuple[str, str]:
-    """What to say, and to do, where labels are of one class."""
+    """The fault, and what to do, if labels have one class only."""
     text = f"{goal} has no {'negatives' if labels.any() else 'positives'} among the {name} states"
     return text, GET_MORE
 
@@ -451,8 +454,8 @@ def _same_step(first: Engine, second: Engine, actions: NDArray[np.int64], where:
         promise(np.array_equal(first.labels(ids), second.labels(others)), f"labels differ ({where})", do)
 
 
-def _array(value: Any, dtype: Any, shape: tuple[int, ...], what: str) -> None:
-    given = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-    wanted = f"{np.dtype(dtype).name} {shape}"
+def _array(value: Any, dtype: Any, shape: tuple[int, ...], name: str) -> None:
+    kind = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+    expected = f"{np.dtype(dtype).name} {shape}"
     fits = isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape
-    promise(fits, f"{what}: {given} instead of {wanted}", "Give a NumPy array of that type and shape.")
+    promise(fits, f"{name}: {kind} instead of {expected}", "Give a NumPy array of that type and shape.")

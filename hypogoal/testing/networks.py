@@ -1,4 +1,4 @@
-"""What a member network must keep to, as a test that its author runs (Spec C5; ``hypogoal.hypotheses.networks``)."""
+"""The contract of a member network, as tests for its author (Spec C5; ``hypogoal.hypotheses.networks``)."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -23,7 +23,7 @@ CLOSE = 1e-4
 def check_network(
     name: str, observation_shape: tuple[int, ...] = (64, 64, 3), observation_dtype: np.dtype[Any] = PICTURE
 ) -> Iterator[Verdict]:
-    """Whether a member network, named as for ``--set network``, can be trained, stored, used to predict, explained."""
+    """Whether a member network, by its ``--set network`` name, can be trained, stored, used and explained."""
     view = FullView(observation_shape, standard_of(observation_shape) if observation_dtype == NUMBERS else None)
     return run(_Network(name, view).tests())
 
@@ -61,14 +61,14 @@ class _Network:
     def repeats(self) -> str:
         first, second = self.network(), self.network()
         for left, right in zip(first.parameters(), second.parameters(), strict=True):
-            promise(torch.equal(left, right), "two networks of one seed differ", "Make the layers anew at every call.")
+            promise(torch.equal(left, right), "two networks of one seed differ", "Make new layers at every call.")
         return "weights come from the generator"
 
     def agrees(self) -> str:
-        """One image, many, all members side by side: different code, the same function."""
+        """One image, many images, all members joined: different code, the same function."""
         ensemble = self.ensemble().eval()
         images = self.images(300)
-        images[40:] = images[:260]  # repeated pictures take a way of their own
+        images[40:] = images[:260]  # repeated pictures take another code path
         many, few = ensemble.predict(images), np.concatenate([ensemble.predict(images[i : i + 1]) for i in range(40)])
         stacked = 1 / (1 + np.exp(-StackedMembers([ensemble]).log_odds(images[:40])))
         for other, way in ((few, "one by one"), (stacked, "all members at once")):

@@ -1,4 +1,4 @@
-"""The laws of a diversity objective, as a test that its author runs (Spec C1, C2; see ``hypogoal.diversity``)."""
+"""The laws of a diversity objective, as tests for its author (Spec C1, C2; see ``hypogoal.diversity``)."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -11,23 +11,25 @@ from torch import Tensor
 from hypogoal.diversity import Context, EnsembleLoss, Objective, PairLoss
 from hypogoal.testing.verdict import Verdict, promise, run
 
-EXTREME = (20.0, 100.0, 1e4)  # logit gaps: from 17 on a float32 probability is exactly 0 or 1
+EXTREME = (20.0, 100.0, 1e4)  # logit gaps: from 17, a float32 probability is exactly 0 or 1
 AGREED = ((1, 0), (1, 1), (0, 0))
 
 
 def check_objective(objective: Objective) -> Iterator[Verdict]:
-    """Whether a diversity objective, see :func:`hypogoal.diversity.load_objective`, keeps what training relies on."""
+    """Whether a diversity objective, see :func:`hypogoal.diversity.load_objective`, obeys the laws of training."""
     laws: list[tuple[Callable[[Any], str], Any]] = [(law, objective) for law in OF_ALL]
     if objective.pair_loss:
         laws = [(shape, objective.pair_loss), *laws, *((law, objective.pair_loss) for law in OF_PAIRS)]
     else:
         laws = [(ensemble_shape, objective.ensemble_loss), *laws]
         laws += [(law, objective.ensemble_loss) for law in OF_ENSEMBLES]
-    return run((law.__name__.replace("_", " ").removeprefix("ensemble "), partial(law, of)) for law, of in laws)
+    return run(
+        (law.__name__.replace("_", " ").removeprefix("ensemble "), partial(law, subject)) for law, subject in laws
+    )
 
 
 def confident(*classes: int, gap: float = 6.0) -> Tensor:
-    """Logits (N, 2) of a member that is sure of these classes."""
+    """Logits (N, 2) of a member that is confident of these classes."""
     sign = 2.0 * torch.tensor(classes, dtype=torch.float32) - 1.0
     return torch.stack([-sign * gap / 2, sign * gap / 2], dim=-1)
 
@@ -53,7 +55,7 @@ def disagreement_lowers_it(pair_loss: PairLoss) -> str:
 
 
 def descent_parts_members(pair_loss: PairLoss, steps: int = 400) -> str:
-    """Not only the value, its gradient too pushes members apart."""
+    """The gradient, not only the value, pushes members apart."""
     fixed = confident(1, 1, 0, 0, gap=2.0)
     moved = (fixed + 0.05 * torch.tensor([[0.0, 0.3], [0.0, -0.3], [0.2, 0.0], [-0.2, 0.0]])).requires_grad_()
     optimiser = torch.optim.SGD([moved], lr=1.0)
@@ -85,10 +87,10 @@ def finite_at_extreme_logits(pair_loss: PairLoss) -> str:
 
 
 def gradient_does_not_vanish(pair_loss: PairLoss, gap: float = 10.0) -> str:
-    """Members that are sure, and agree where they should not, must still be pushed.
+    """Confident members that agree must still be pushed apart.
 
-    An objective that compares members over states, as mutual information does, has nothing to say where each says the
-    same of all of them, so one of three cases is enough.
+    An objective that compares members across states, such as mutual information, has no gradient if each predicts one
+    class for all states, so one of three cases suffices.
     """
     largest = 0.0
     for classes in AGREED:
@@ -106,9 +108,9 @@ OF_PAIRS = (disagreement_lowers_it, descent_parts_members, finite_at_extreme_log
 def context_of(
     members: int = 3, states: int = 7, frozen: int = 0, *, gap: float = 1.0, seed: int = 3, dtype: Any = torch.float64
 ) -> Context:
-    """A batch of random members that can be differentiated: 6 labelled and ``states`` unlabelled states.
+    """A differentiable batch of random members: 6 labelled and ``states`` unlabelled states.
 
-    ``gap`` is the standard deviation of their logits, of which half of the unlabelled ones are agreed upon.
+    ``gap`` is the standard deviation of the logits; members agree on half of the unlabelled states.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -131,7 +133,7 @@ def context_of(
 
 
 def rearranged(context: Context, members: Tensor, states: Tensor) -> Context:
-    """The same batch with its members and its unlabelled states in another order."""
+    """The batch with its members and its unlabelled states in another order."""
     gradients = context.input_gradients()
     return replace(
         context,
@@ -145,7 +147,7 @@ def rearranged(context: Context, members: Tensor, states: Tensor) -> Context:
 
 
 def ensemble_shape(ensemble_loss: EnsembleLoss) -> str:
-    """One number for any number of members, in training and before it."""
+    """One number, for any number of members in training and frozen ones."""
     for members, frozen in ((1, 0), (2, 0), (3, 0), (1, 2), (2, 1)):
         loss = ensemble_loss(context_of(members, frozen=frozen))
         text = f"{members} members and {frozen} frozen ones give {loss.tolist()}"
@@ -164,12 +166,12 @@ def empty_sets(objective: Objective) -> str:
 
 
 def order_does_not_matter(objective: Objective) -> str:
-    """Neither that of the members nor that of the states."""
-    context, none = context_of(), torch.arange(3)
+    """Of the members, and of the states."""
+    context = context_of()
     loss = objective.losses(context).sum()
     same = torch.allclose(loss, objective.losses(rearranged(context, torch.tensor([2, 0, 1]), torch.arange(7))).sum())
     promise(same, "the loss changes when the members change places", "Make it symmetric, for example by a mean.")
-    other = rearranged(context, none, torch.tensor([3, 6, 0, 5, 1, 2, 4]))
+    other = rearranged(context, torch.arange(3), torch.tensor([3, 6, 0, 5, 1, 2, 4]))
     same = torch.allclose(loss, objective.losses(other).sum())
     promise(same, "the loss depends on the order of the states", "Use a mean over states.")
     return "members and states are interchangeable"
@@ -187,7 +189,7 @@ def ensemble_finite_at_extreme_logits(ensemble_loss: EnsembleLoss) -> str:
 
 
 def ensemble_gradient_does_not_vanish(ensemble_loss: EnsembleLoss) -> str:
-    """Each of three members must be moved, through its logits, features or input gradients."""
+    """Each of three members gets a gradient, through its logits, features or input gradients."""
     context = context_of()
     gradients = _differentiate(ensemble_loss(context), context)
     largest = [max(float(of_members[member].abs().max()) for of_members in gradients) for member in range(3)]
@@ -197,12 +199,12 @@ def ensemble_gradient_does_not_vanish(ensemble_loss: EnsembleLoss) -> str:
 
 
 def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
-    """Gradients by all that a context holds, 0 where the loss does not depend on it."""
+    """Gradients by all parts of a context, 0 for those that the loss does not depend on."""
     leaves = [context.labelled, context.unlabelled, context.labelled_features, context.unlabelled_features]
     leaves.append(context.input_gradients())
-    found = torch.autograd.grad(loss, leaves, allow_unused=True) if loss.requires_grad else [None] * len(leaves)
-    both = zip(leaves, found, strict=True)
-    return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in both]
+    if not loss.requires_grad:
+        return [torch.zeros_like(leaf) for leaf in leaves]
+    return list(torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True))
 
 
 OF_ALL = (empty_sets, order_does_not_matter)

@@ -1,4 +1,4 @@
-"""What one check found, and how checks are run: one that fails ends those that build on it, not the program."""
+"""The result of a check, and how checks run: a failure ends the checks that build on it, not the program."""
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -13,24 +13,24 @@ Test = tuple[str, Callable[[], str]]
 
 
 class TimeUp(UserError):
-    """A check took as long as it may: what is left is not looked at, and no promise is broken by that."""
+    """A check ran out of time: the rest is skipped, which breaks no promise."""
 
 
 def promise(kept: bool, what: str, do: str) -> None:
-    """A ``UserError`` where a promise is not kept: what was found, and what to do about it."""
+    """Raise a ``UserError``, with what is wrong and what to do about it, unless a promise is ``kept``."""
     if not kept:
         raise UserError(what, do=do)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One check.
+    """The result of one check.
 
     Attributes:
         name: what was checked.
         ok: whether the promise is kept.
-        text: what was found; where the promise is not kept, also what to do.
-        warnings: what is allowed and may still surprise.
+        text: the finding; if the promise is broken, also what to do.
+        warnings: findings that are allowed but may surprise.
     """
 
     name: str
@@ -46,14 +46,14 @@ class Verdict:
 
 
 def run(tests: Iterable[Test]) -> Iterator[Verdict]:
-    """Run tests, names and functions, one after the other, until one fails: those after it build on what it found.
+    """Run tests, pairs of a name and a function, until one fails: later ones build on earlier ones.
 
-    A function says what it found, or raises. Warnings that it gives are kept. Where time is up, or play did not meet
-    what the next ones need, the rest is not looked at, which is no failure.
+    A function returns its finding, or raises. Its warnings are kept. If time is up, or play did not reach the states
+    that later tests need, the rest is skipped, which is no failure.
     """
     tests = iter(tests)
     for name, test in tests:
-        with warnings.catch_warnings(record=True) as given:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             ok, over = True, False
             try:
@@ -66,13 +66,15 @@ def run(tests: Iterable[Test]) -> Iterator[Verdict]:
                     warnings.warn(f"not looked at: {', '.join(rest)}", stacklevel=1)
             except UserError as error:
                 ok, text = False, str(error)
-        yield Verdict(name, ok, " ".join(text.split()), tuple(dict.fromkeys(str(warning.message) for warning in given)))
+        yield Verdict(
+            name, ok, " ".join(text.split()), tuple(dict.fromkeys(str(warning.message) for warning in caught))
+        )
         if over or not ok:
             return
 
 
 def require(verdicts: Iterable[Verdict]) -> None:
-    """For a test suite: passes if all promises are kept, else raises an ``AssertionError`` that says which is not."""
+    """For a test suite: raise an ``AssertionError`` that names the first broken promise, if any."""
     for verdict in verdicts:
         if not verdict.ok:
             raise AssertionError("\n".join(verdict.lines))

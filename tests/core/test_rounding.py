@@ -31,7 +31,14 @@ def test_what_misses_a_bound_by_rounding_meets_it() -> None:
 @pytest.mark.parametrize(
     "share",
     [
-        *(NEAR, SOLVED, Patience.ENOUGH, ace.LEAST_SHARE, *montezuma_states.SHARES.values(), montezuma_states.SPARE),
+        *(
+            NEAR,
+            SOLVED,
+            Patience.ENOUGH,
+            ace.LEAST_SHARE,
+            *montezuma_states.KIND_SHARES.values(),
+            montezuma_states.SPARE,
+        ),
         *(montezuma_states.FEWEST_POSITIVES, montezuma_states.FEWEST_AT_A_BASE),
     ],
 )

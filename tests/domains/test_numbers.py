@@ -16,7 +16,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.dataset import DEVIATIONS, NUMBERS, open_dataset, standard_of, standardised, write_dataset
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
-from hypogoal.domains.gymnasium_engine import look_of
+from hypogoal.domains.gymnasium_engine import reader_of
 
 NAMES = (*(f"layout[{number}]" for number in range(8)), "noise", "place[0]", "place[1]")
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
@@ -39,7 +39,7 @@ class Says(gymnasium.Env[Any, int]):
 
 def read(space: spaces.Space[Any], observation: Any) -> Any:
     env = Says(space, observation)
-    look = look_of(env)
+    look = reader_of(env)
     values = look.read(env, observation)
     assert values.dtype == look.dtype and values.shape == look.shape
     return values.tolist(), look.features
@@ -119,7 +119,7 @@ def test_files_from_before_there_were_numbers_hold_pictures(tmp_path: Any) -> No
 def test_features_may_be_named() -> None:
     """Spec B6: one name for each number."""
     named = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=[f"f{number}" for number in range(11)])
-    assert named.look.features[-1] == "f10"
+    assert named.reader.features[-1] == "f10"
     with pytest.raises(UserError, match="number of feature names is wrong: 2 for 11"):
         _ = GymnasiumDomain(corridor_env.Sensed, SUB_GOALS, features=["a", "b"]).observation_shape
     with pytest.raises(UserError, match="1 for 0"):

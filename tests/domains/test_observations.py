@@ -17,7 +17,7 @@ from benchmarks.observations import DTYPES, drawn_observation, outcome_of
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import NUMBERS, PICTURE, open_dataset
-from hypogoal.domains.gymnasium_engine import look_of
+from hypogoal.domains.gymnasium_engine import reader_of
 from hypogoal.own_data.parts import Parts, as_observations, collected_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"
@@ -64,7 +64,7 @@ def test_frames_and_colours_are_stacked_in_their_order() -> None:
         space = spaces.Box(0, 255, states.shape[1:], np.uint8)
         env = Says(space, states[1])
         with pytest.raises(UserError) as refused:
-            look_of(env)
+            reader_of(env)
         of_env = str(refused.value)
         with pytest.raises(UserError) as refused:
             as_observations(states, "the states")
@@ -83,17 +83,17 @@ def test_a_dictionary_hides_no_picture() -> None:
     for shape, dtype in (((4, 48, 48, 3), np.uint8), ((48, 48), np.int64), ((3, 48, 48), np.uint8)):
         space = spaces.Dict(a=speed, b=spaces.Box(0, 1, shape, dtype))
         with pytest.raises(UserError, match="observations mix pictures with other values: a, b"):
-            look_of(Says(space, None))
+            reader_of(Says(space, None))
         alone = Says(spaces.Dict(b=space["b"]), {"b": np.ones(shape, dtype)})
         with pytest.raises(UserError) as refused:
-            look_of(alone)
+            reader_of(alone)
         line = re.search(r"env = (.*?); of numbers: env = (.*)", str(refused.value))
         for number, kind in ((1, PICTURE), (2, NUMBERS)):
             wrapped = eval(line[number], {"gymnasium": gymnasium, "env": alone})
-            assert look_of(wrapped).dtype == kind
-            look_of(wrapped).read(wrapped, wrapped.reset()[0])
+            assert reader_of(wrapped).dtype == kind
+            reader_of(wrapped).read(wrapped, wrapped.reset()[0])
     space = spaces.Dict(a=speed, b=spaces.Box(0, 1, (48, 48, 3)))
-    assert "float32 (48, 48, 3) is taken for numbers: of pictures give (255 * x)" in look_of(Says(space, None)).doubt
+    assert "float32 (48, 48, 3) is taken for numbers: of pictures give (255 * x)" in reader_of(Says(space, None)).doubt
 
 
 def test_floats_that_may_be_pictures_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

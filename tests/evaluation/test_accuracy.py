@@ -50,7 +50,7 @@ def test_scores_without_a_class_are_not_numbers():
     np.testing.assert_allclose(negatives["accuracy"], [1, 1 / 2, 0, 1])
     nothing = member_scores(VERDICTS[:0], LABELS[:0])
     assert all(np.isnan(values).all() and values.shape == (4,) for values in nothing.values())
-    with pytest.raises(ValueError, match="6 verdicts for 2 labels"):
+    with pytest.raises(ValueError, match="6 predictions for 2 labels"):
         member_scores(VERDICTS, LABELS[:2])
 
 

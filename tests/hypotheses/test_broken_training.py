@@ -16,8 +16,8 @@ from hypogoal.domains.montezuma_emulator import observed_pixel
 from hypogoal.hypotheses import views
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.localisers import fit_localiser
-from hypogoal.hypotheses.training import fit
-from hypogoal.hypotheses.views import ACTIONS
+from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.hypotheses.views import ACTIONS, StateOrigins
 
 SHORT = dataclasses.replace(CROP, localiser="learned", steps=12, batch_size=16, diversity="dbat", diversity_weight=1e-2)
 
@@ -61,24 +61,22 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
     monkeypatch.setenv("HYPOGOAL_TRUST", "test_broken_training:dropping")
     monkeypatch.setattr(views, "fit_localiser", partial(fit_localiser, steps=2))
     observations, labels, origins = montezuma_states(60, seed=0)
-    unlabelled, _, there = montezuma_states(40, seed=1)
-    there |= {name: np.arange(40) % 18 for name in ACTIONS}
+    unlabelled, _, unlabelled_origins = montezuma_states(40, seed=1)
+    unlabelled_origins |= {name: np.arange(40) % 18 for name in ACTIONS}
 
     def trained(checkpoints: Checkpoints | None) -> tuple[dict[str, torch.Tensor], list[tuple[int, dict[str, float]]]]:
-        told: list[tuple[int, dict[str, float]]] = []
+        reports: list[tuple[int, dict[str, float]]] = []
         ensemble = fit(
             observations,
             labels,
             unlabelled,
             config,
             0,
-            lambda *report: told.append(report),
-            origins=origins,
-            unlabelled_origins=there,
-            agent_pixels=observed_pixel,
+            Watcher(lambda *report: reports.append(report)),
+            origins=StateOrigins(origins, unlabelled_origins, observed_pixel),
             checkpoints=checkpoints,
         )
-        return ensemble.state(), told
+        return ensemble.state(), reports
 
     unbroken, expected = trained(None)
     path = tmp_path / "ensemble.safetensors"
@@ -94,8 +92,8 @@ def test_breaks_leave_no_trace(config: EnsembleConfig, tmp_path: Path, monkeypat
         with pytest.raises(UserError, match="does not fit"):
             trained(Checkpoints(path))
     Checkpoints(path).save(saved)
-    resumed, told = trained(Checkpoints(path))
-    assert told == expected[-len(told) :] and told
+    resumed, reports = trained(Checkpoints(path))
+    assert reports == expected[-len(reports) :] and reports
     again, nothing = trained(Checkpoints(path))
     assert nothing == []
     for state in (resumed, again):

@@ -47,13 +47,13 @@ def test_known_windows_equal_whole_images() -> None:
     states = grid_worlds(60, rng)
     plain = StackedMembers(ensembles).log_odds(states)
     windows = StackedMembers(ensembles, repeats=True)
-    assert windows._known is not None
+    assert windows._windows is not None
     for most in (16_384, 500):
-        windows._known.most = most
+        windows._windows.most = most
         for start in range(0, 60, 7):
             found = windows.log_odds(states[start : start + 7])
             np.testing.assert_allclose(found, plain[start : start + 7], atol=1e-6)
-            assert 0 < len(windows._known._rows) <= most
+            assert 0 < len(windows._windows._rows) <= most
     assert np.ptp(plain) > 1e-3
 
 
@@ -73,7 +73,7 @@ def test_a_window_s_numbers_do_not_depend_on_its_company() -> None:
 
 def test_networks_without_windows_are_judged_whole() -> None:
     """Spec C5: an own network with padding, pictures that are no grid world."""
-    from hypogoal.hypotheses.windows import split_of
+    from hypogoal.hypotheses.known_windows import split_of
 
     padded = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3, padding=1), torch.nn.ReLU())
     assert split_of(padded) is None

@@ -22,7 +22,7 @@ from hypogoal.hypotheses.changes import grey_maps, other_context
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.thresholds import RULES, thresholds
-from hypogoal.hypotheses.training import fit
+from hypogoal.hypotheses.training import Watcher, fit
 
 TOY = EnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, diversity_weight=0.03)
 
@@ -71,7 +71,7 @@ def test_a_single_member_is_the_plain_cnn() -> None:
     observations, labels, unlabelled = toy()
     config = dataclasses.replace(TOY, members=1)
     reports: list[dict[str, float]] = []
-    ensemble = fit(observations, labels, unlabelled[:0], config, 0, lambda _, numbers: reports.append(numbers))
+    ensemble = fit(observations, labels, unlabelled[:0], config, 0, Watcher(lambda _, numbers: reports.append(numbers)))
     assert ensemble.predict(observations).shape == (64, 1)
     assert ((ensemble.predict(observations)[:, 0] > 0.5) == labels).all()
     assert {numbers["diversity"] for numbers in reports} == {0.0}
@@ -121,7 +121,7 @@ def test_reports_are_the_losses_of_equation_1(diversity: str) -> None:
     observations, labels, unlabelled = toy()
     config = dataclasses.replace(TOY, members=3, steps=12, diversity=diversity, diversity_weight=0.5)
     reports: list[tuple[int, dict[str, float]]] = []
-    fit(observations, labels, unlabelled, config, 0, lambda *report: reports.append(report))
+    fit(observations, labels, unlabelled, config, 0, Watcher(lambda *report: reports.append(report)))
     assert [step for step, _ in reports] == [10, 12]
     for _, numbers in reports:
         assert numbers["loss"] == pytest.approx(3 * numbers["labelled"] + 0.5 * numbers["diversity"], rel=1e-5)
@@ -164,7 +164,7 @@ def test_a_look_leaves_no_trace(schedule: str) -> None:
         looked[step] = ensemble.state()
 
     total = 12 * (2 if schedule == "sequential" else 1)
-    found = fit(observations, labels, unlabelled, config, 0, look=look, look_at=(5, 10, total)).state()
+    found = fit(observations, labels, unlabelled, config, 0, Watcher(look=look, look_at=(5, 10, total))).state()
     assert list(looked) == [5, 10, total]
     unlooked = fit(observations, labels, unlabelled, config, 0).state()
     assert all(
@@ -193,7 +193,9 @@ def test_sequential_members_do_not_move_once_trained() -> None:
     steps: list[int] = []
     watched = Watched()
     one = fit(observations, labels, unlabelled, dataclasses.replace(config, members=1), seed=0)
-    two = fit(observations, labels, unlabelled, config, 0, lambda step, _: steps.append(step), checkpoints=watched)
+    two = fit(
+        observations, labels, unlabelled, config, 0, Watcher(lambda step, _: steps.append(step)), checkpoints=watched
+    )
     begun, first, last = (watched.weights[step] for step in (0, 4, 9))
     for name, value in last.items():
         if name.startswith("members."):
@@ -450,8 +452,8 @@ def test_methods_see_the_same_labelled_states_changed_the_same_way(monkeypatch: 
             seen[-1].append(images)
         return images
 
-    inputs = TrainingStates._inputs
-    monkeypatch.setattr(TrainingStates, "_inputs", recorded)
+    inputs = TrainingStates._images_of
+    monkeypatch.setattr(TrainingStates, "_images_of", recorded)
     for changes in ({}, {"diversity": "none"}, {"diversity": "none", "unlabelled_bn": False}):
         seen.append([])
         fit(observations, labels, unlabelled, dataclasses.replace(TOY, steps=3, augment="grey", **changes), seed=0)

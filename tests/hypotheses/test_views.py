@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from hypogoal.hypotheses.localisers import (
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.training import fit
-from hypogoal.hypotheses.views import AgentView, FullView, windows
+from hypogoal.hypotheses.views import AgentView, FullView, StateOrigins, cut_windows
 
 SHAPE = (84, 84, 4)
 
@@ -39,16 +39,16 @@ def numbered(count: int = 1) -> NDArray[np.uint8]:
 
 def test_a_window_by_hand() -> None:
     """The pixel in the middle of an odd window is the agent's; of an even one it is the one after the middle."""
-    odd = windows(numbered(), np.array([[2.0, 3.0]]), 3, 3)
+    odd = cut_windows(numbered(), np.array([[2.0, 3.0]]), 3, 3)
     np.testing.assert_array_equal(odd[0, :, :, 0], [[12, 13, 14], [22, 23, 24], [32, 33, 34]])
-    even = windows(numbered(), np.array([[2.4, 3.4]]), 2, 4)
+    even = cut_windows(numbered(), np.array([[2.4, 3.4]]), 2, 4)
     np.testing.assert_array_equal(even[0, :, :, 0], [[11, 12, 13, 14], [21, 22, 23, 24]])
     np.testing.assert_array_equal(even[0, :, :, 1], [[2, 3, 4, 5], [3, 4, 5, 6]])
 
 
 def test_outside_the_image_is_black() -> None:
     """At two corners, and somewhere else altogether; each state has its own window."""
-    found = windows(numbered(3), np.array([[0.0, 0.0], [5.0, 6.0], [-90.0, 400.0]]), 3, 3)[..., 1]
+    found = cut_windows(numbered(3), np.array([[0.0, 0.0], [5.0, 6.0], [-90.0, 400.0]]), 3, 3)[..., 1]
     np.testing.assert_array_equal(found[0], [[0, 0, 0], [0, 0, 1], [0, 1, 2]])
     np.testing.assert_array_equal(found[1], [[9, 10, 0], [10, 11, 0], [0, 0, 0]])
     assert not found[2].any()
@@ -232,14 +232,17 @@ CROP = EnsembleConfig(
 )
 
 
-fit_crop = partial(fit, config=CROP, seed=0, agent_pixels=observed_pixel)
+def fit_crop(observations: Any, labels: Any, unlabelled: Any, *origins: Any) -> Ensemble:
+    """An ensemble of windows, with the origins of labelled and unlabelled states."""
+    places = StateOrigins(*origins, agent_pixels=observed_pixel)
+    return fit(observations, labels, unlabelled, CROP, 0, origins=places)
 
 
 def test_an_ensemble_learns_from_windows() -> None:
     """Beyond the paper: what surrounds the agent decides, wherever it is."""
     observations, labels, origins = montezuma_states(60, seed=0)
     others, truth, there = montezuma_states(60, seed=1)
-    ensemble = fit_crop(observations, labels, others, origins=origins, unlabelled_origins=there)
+    ensemble = fit_crop(observations, labels, others, origins, there)
     positions = np.stack([there[name] for name in ("room", "x", "y")], axis=1)
     assert (ensemble.verdicts(others, positions) == truth[:, None]).mean() > 0.95
 
@@ -249,11 +252,11 @@ def test_data_that_do_not_say_enough_are_one_clear_line() -> None:
     observations, labels, origins = montezuma_states(12, seed=0)
     some = {name: origins[name] for name in ("room", "x", "ladder")}
     with pytest.raises(UserError, match=r"do not say y of each state: view=agent-crop"):
-        fit_crop(observations, labels, observations, origins=some, unlabelled_origins=origins)
+        fit_crop(observations, labels, observations, some, origins)
     with pytest.raises(UserError, match=r"do not say room, x, y of each state: localiser=ram"):
-        fit_crop(observations, labels, observations, origins=origins)
+        fit_crop(observations, labels, observations, origins)
     with pytest.raises(UserError, match="the agent's place in these observations is not known: view=agent-crop"):
-        fit(observations, labels, observations, CROP, 0, origins=origins)
+        fit(observations, labels, observations, CROP, 0, origins=StateOrigins(origins))
     with pytest.raises(UserError, match="the surroundings of the agent are not known: augment=grey-context"):
         fit(observations, labels, observations, dataclasses.replace(CROP, view="full", augment="grey-context"), 0)
     plain = dataclasses.replace(CROP, view="full")

@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = hypogoal.train_options(ensemble, out=folder / "options", **PLAY)
     hypogoal.train_meta(ensemble, out=str(folder / "meta"), options=options, **PLAY)
     hypogoal.evaluate(folder, quiet=True)
-    del base.here[NAME]  # as in another program
+    del base.REGISTERED[NAME]  # as in another program
     return folder
 
 

@@ -15,7 +15,7 @@ from hypogoal.domains.montezuma import DOMAIN
 from hypogoal.domains.montezuma_engine import MontezumaEngine
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.hypotheses.localisers import LearnedLocaliser
-from hypogoal.hypotheses.views import AgentView, windows
+from hypogoal.hypotheses.views import AgentView, cut_windows
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.windows import SIDE, AgentWindows, HalfPictures, halved
 from hypogoal.stages.train_options import train_options
@@ -61,7 +61,7 @@ def test_the_agent_is_looked_for_once_in_each_state() -> None:
     ids = rng.integers(engine.n_states, size=30)
     localiser = LearnedLocaliser(SHAPE)
     seen = AgentWindows(engine, localiser)
-    expected = windows(engine.images(ids), localiser.locate(engine.images(ids)), SIDE, SIDE)
+    expected = cut_windows(engine.images(ids), localiser.locate(engine.images(ids)), SIDE, SIDE)
     np.testing.assert_array_equal(seen.images(ids), expected)
     again, out = AgentWindows(engine, LearnedLocaliser(SHAPE)), np.zeros((30, *seen.observation_shape), np.uint8)
     again.restore(seen.snapshot())
