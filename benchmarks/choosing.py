@@ -4,7 +4,7 @@ hypogoal run doorkey --preset choosing --out runs/choosing
 python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run which-feature --out runs/which-feature
 python -m benchmarks.choosing runs/which-feature docs/results/which-feature-rooms.csv
-hypogoal sweep examples/preference.toml --out runs/preference
+hypogoal sweep examples.preference:preference --out runs/preference
 python -m benchmarks.choosing runs/preference docs/results/preference-doorkey.csv
 python -m benchmarks.choosing --tables docs/results/choosing-doorkey.csv
 """

@@ -310,8 +310,9 @@ def fuzz_tables(box: Sandbox, rng: Rng, case: int) -> bool:
 
 def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
     from hypogoal.core.config import resolve
+    from hypogoal.experiments.named import EXPERIMENTS
     from hypogoal.settings import STAGES, TABLES
-    from hypogoal.stages.sweep import EXPERIMENTS, config_class_of, plan
+    from hypogoal.stages.sweep import config_class_of, plan
 
     path = box.case / "own.toml"
     text = toml_of(tree_changed(PRESET, rng, box.odd), rng).encode(errors="surrogatepass")
@@ -334,18 +335,19 @@ def fuzz_toml(box: Sandbox, rng: Rng, case: int) -> bool:
 
 def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
     """An own experiment; the plan, records and last words that a sweep leaves, and the log of what a cell made."""
-    from hypogoal.experiments.format import make_plan, read_experiment
+    from hypogoal.experiments.planning import make_plan
     from hypogoal.experiments.records import PLAN, write_plan
     from hypogoal.experiments.status import lines as lines_of
     from hypogoal.experiments.status import read_status
+    from hypogoal.experiments.toml_file import read_toml
 
     own, run = box.case / "own.toml", box.out / "run"
     own.write_text(OWN, encoding="utf-8")
     if rng.random() < 0.3:
         text = toml_of(tree_changed(tomllib.loads(OWN), rng, box.odd), rng).encode(errors="surrogatepass")
         own.write_bytes(bytes_changed(text, rng) if rng.random() < 0.3 else text)
-        return tolerated(lambda: make_plan(read_experiment(own), run, ["seed=0-2"] if case % 2 else []))
-    planned = make_plan(read_experiment(own), run)
+        return tolerated(lambda: make_plan(read_toml(own), run, ["seed=0-2"] if case % 2 else []))
+    planned = make_plan(read_toml(own), run)
     write_plan(run, planned, 1.0)
     (run / "logs").mkdir(exist_ok=True)
     said = str(rng.choice(box.odd))[:9999]

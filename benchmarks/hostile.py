@@ -856,13 +856,14 @@ def hostile_json(text: bytes, rng: Rng, case: int, most: int = 2**20) -> tuple[s
 
 def _sweep(box: Any) -> Path:
     """The folder of a sweep that was begun, with the records of its first cell."""
-    from hypogoal.experiments.format import make_plan, read_experiment
+    from hypogoal.experiments.planning import make_plan
     from hypogoal.experiments.records import write_plan
+    from hypogoal.experiments.toml_file import read_toml
 
     run: Path = box.case / "sweep"
     own = box.case / "own.toml"
     own.write_text(OWN, encoding="utf-8")
-    write_plan(run, make_plan(read_experiment(own), run), 1.0)
+    write_plan(run, make_plan(read_toml(own), run), 1.0)
     (run / "logs").mkdir()
     (run / "logs" / "data.log").write_text("started\n")
     (run / "logs" / "data.json").write_text(

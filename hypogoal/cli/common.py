@@ -88,7 +88,9 @@ def offer(kind: str) -> Any:
         presets, stage = Path(__file__).parents[1] / "presets", ctx.info_name or ""
         named = {path.stem for path in presets.glob("*/*.toml")}
         if kind == "experiment":
-            named = {path.stem for path in presets.glob("*.toml")} | {name for name in named if "figure" in name}
+            from hypogoal.experiments.named import NAMES
+
+            named = {*NAMES}
         elif kind == "setting":
             own = {"": CONFIGS[stage]} if stage in CONFIGS else {f"{name}.": of for name, of in CONFIGS.items()}
             named = {f"{prefix}{field.name}=" for prefix, of in own.items() for field in fields(of)}

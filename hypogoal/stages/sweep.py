@@ -5,10 +5,9 @@
 
 import contextlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +22,15 @@ from hypogoal.domains.base import load_domain
 from hypogoal.experiments import records
 from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.costs import LONG_SECONDS, cost_lines, machine_factor, wall_seconds
-from hypogoal.experiments.format import Experiment, make_plan, read_experiment
+from hypogoal.experiments.experiment import Experiment, load_experiment
+from hypogoal.experiments.named import CELLS, EXPERIMENTS, FIGURES, NAMES
+from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.runners import slurm
 from hypogoal.experiments.runners.local import run_cells
 from hypogoal.experiments.status import done_of, left_of, stamp_of
+from hypogoal.experiments.toml_file import read_toml
 from hypogoal.settings import CONFIGS, TABLES
 
-PRESETS = Path(str(resources.files("hypogoal"))) / "presets"
-EXPERIMENTS: Mapping[str, Experiment] = {path.stem: read_experiment(path) for path in sorted(PRESETS.glob("*.toml"))}
-FIGURES = {  # of the paper, and what has one preset: the experiment and this
-    "choosing": ("choosing", "choosing"),
-    "figure3": ("montezuma-ladders", "figure3"),
-    "figure4": ("montezuma-ladders", "figure4"),
-    "figure6": ("doorkey", "figure6"),
-}
-CELLS = {("doorkey", "choosing"): "choosing"}  # presets with cells of their own: the experiment that has them
 AGAIN = "give the same command again to go on"
 _say = partial(say, err=True)
 
@@ -66,35 +59,44 @@ def plan(
     device: str = "auto",
     short: bool = False,
 ) -> Plan:
-    """The cells of an experiment in the folder ``out``: a name, one of the paper's figures, or an own TOML file.
+    """The cells of an experiment in the folder ``out``.
 
-    ``assignments`` are ``KEY=VALUE`` or ``STAGE.KEY=VALUE``, of an own experiment ``AXIS=VALUES``; ``preset`` is of a
-    named one, a figure has its own; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages.
-    ``short``: for an experiment that is to have one agent and no more, names without its seed and layout; a folder that
-    was begun with other names keeps those. What is unknown is a ``UserError``.
+    It is named, one of the paper's figures, a TOML file, or ``module:function``, a name that the user must have given.
+    ``assignments`` are ``KEY=VALUE`` or ``STAGE.KEY=VALUE``, of a TOML file ``AXIS=VALUES``; ``preset`` is of a named
+    one, a figure has its own; ``seeds`` are the run seeds, ``0-9``; ``device`` is of the training stages. ``short``:
+    leave seed and layout out of names if there is a single agent; a folder that was begun with other names keeps those.
+    What is unknown is a ``UserError``.
     """
     check_name(device)
     assignments = [*assignments]
     experiment = CELLS.get((experiment, preset or ""), experiment)
     name, own_preset = FIGURES.get(experiment, (experiment, None))
-    if name not in EXPERIMENTS and not name.endswith(".toml"):
-        known = ", ".join(dict.fromkeys([*EXPERIMENTS, *FIGURES]))
-        raise UserError("unknown experiment", experiment, f"Choose one of {known}, or give a .toml file.")
     if own_preset not in (None, preset or own_preset):
         raise UserError(f"{experiment} has its own preset", preset, f"For another, give {name} with --preset.")
-    found = EXPERIMENTS[name] if name in EXPERIMENTS else read_experiment(Path(name))
+    source = _experiment(name)
     if seeds:
-        assignments.insert(0, f"{'seeds' if 'seeds' in found.settings else 'seed'}={seeds}")  # before --set's own
-    short = _short(out, wanted=short)
-    return make_plan(found, out, assignments, preset=preset or own_preset, device=device, short=short)
+        assignments.insert(0, f"{'seeds' if 'seeds' in source.settings else 'seed'}={seeds}")  # before --set's own
+    short = _has_short_names(out, otherwise=short)
+    return make_plan(source, out, assignments, preset=preset or own_preset, device=device, short=short)
 
 
-def _short(out: Path, *, wanted: bool) -> bool:
-    """Whether names are to be short: as in the run's folder, where there is something."""
+def _experiment(name: str) -> Experiment:
+    if name in EXPERIMENTS:
+        return EXPERIMENTS[name]
+    if name.endswith(".toml"):
+        return read_toml(Path(name))
+    if ":" in name:
+        return load_experiment(name)
+    do = f"Choose one of {', '.join(NAMES)}, or give a .toml file or module:function."
+    raise UserError("unknown experiment", name, do)
+
+
+def _has_short_names(out: Path, *, otherwise: bool) -> bool:
+    """Whether the cells of the run in this folder have short names; ``otherwise`` if there is none."""
     try:
         before, _ = records.read_plan(out)
-    except UserError:  # none, or a damaged one, which is told when it is to be gone on with
-        return wanted
+    except UserError:  # none, or a damaged one: refused when the run is to be continued
+        return otherwise
     return out / "ensemble" in {cell.out for cell in before.cells}
 
 

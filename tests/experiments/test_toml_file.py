@@ -1,4 +1,4 @@
-"""Experiments in TOML (Spec G4): what they can say, and that they can say nothing else."""
+"""Sweeps in TOML (Spec G4): what they can say, and that they can say nothing else."""
 
 import csv
 import json
@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-import hypogoal
 from hypogoal.core.artefacts import create_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import path_part
 from hypogoal.experiments.cells import Plan
-from hypogoal.experiments.format import make_plan, read_experiment
+from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.results import write_results
-from hypogoal.stages import sweep
+from hypogoal.experiments.toml_file import read_toml
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = Path("somewhere")
@@ -32,7 +31,7 @@ cells = [
 
 def planned(tmp_path: Path, text: str, *assignments: str) -> Plan:
     (tmp_path / "own.toml").write_text(text)
-    return make_plan(read_experiment(tmp_path / "own.toml"), OUT, assignments)
+    return make_plan(read_toml(tmp_path / "own.toml"), OUT, assignments)
 
 
 def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
@@ -82,114 +81,25 @@ def test_values_may_have_a_dot(tmp_path: Path) -> None:
 
 def test_the_example_is_one() -> None:
     """The file in examples/ is an experiment."""
-    plan = make_plan(read_experiment(ROOT / "examples" / "sweep-doorkey.toml"), OUT)
+    plan = make_plan(read_toml(ROOT / "examples" / "sweep-doorkey.toml"), OUT)
     assert len(plan.cells) == 1 + 4 + 8 + 4 + 2
 
 
-@pytest.mark.parametrize("name", ["doorkey", "montezuma-ladders"])
-def test_a_copy_of_a_named_experiment_is_the_same(tmp_path: Path, name: str) -> None:
-    """Spec G4: what comes with hypogoal is written as users write, presets and settings of stages too."""
-    copy = tmp_path / f"{name}.toml"
-    copy.write_text((Path(hypogoal.__file__).parent / "presets" / copy.name).read_text())
-    given = {"preset": "demo", "seeds": "0-2", "assignments": ["train-ensemble.steps=7"], "device": "cpu"}
-    assert sweep.plan(str(copy), OUT, **given) == sweep.plan(name, OUT, **given)
-
-
-DESCRIBED = """
-format = 1
-domain = "doorkey"
-pairs = { together = ["layouts", "seeds"] }
-settings.together.value = true
-settings.layouts.value = [7, 8]
-settings.seeds.value = [0, 1]
-settings.learn.value = true
-settings.kinds = { value = ["few", "many"], words = { few = "--set members=1", many = "--members 4" } }
-settings.changed = { value = ["steps=5", "steps=6 jitter=1"], changes = true }
-
-[[cells]]
-name = "data"
-command = "collect doorkey"
-columns = {}
-evaluated = false
-
-[[cells]]
-name = "ensemble"
-out = "{kind}{change}"
-for = ["seed"]
-axes = { kind = "kinds", change = "changed", seed = "seeds" }
-command = "train-ensemble {data} {kind} {change}"
-
-[[cells]]
-name = "options"
-if = "learn"
-axes = { kind = "kinds", seed = "seeds" }
-command = "train-options {ensemble}"
-
-[[cells]]
-name = "later"
-command = "collect doorkey"
-columns = {}
-
-[[cells]]
-name = "agent"
-axes = { kind = "kinds", seed = "seeds", layout = "layouts" }
-first = ["kind"]
-command = "train-meta {ensemble} [--options {options}] --set steps={options.steps+agent.steps}"
-"""
-
-
-def test_what_settings_can_say(tmp_path: Path) -> None:
-    """Spec G4: words for values, changes, pairs, switches, first values, sums of steps, places and the order."""
-    (tmp_path / "own.toml").write_text(DESCRIBED)
-    cells = {cell.out.relative_to(OUT).as_posix(): cell for cell in sweep.plan(str(tmp_path / "own.toml"), OUT).cells}
-    ensembles = [f"{kind}{change}/seed-{seed}" for seed in (0, 1) for kind in ("few", "many")
-                 for change in ("", ",steps=5", ",steps=6,jitter=1")]  # fmt: skip
-    options = [f"options/kind-{kind}-seed-{seed}" for kind in ("few", "many") for seed in (0, 1)]
-    agents = ["agent/seed-0-layout-7", "agent/seed-1-layout-8"]
-    assert [*cells] == ["data.h5", *ensembles, *options, "later.h5", *agents, "evaluation", "report"]
-    assert cells["many,steps=6,jitter=1/seed-0"].arguments[2:-2] == (
-        "--members", "4", "--set", "steps=6", "--set", "jitter=1",
-    )  # fmt: skip
-    assert cells[agents[1]].needs == (OUT / "few/seed-1", OUT / "options/kind-few-seed-1")
-    assert "steps=360000" in cells[agents[1]].arguments
-    assert cells[agents[1]].axes == (("group", "agent"), ("kind", "few"), ("seed", 1), ("layout", 8))
-    off = sweep.plan(str(tmp_path / "own.toml"), OUT, assignments=["learn=false", "together=false"]).cells
-    agents = [cell for cell in off if cell.stage == "train-meta"]
-    assert len(agents) == 4 and not any("--options" in cell.arguments for cell in agents)
-    assert all("steps=300000" in cell.arguments for cell in agents)
-
-
 @pytest.mark.parametrize(
-    ("before", "after", "words"),
+    ("before", "after"),
     [
-        ('"layouts", "seeds"]', '"layouts", "learn"]', "pairs must be named after a switch"),
-        ("together = [", "kinds = [", "pairs must be named after a switch"),
-        ('if = "learn"', 'if = "kinds"', "no such switch"),
-        ('first = ["kind"]', 'first = ["change"]', "an axis that does not exist"),
-        ('for = ["seed"]', 'for = ["layout"]', "an axis that does not exist"),
-        ('out = "{kind}', 'out = "{layout}', "not an axis of these cells"),
-        ('out = "{kind}', 'out = "../{kind}', "outside the run"),
-        ('"--set members=1"', '"--out /tmp"', "given by the sweep"),
-        ('"--set members=1"', "3", "words must be texts"),
-        ("columns = {}", "columns = { a = 1 }", "columns must be texts"),
-        ("agent.steps}", "agent.stops}", "neither an axis"),
-        ("[--options {options}]", "--options {options}", "neither an axis"),
-        ('domain = "doorkey"', 'domain = "doorkey"\nestimate.step = "x"', "no such rate"),
-        ('domain = "doorkey"', 'domain = "mine:domain"', "a file names code of its own"),
-        ('"collect doorkey"', '"collect doorkey {options}"', "neither an axis"),
-        ("train-ensemble {data}", "train-ensemble {later}", "what no cell before it makes"),
-        ("--members 4", "--members '4", "cannot be read"),
-        ('{ kind = "kinds", seed = "seeds" }', '{ "(" = "kinds" }', "cannot have this name"),
-        ("columns = {}", 'columns = { value = "1" }', "cannot have this name"),
-        ("train-meta {ensemble}", "train-meta {ensemble} --set chooser={nothing}", "neither an axis"),
+        ("format = 1", "format = 1\ndomain = 'doorkey'"),
+        ("format = 1", "format = 1\nsettings.seeds.value = [0]"),
+        ("format = 1", "format = 1\npairs = { paired = ['seed', 'layout'] }"),
+        ("minutes = 2", "for = ['seed']"),
+        ("minutes = 2", "evaluated = false"),
+        ('axes = ["seed"]', 'axes = { seed = "seed" }'),
     ],
 )
-def test_what_settings_cannot_say(tmp_path: Path, before: str, after: str, words: str) -> None:
-    """Spec G2: told in one line, too."""
-    assert before in DESCRIBED
-    (tmp_path / "own.toml").write_text(DESCRIBED.replace(before, after))
-    with pytest.raises(UserError, match=words):
-        sweep.plan(str(tmp_path / "own.toml"), OUT, assignments=["learn=false"] if "[" in before else [])
+def test_the_language_of_before_is_refused_with_what_to_do(tmp_path: Path, before: str, after: str) -> None:
+    """Spec G2: what experiments in TOML could say until 0.15."""
+    with pytest.raises(UserError, match=r"can no longer say '\w+': .*Write it as a Python function"):
+        planned(tmp_path, GOOD.replace(before, after))
 
 
 @pytest.mark.parametrize(
