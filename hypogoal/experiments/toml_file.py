@@ -4,24 +4,21 @@ The file is data. Its commands are stages of hypogoal and nothing else, and writ
 """
 
 import re
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.config import MAX_PRESET_BYTES, parse_integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import parse_toml, path_part, plain_name, read_text
+from hypogoal.core.files import parse_toml, path_part, read_text
 from hypogoal.experiments.cells import COLUMNS, Cost
 from hypogoal.experiments.experiment import UNKNOWN, Command, Experiment, Value, run_config
-from hypogoal.settings import STAGES
 
 FORMAT_VERSION = 1
 NUMBER = (int, float)
-KEYS = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
-CELL_KEYS = {"name": str, "command": str, "axes": list, "minutes": NUMBER, "memory_gb": NUMBER}
+KEYS: Mapping[str, Any] = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
+CELL_KEYS: Mapping[str, Any] = {"name": str, "command": str, "axes": list, "minutes": NUMBER, "memory_gb": NUMBER}
 FORMER = ("domain", "settings", "pairs", "short", "estimate", "for", "first", "if", "out", "columns", "evaluated")
 TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *COLUMNS)  # axes become columns
 MOST = 1e7  # minutes, gigabytes
@@ -29,21 +26,6 @@ MEND = "Mend the file, see docs/formats.md."
 REFERENCE = re.compile(r"\{([^{}]*)\}")
 
 Point = Mapping[str, Value]
-
-
-@dataclass(frozen=True)
-class _Group:
-    """A command for each combination of its axes' values."""
-
-    name: str
-    words: tuple[str, ...]
-    axes: tuple[str, ...]
-    cost: Cost
-
-    def cell_name(self, point: Point) -> str:
-        """NAME, or NAME/AXIS-VALUE-AXIS-VALUE."""
-        values = "-".join(f"{axis}-{point[axis]}" for axis in self.axes)
-        return f"{self.name}/{values}" if values else self.name
 
 
 def read_toml(path: Path) -> Experiment:
@@ -54,35 +36,46 @@ def read_toml(path: Path) -> Experiment:
     if table.get("format") != FORMAT_VERSION:
         raise UserError(f"format must be {FORMAT_VERSION}", path, MEND)
     axes = {name: _values(name, values, path) for name, values in table.get("axes", {}).items()}
-    groups: dict[str, _Group] = {}
+    rows: dict[str, Mapping[str, Any]] = {}
     for row in table.get("cells", []):
-        group = _group(row, axes, groups, path)
-        groups[group.name] = group
+        _check_row(row, axes, path)
+        if row.get("name", "") in (*rows, *axes):
+            raise UserError("cells need a name of their own", f"cells {row.get('name', '')!r} in {path}", MEND)
+        rows[row.get("name", "")] = row
 
     def commands(**values: tuple[Value, ...]) -> Iterator[Command]:
         for name, chosen in values.items():
             _values(name, list(chosen), "--set")
-        for group in groups.values():
-            for combination in product(*(values[axis] for axis in group.axes)):
-                yield _command(group, groups, dict(zip(group.axes, combination, strict=True)))
+        for row in rows.values():
+            names = row.get("axes", [])
+            for combination in product(*(values[name] for name in names)):
+                yield _command(row, rows, dict(zip(names, combination, strict=True)))
 
-    fields = [(name, _kind(values), setting(values, "")) for name, values in axes.items()]
-    given = {key: table[key] for key in ("workers", "evaluate") if key in table}
-    return Experiment(path.stem, commands, run_config(fields, closing=True, **given))
+    settings = [(name, _kind(values), setting(values, "")) for name, values in axes.items()]
+    defaults = {key: table[key] for key in ("workers", "evaluate") if key in table}
+    return Experiment(path.stem, commands, run_config(settings, closing=True, **defaults))
 
 
 def _check_keys(table: Any, kinds: Mapping[str, Any], path: Path) -> None:
     if not isinstance(table, dict):
         raise UserError("cells must be tables", path, MEND)
     for key, value in table.items():
-        if key in FORMER or (key == "axes" and kinds is CELL_KEYS and isinstance(value, dict)):
+        if key in FORMER or (kinds is CELL_KEYS and key == "axes" and isinstance(value, dict)):
             do = "Write it as a Python function and give module:function, see docs/formats.md."
             raise UserError(f"an experiment in TOML can no longer say {key!r}", path, do)
         if key not in kinds:
             raise UserError("no such key in an experiment", key, f"{path} may have {', '.join(kinds)}.")
-        allowed = kinds[key] if isinstance(kinds[key], tuple) else (kinds[key],)
-        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
+        if not isinstance(value, kinds[key]) or (isinstance(value, bool) and kinds[key] is not bool):
             raise UserError("wrong kind of value in an experiment", f"{key} in {path}", MEND)
+
+
+def _check_row(row: Any, axes: Mapping[str, Any], path: Path) -> None:
+    _check_keys(row, CELL_KEYS, path)
+    where, names = f"cells {row.get('name', '')!r} in {path}", row.get("axes", [])
+    if not all(isinstance(name, str) and name in axes for name in names) or len({*names}) < len(names):
+        raise UserError("cells over an axis that does not exist", where, MEND)
+    if not all(0 <= row.get(key, 0) < MOST for key in ("minutes", "memory_gb")):
+        raise UserError("minutes and memory_gb cannot have these values", where, MEND)
 
 
 def _values(name: str, values: Any, where: object) -> tuple[Value, ...]:
@@ -102,38 +95,25 @@ def _kind(values: Sequence[Value]) -> Any:
     return tuple[int, ...] if kinds == {int} else tuple[float, ...] if kinds == {float} else tuple[str, ...]
 
 
-def _group(row: Any, axes: Mapping[str, Any], known: Mapping[str, _Group], path: Path) -> _Group:
-    _check_keys(row, CELL_KEYS, path)
-    name, command, named = row.get("name", ""), row.get("command", ""), row.get("axes", [])
-    where = f"cells {name!r} in {path}"
-    if not plain_name(name) or name in (*known, *axes):
-        raise UserError("cells need a name of their own, of letters, digits, - and _", where, MEND)
-    if not all(isinstance(axis, str) and axis in axes for axis in named) or len({*named}) != len(named):
-        raise UserError("cells over an axis that does not exist", where, MEND)
-    try:
-        words = tuple(shlex.split(command))
-    except ValueError as error:
-        raise UserError(f"the command cannot be read ({error})", where, MEND) from None
-    if not words or words[0] not in STAGES:
-        raise UserError("the command must be a stage", where, f"Choose one of {', '.join(STAGES)}.")
-    minutes, memory = float(row.get("minutes", 0)), float(row.get("memory_gb", UNKNOWN.memory / 1e9))
-    if not (0 <= minutes < MOST and 0 <= memory < MOST):
-        raise UserError("minutes and memory_gb cannot have these values", where, MEND)
-    return _Group(name, words, tuple(named), Cost(60 * minutes, 1e9 * memory))
-
-
-def _command(group: _Group, groups: Mapping[str, _Group], point: Point) -> Command:
+def _command(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], point: Point) -> Command:
     """``{axis}`` is its value, ``{name}`` the output of the cells of that name for the same values."""
 
     def filled(match: re.Match[str]) -> str:
         key = match[1]
         if key in point:
             return str(point[key])
-        other = groups.get(key)
-        if other is None or other is group or not point.keys() >= {*other.axes}:
+        if key not in rows or rows[key] is row or not point.keys() >= {*rows[key].get("axes", [])}:
             what = f"{{{key}}} is neither an axis of these cells nor the name of cells above over some of their axes"
-            raise UserError(what, f"cells {group.name!r}", MEND)
-        return f"@{other.cell_name(point)}"
+            raise UserError(what, f"cells {row.get('name', '')!r}", MEND)
+        return f"@{_name(rows[key], point)}"
 
-    words = [REFERENCE.sub(filled, word) for word in group.words]
-    return Command(group.cell_name(point), words, {"group": group.name, **point}, group.cost)
+    words = Command(row.get("name", ""), row.get("command", "")).words
+    cost = Cost(60.0 * row.get("minutes", 0), 1e9 * row["memory_gb"] if "memory_gb" in row else UNKNOWN.memory)
+    columns = {"group": row.get("name", ""), **point}
+    return Command(_name(row, point), [REFERENCE.sub(filled, word) for word in words], columns, cost)
+
+
+def _name(row: Mapping[str, Any], point: Point) -> str:
+    """NAME, or NAME/AXIS-VALUE-AXIS-VALUE."""
+    values = "-".join(f"{axis}-{point[axis]}" for axis in row.get("axes", []))
+    return f"{row.get('name', '')}/{values}" if values else row.get("name", "")
