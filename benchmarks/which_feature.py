@@ -22,10 +22,10 @@ import numpy as np
 from benchmarks.cells import table
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import number
-from hypogoal.which_feature.run import Cell
+from hypogoal.which_feature.run import Scored
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS
-from hypogoal.which_feature.table import COLUMNS, Line, summary, told
+from hypogoal.which_feature.table import COLUMNS, Line, summary, with_interval
 
 WEIGHTS = (1.0, 0.1, 0.01, 0.001, 0.0001)
 OBJECTIVES = (  # in the order in which they are run
@@ -53,7 +53,7 @@ def gather(target: Path, paths: Iterable[Path]) -> None:
         csv.writer(file, lineterminator="\n").writerows(lines.values())
 
 
-def read(path: Path) -> list[Cell]:
+def read(path: Path) -> list[Scored]:
     """The cells of a ``results.csv``."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -62,11 +62,11 @@ def read(path: Path) -> list[Cell]:
         shape = (-1, len({row["factor"] for row in of}))
         ranked, at_half, at_best = (np.array([float(row[name]) for row in of]).reshape(shape) for name in SCORES)
         labels = np.array([int(row["labels"]) for row in of[: shape[1]]])
-        cells.append(Cell(entry, float(mix), int(seed), ranked, at_half, at_best, labels))
+        cells.append(Scored(entry, float(mix), int(seed), ranked, at_half, at_best, labels))
     return cells
 
 
-def chosen(cells: Sequence[Cell], objectives: Sequence[str] = OBJECTIVES, mix: float = CHOICE_MIX) -> dict[str, str]:
+def chosen(cells: Sequence[Scored], objectives: Sequence[str] = OBJECTIVES, mix: float = CHOICE_MIX) -> dict[str, str]:
     """The rule: of each objective's weights the one with the highest coverage, ties by best; by objective its entry.
 
     Objectives of which a weight or a seed is still missing are left out.
@@ -104,7 +104,7 @@ def tables_of_two(path: Path) -> Iterator[str]:
         yield from _board(title, [cell for cell in cells if cell.seed not in CHOICE_SEEDS])
 
 
-def _weights(what: str, cells: Iterable[Cell], winners: Mapping[str, str]) -> Iterator[str]:
+def _weights(what: str, cells: Iterable[Scored], winners: Mapping[str, str]) -> Iterator[str]:
     choice = summary([cell for cell in cells if cell.seed in CHOICE_SEEDS], HIGH, LOW)
     by_entry = {line.entry: line for line in choice}
     yield what
@@ -119,12 +119,12 @@ def _weights(what: str, cells: Iterable[Cell], winners: Mapping[str, str]) -> It
     )
 
 
-def _board(title: str, cells: Iterable[Cell]) -> Iterator[str]:
+def _board(title: str, cells: Iterable[Scored]) -> Iterator[str]:
     """The scores of entries, a table for each mix."""
     for mix, lines in grouped(summary(cells, HIGH, LOW), lambda line: line.mix).items():
         plain = next(line.best for line in lines if line.entry == "none")  # of the same seeds as the others
-        best = number("best", lambda line: line.best, told)
-        gain = number("best, minus none", lambda line, plain=plain: line.best - plain, told)
+        best = number("best", lambda line: line.best, with_interval)
+        gain = number("best, minus none", lambda line, plain=plain: line.best - plain, with_interval)
         shown = [*(best if column.title == "best" else column for column in COLUMNS if column.title != "mix"), gain]
         yield f"{title} at mix {mix:g}, mean and Student's 95 % interval over seeds."
         yield ""
@@ -142,7 +142,7 @@ def _choice(line: Line | None, best: bool) -> str:
     return f"**{text}**" if best else text
 
 
-def _by_factor(cells: Sequence[Cell]) -> Iterator[list[str]]:
+def _by_factor(cells: Sequence[Scored]) -> Iterator[list[str]]:
     for entry, of in grouped(cells, lambda cell: cell.entry).items():
         share = np.mean([owned(cell.ranking, HIGH, LOW).any(axis=0) for cell in of], axis=0)
         best = np.mean([cell.ranking.max(axis=0) for cell in of], axis=0)

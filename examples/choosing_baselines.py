@@ -16,9 +16,9 @@ from hypogoal.experiments.experiment import (
     Names,
     Paired,
     Seeds,
-    about,
     agents_of,
     experiment,
+    explained,
 )
 
 
@@ -28,7 +28,7 @@ def choosing_baselines(
     layouts: Layouts = LAYOUTS,
     seeds: Seeds = tuple(range(920, 930)),
     paired: Paired = True,
-    agents: Annotated[Names, about("agents")] = ("ppo", "dqn"),
+    agents: Annotated[Names, explained("agents")] = ("ppo", "dqn"),
 ) -> Iterator[Command]:
     """Every agent on every layout."""
     yield Command("data", "collect doorkey --set heldout_layouts=1", {"group": "data"})

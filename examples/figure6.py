@@ -19,10 +19,10 @@ from hypogoal.experiments.experiment import (
     Names,
     Paired,
     Seeds,
-    about,
     agents_of,
     check_among,
     experiment,
+    explained,
 )
 
 METHODS = {
@@ -45,17 +45,21 @@ def figure6(
     layouts: Layouts = tuple(range(300, 310)),
     seeds: Seeds = tuple(range(3000, 3010)),
     paired: Paired = True,
-    methods: Annotated[Names, about("ensembles", choices=METHODS)] = tuple(METHODS),
-    told: Annotated[Names, about("ensembles whose options end at the true sub-goal instead: the control")] = (
+    methods: Annotated[Names, explained("ensembles", choices=METHODS)] = tuple(METHODS),
+    told: Annotated[Names, explained("ensembles whose options end at the true sub-goal instead: the control")] = (
         "dbat-k3",
     ),
-    baselines: Annotated[Names, about("agents on the primitive actions", choices=BASELINES)] = tuple(BASELINES),
-    paid: Annotated[Names, about("ensembles whose members' first positives in an episode PPO is paid for")] = (
+    baselines: Annotated[Names, explained("agents on the primitive actions", choices=BASELINES)] = tuple(BASELINES),
+    paid: Annotated[Names, explained("ensembles whose members' first positives in an episode PPO is paid for")] = (
         "dbat-k3",
     ),
-    papers: Annotated[Names, about("the same agents as the paper's tables have them", choices=PAPERS)] = tuple(PAPERS),
-    paper_layouts: Annotated[Integers, about("layouts of these, which take five times as long", low=0)] = FEW_LAYOUTS,
-    paper_seeds: Annotated[Integers, about("seeds of these", low=0)] = FEW_SEEDS,
+    papers: Annotated[Names, explained("the same agents as the paper's tables have them", choices=PAPERS)] = tuple(
+        PAPERS
+    ),
+    paper_layouts: Annotated[
+        Integers, explained("layouts of these, which take five times as long", low=0)
+    ] = FEW_LAYOUTS,
+    paper_seeds: Annotated[Integers, explained("seeds of these", low=0)] = FEW_SEEDS,
 ) -> Iterator[Command]:
     """For each method and seed its ensemble, options and agents; then the control and the baselines."""
     agents = agents_of(layouts, seeds, paired=paired)

@@ -16,9 +16,9 @@ from hypogoal.experiments.experiment import (
     Names,
     Paired,
     Seeds,
-    about,
     agents_of,
     experiment,
+    explained,
 )
 
 METHODS = {"dbat-k3": "--diversity dbat --members 3", "none-k3": "--diversity none --members 3"}
@@ -30,7 +30,7 @@ def preference(
     layouts: Layouts = tuple(range(300, 334)),
     seeds: Seeds = tuple(range(3000, 3034)),
     paired: Paired = True,
-    methods: Annotated[Names, about("ensembles", choices=METHODS)] = tuple(METHODS),
+    methods: Annotated[Names, explained("ensembles", choices=METHODS)] = tuple(METHODS),
 ) -> Iterator[Command]:
     """For each method and seed its ensemble, then its agents."""
     agents = agents_of(layouts, seeds, paired=paired)

@@ -1,4 +1,4 @@
-"""Benchmarks of hypothesis learning: what an objective finds where the answer is known (Spec H1)."""
+"""Benchmarks of hypothesis learning: which features an objective finds where the answer is known (Spec H1)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,7 @@ from hypogoal.core.terminal import draw, give
 
 ENTRIES = (
     "Comma-separated: dbat, none, another objective (docs/concepts.md) or module:function, each also with a weight "
-    "(dbat:0.01); cnn, one member; oracle, one taught by each feature's truth."
+    "(dbat:0.01); cnn, one member; oracle, one member trained on the truth of each feature."
 )
 benchmark = typer.Typer(cls=cli.Commands, no_args_is_help=True)
 cli.app.add_typer(benchmark, name="benchmark", rich_help_panel=cli.MANY)

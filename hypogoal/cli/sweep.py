@@ -102,8 +102,8 @@ def sweep(
         from hypogoal.experiments.status import as_json as status_json
         from hypogoal.experiments.status import lines, read_status
 
-        found = read_status(out)
-        cli.echo(status_json(found), as_json, lines(found))
+        progress = read_status(out)
+        cli.echo(status_json(progress), as_json, lines(progress))
         return
     if cancel:
         from hypogoal.experiments.runners.slurm import cancel as end

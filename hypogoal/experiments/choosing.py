@@ -10,7 +10,7 @@ from itertools import product
 from typing import Annotated
 
 from hypogoal.experiments.doorkey import RATES
-from hypogoal.experiments.experiment import Command, Layouts, Paired, Seeds, Value, about, agents_of, experiment
+from hypogoal.experiments.experiment import Command, Layouts, Paired, Seeds, Value, agents_of, experiment, explained
 
 METHODS = {
     "dbat": "--diversity dbat --members 6",
@@ -26,9 +26,9 @@ def choosing(
     layouts: Layouts = LAYOUTS,
     seeds: Seeds = tuple(range(920, 930)),
     paired: Paired = True,
-    methods: Annotated[tuple[str, ...], about("ensembles", choices=METHODS)] = tuple(METHODS),
-    learned: Annotated[bool, about("agents whose options are learned")] = True,
-    planned: Annotated[bool, about("agents whose options are planned")] = True,
+    methods: Annotated[tuple[str, ...], explained("ensembles", choices=METHODS)] = tuple(METHODS),
+    learned: Annotated[bool, explained("agents whose options are learned")] = True,
+    planned: Annotated[bool, explained("agents whose options are planned")] = True,
 ) -> Iterator[Command]:
     """All of a seed, then all of the next: its ensembles, agents of planned options, options, agents of these."""
     agents = agents_of(layouts, seeds, paired=paired)

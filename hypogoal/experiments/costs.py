@@ -164,7 +164,7 @@ def cost_lines(cells: Sequence[Cell], workers: int, factor: float) -> list[str]:
     wall = duration(wall_seconds(cells, workers, factor))
     total = f"about {duration(seconds)} of one core, {wall} with {workers} at once" if seconds else "time not known"
     memory, disk = (
-        sum(sorted((getattr(cell.cost, what) for cell in cells), reverse=True)[:workers]) for what in ("memory", "disk")
+        sum(sorted((getattr(cell.cost, kind) for cell in cells), reverse=True)[:workers]) for kind in ("memory", "disk")
     )
     most = f"; at once at most {human(memory)} of memory, {human(disk)} of disk, checkpoints included" if disk else ""
     text = f"{len(cells)} commands: {total}{most}"

@@ -7,7 +7,17 @@ from collections.abc import Callable, Iterator
 from itertools import product
 from typing import Annotated, Any
 
-from hypogoal.experiments.experiment import Command, Layouts, Names, Paired, Seeds, Value, about, agents_of, experiment
+from hypogoal.experiments.experiment import (
+    Command,
+    Layouts,
+    Names,
+    Paired,
+    Seeds,
+    Value,
+    agents_of,
+    experiment,
+    explained,
+)
 
 RATES = {
     "heldout": "heldout_layouts",
@@ -23,9 +33,9 @@ BASELINES = {
     f"{agent}-{tuning}": f"--agent {agent} --set setting={tuning}"
     for agent, tuning in product(("ppo", "dqn"), ("paper", "tuned"))
 }
-Pretrain = Annotated[bool, about("train-options before train-meta; false is the paper's D5")]
-Controls = Annotated[Names, about("controls beside the agent", source="ours: controls", choices=CONTROLS)]
-Baselines = Annotated[Names, about("agents on primitive actions", source="paper, Figure 6", choices=BASELINES)]
+Pretrain = Annotated[bool, explained("train-options before train-meta; false is the paper's D5")]
+Controls = Annotated[Names, explained("controls beside the agent", source="ours: controls", choices=CONTROLS)]
+Baselines = Annotated[Names, explained("agents on primitive actions", source="paper, Figure 6", choices=BASELINES)]
 
 
 @experiment(

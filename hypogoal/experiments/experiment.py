@@ -3,7 +3,7 @@
 ::
 
     @experiment("doorkey", stages=("collect", "train-ensemble"))
-    def members(*, seeds: Annotated[tuple[int, ...], about("run seeds", low=0)] = (0, 1)):
+    def members(*, seeds: Annotated[tuple[int, ...], explained("run seeds", low=0)] = (0, 1)):
         yield "data", "collect doorkey"
         for seed in seeds:
             yield f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}", {"seed": seed}
@@ -24,7 +24,6 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import UsersCode, load_own
 from hypogoal.experiments.cells import Cost
 
-ENTRY_POINTS = "hypogoal.experiments"
 MAX_CELLS = 20_000
 UNKNOWN = Cost(memory=1e9)  # of a process of a command that is not estimated otherwise
 MEND = "Mend the experiment, see docs/formats.md."
@@ -49,7 +48,7 @@ class Command:
         """The command, split as a shell does."""
         try:
             return shlex.split(self.command) if isinstance(self.command, str) else [*self.command]
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             raise UserError(f"the command cannot be read ({error})", f"cell {self.name!r}", MEND) from None
 
 
@@ -79,23 +78,22 @@ class Experiment:
         if len(rows) > MAX_CELLS:
             raise UserError(f"more than {MAX_CELLS} cells", self.name, "Take fewer values.")
         for row in rows:
-            if isinstance(row, Command):
-                yield row
-            elif isinstance(row, tuple) and 2 <= len(row) <= 3 and isinstance(row[0], str) and isinstance(row[1], str):
-                yield Command(*row)
-            else:
+            command = Command(*row) if isinstance(row, tuple) and 2 <= len(row) <= 3 else row
+            parts = (command.name, *command.words) if isinstance(command, Command) else (None,)
+            if not all(isinstance(part, str) for part in parts):
                 raise UserError("an experiment yields (name, command) or (name, command, columns)", self.name, MEND)
+            yield command
 
 
-def about(meaning: str, **limits: Any) -> Mapping[str, Any]:
+def explained(meaning: str, **limits: Any) -> Mapping[str, Any]:
     """What a setting means, for its annotation; ``limits`` are those of :func:`hypogoal.core.config.setting`."""
     metadata: Mapping[str, Any] = setting(None, meaning, **limits).metadata
     return metadata
 
 
-Layouts = Annotated[Integers, about("layouts, each with an agent of its own", source="paper, Figure 6", low=0)]
-Seeds = Annotated[Integers, about("run seeds, each with ensembles of its own", low=0)]
-Paired = Annotated[bool, about("each layout with the seed at its place in the list, instead of all with all")]
+Layouts = Annotated[Integers, explained("layouts, each with an agent of its own", source="paper, Figure 6", low=0)]
+Seeds = Annotated[Integers, explained("run seeds, each with ensembles of its own", low=0)]
+Paired = Annotated[bool, explained("each layout with the seed at its place in the list, instead of all with all")]
 
 
 def experiment(
@@ -120,15 +118,15 @@ def experiment(
 
 def load_experiment(name: str) -> Experiment:
     """The experiment ``module:function``; the user must have given the name or allowed it, else a ``UserError``."""
-    found = load_own(name, "experiment", ENTRY_POINTS, {})
-    if isinstance(found, Experiment):
-        return replace(found, is_own=True)
-    if not inspect.isgeneratorfunction(found):
+    target = load_own(name, "experiment", "hypogoal.experiments", {})
+    if isinstance(target, Experiment):
+        return replace(target, is_own=True)
+    if not inspect.isgeneratorfunction(target):
         raise UserError("the object is not an experiment", name, "Give a generator of (name, command).")
-    if _takes_stages(found):
+    if _takes_stages(target):
         raise UserError("all arguments of an experiment must be keyword-only", name, "Write * before them.")
-    config_class = _config_of(found, closing=True)
-    return Experiment(found.__name__.replace("_", "-"), found, config_class, is_own=True)
+    config_class = _config_of(target, closing=True)
+    return Experiment(target.__name__.replace("_", "-"), target, config_class, is_own=True)
 
 
 def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> list[tuple[int, int]]:
@@ -136,15 +134,15 @@ def agents_of(layouts: Sequence[int], seeds: Sequence[int], *, paired: bool) -> 
     if not paired:
         return list(product(layouts, seeds))
     if len(layouts) != len(seeds):
-        what = f"{len(layouts)} layouts cannot be paired with {len(seeds)} seeds"
-        raise UserError(what, None, "Give as many of both, or paired=false for every layout with every seed.")
+        problem = f"{len(layouts)} layouts cannot be paired with {len(seeds)} seeds"
+        raise UserError(problem, None, "Give as many of both, or paired=false for every layout with every seed.")
     return list(zip(layouts, seeds, strict=True))
 
 
-def check_among(values: Sequence[Value], name: str, made: Sequence[Value], made_name: str, what: str) -> None:
-    """Refuse (``UserError``) values of a setting for which the commands of another setting make nothing to read."""
-    if missing := [value for value in values if value not in made]:
-        raise UserError(f"no {what} of {','.join(map(str, missing))} to read", name, f"Add it to {made_name}.")
+def check_among(values: Sequence[Value], name: str, available: Sequence[Value], source: str, noun: str) -> None:
+    """Refuse (``UserError``) values that read what the commands of another setting, ``source``, do not make."""
+    if missing := [value for value in values if value not in available]:
+        raise UserError(f"no {noun} of {','.join(map(str, missing))} to read", name, f"Add it to {source}.")
 
 
 def run_config(
@@ -168,7 +166,7 @@ def _config_of(function: Callable[..., Iterable[Any]], *, closing: bool) -> type
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind is not parameter.KEYWORD_ONLY:
             continue
-        kind, metadata = hints.get(name), about("")
+        kind, metadata = hints.get(name), explained("")
         if get_origin(kind) is Annotated:
             kind, metadata = get_args(kind)
         if kind not in KINDS or parameter.default is parameter.empty or name in ("workers", "evaluate"):

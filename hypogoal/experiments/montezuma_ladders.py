@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.experiment import Command, Integers, Names, Seeds, about, check_among, experiment
+from hypogoal.experiments.experiment import Command, Integers, Names, Seeds, check_among, experiment, explained
 
 RATES = {
     "heldout": "heldout_per_room",
@@ -36,14 +36,19 @@ ORACLE = "options that end at the true sub-goal beside them, on each ladder"
 @experiment("montezuma", stages=("collect", "train-ensemble", "train-options"), rates=RATES)
 def montezuma_ladders(
     *,
-    groups: Annotated[Integers, about("labelled ladder groups (N)", source="Figure 3", low=1, high=7)] = (1, 2, 3, 7),
+    groups: Annotated[Integers, explained("labelled ladder groups (N)", source="Figure 3", low=1, high=7)] = (
+        1,
+        2,
+        3,
+        7,
+    ),
     seeds: Seeds = (0,),
-    methods: Annotated[Names, about(ENSEMBLES, source="Figure 3", choices=METHODS)] = tuple(METHODS),
-    variants: Annotated[Names, about(CHANGES)] = (),
-    ladders: Annotated[Names, about("ladders to learn options on; empty for none", source="Figure 4")] = (),
-    option_groups: Annotated[Integers, about(OPTION_GROUPS, low=1, high=7)] = (2,),
-    option_methods: Annotated[Names, about(OPTION_METHODS, choices=METHODS)] = tuple(METHODS),
-    oracle: Annotated[bool, about(ORACLE, source="ours: a control")] = True,
+    methods: Annotated[Names, explained(ENSEMBLES, source="Figure 3", choices=METHODS)] = tuple(METHODS),
+    variants: Annotated[Names, explained(CHANGES)] = (),
+    ladders: Annotated[Names, explained("ladders to learn options on; empty for none", source="Figure 4")] = (),
+    option_groups: Annotated[Integers, explained(OPTION_GROUPS, low=1, high=7)] = (2,),
+    option_methods: Annotated[Names, explained(OPTION_METHODS, choices=METHODS)] = tuple(METHODS),
+    oracle: Annotated[bool, explained(ORACLE, source="ours: a control")] = True,
 ) -> Iterator[Command]:
     """The states and ensembles of each N, then the options of each ladder and seed with their oracle."""
     if ladders:

@@ -79,29 +79,29 @@ def _check_own(experiment: Experiment, assignments: list[str], preset: str | Non
         if value:
             do = f"Write --{option} into its commands."
             raise UserError(f"an experiment of your own takes no {option}", value, do)
-    known = [field.name for field in fields(experiment.config_class)]
+    names = [field.name for field in fields(experiment.config_class)]
     for key, text in parse_assignments(assignments).items():
-        if key not in known:
-            do = f"It has {', '.join(known)}."
+        if key not in names:
+            do = f"It has {', '.join(names)}."
             raise UserError("no such axis or setting in this experiment", f"{key}={text}", do)
     return assignments
 
 
 def _split(experiment: Experiment, assignments: Iterable[str]) -> tuple[list[str], dict[str, list[str]]]:
     """The experiment's own assignments, and those of each of its stages without the stage's name."""
-    own: list[str] = []
+    of_run: list[str] = []
     by_stage: dict[str, list[str]] = {}
     for assignment in assignments:
         (key,) = parse_assignments([assignment])
         stage, dot, rest = key.partition(".")
         stage = stage.replace("_", "-") if dot else stage
         if not dot:
-            own.append(assignment)
+            of_run.append(assignment)
         elif stage in experiment.stages:
             by_stage.setdefault(stage, []).append(f"{rest}={assignment.partition('=')[2]}")
         else:
             raise UserError("no such stage in --set", stage, f"Choose one of {', '.join(experiment.stages)}.")
-    return own, by_stage
+    return of_run, by_stage
 
 
 def _check_free(experiment: Experiment, commands: Sequence[Command], by_stage: Mapping[str, Sequence[str]]) -> None:
@@ -149,8 +149,8 @@ def _cells(commands: Sequence[Command], out: Path, common: Mapping[str, Sequence
         if any(word.split("=")[0] in RESERVED for word in words):  # even by a setting's value
             raise UserError(f"{', '.join(RESERVED)} are given by the sweep", where, MEND)
         cost = command.cost._replace(cores=_cores(words, sources))
-        # What is common to a stage comes behind stage and input, so that the cell's own come last: of settings the last
-        # one counts, and a method or a control is what it is called, whatever all cells were given.
+        # Options of all cells of a stage stand before the cell's own: the last setting of a name counts, so --set
+        # cannot turn a method or a control into another.
         words[2:2] = common[words[0]]
         place = out / ((folder if short else command.name) + (".h5" if words[0] == "collect" else ""))
         needs = [source.out for source in sources]
@@ -167,14 +167,14 @@ def _columns(command: Command) -> Mapping[str, str | int | float]:
 
 
 def _cores(words: Sequence[str], sources: Sequence[Cell]) -> int:
-    """Processes that a command can use: training ensembles one for each sub-goal, as far as those are simply seen."""
+    """The processes that a command can use: train-ensemble one for each sub-goal, if those are known here."""
     if words[0] != "train-ensemble":
         return 1
     settings = dict(re.findall(r"--set[ =](\w+)=(\S+)", " ".join(words)))
     domain = next((cell.arguments[1] for cell in sources if cell.stage == "collect"), "")
     count = len(settings["sub_goals"].split(",")) if "sub_goals" in settings else 1
     if "sub_goals" not in settings:
-        with contextlib.suppress(UserError):  # it may not be loaded: whether it may run is for its cell to say
+        with contextlib.suppress(UserError):  # its cell refuses a domain that may not be loaded
             count = len(load_domain(domain).sub_goals)
     limit = settings.get("workers", "")
     return max(1, min(count, int(limit) if limit.isdigit() and int(limit) else count))

@@ -29,8 +29,8 @@ def write_results(plan: Plan, run: Path) -> Path:
     try:
         write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        what = f"an artefact is damaged ({type(error).__name__} {error})"
-        raise UserError(what, run, advice("Which one", "verify", run)) from None
+        problem = f"an artefact is damaged ({type(error).__name__} {error})"
+        raise UserError(problem, run, advice("Which one", "verify", run)) from None
     return path
 
 

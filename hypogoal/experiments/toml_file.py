@@ -103,8 +103,8 @@ def _command(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], poin
         if key in point:
             return str(point[key])
         if key not in rows or rows[key] is row or not point.keys() >= {*rows[key].get("axes", [])}:
-            what = f"{{{key}}} is neither an axis of these cells nor the name of cells above over some of their axes"
-            raise UserError(what, f"cells {row.get('name', '')!r}", MEND)
+            problem = f"{{{key}}} is neither an axis of these cells nor the name of cells above over some of their axes"
+            raise UserError(problem, f"cells {row.get('name', '')!r}", MEND)
         return f"@{_name(rows[key], point)}"
 
     words = Command(row.get("name", ""), row.get("command", "")).words

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Annotated
 
-from hypogoal.experiments.experiment import Command, about, experiment
+from hypogoal.experiments.experiment import Command, experiment, explained
 
 RATES = {
     "heldout": "heldout_layouts",
@@ -24,15 +24,15 @@ METHODS = {
     "none": "--diversity none --members 3",
     "one": "--diversity none --members 1",
 }
-Rooms = Annotated[tuple[int, ...], about("seeds: each has states, ensembles, rooms and agents of its own")]
+Rooms = Annotated[tuple[int, ...], explained("seeds: each has states, ensembles, rooms and agents of its own")]
 
 
 @experiment("which-feature", stages=("collect", "train-ensemble", "train-meta"), short=True, rates=RATES)
 def which_feature(
     *,
     seeds: Rooms = tuple(range(990, 1000)),
-    methods: Annotated[tuple[str, ...], about("ensembles", choices=METHODS)] = ("dbat", "none", "one"),
-    truths: Annotated[tuple[str, ...], about("what the reward asks for")] = ("shape", "place"),
+    methods: Annotated[tuple[str, ...], explained("ensembles", choices=METHODS)] = ("dbat", "none", "one"),
+    truths: Annotated[tuple[str, ...], explained("what the reward asks for")] = ("shape", "place"),
 ) -> Iterator[Command]:
     """The states of each seed, its ensembles, then an agent for each of them and each truth."""
     for seed in seeds:

@@ -149,8 +149,8 @@ def sweep(
     if outcome.failed:
         name, reason = next(iter(outcome.failed.items()))
         rest = f", {len(outcome.waiting)} wait for them" if outcome.waiting else ""
-        what = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {reason}"
-        raise UserError(what, None, "Fix it, then start again: what is done is kept.")
+        problem = f"{len(outcome.failed)} of {len(planned.cells)} cells failed{rest}; the first is {name}: {reason}"
+        raise UserError(problem, None, "Fix it, then start again: what is done is kept.")
     say(f"all {len(planned.cells)} cells done")
     return out / records.RESULTS
 
@@ -171,8 +171,8 @@ def submit(
     with sole_writer(out):
         planned = _begin(planned, out, force=False, say=(lambda text: None) if quiet else _say, confirm=confirm)
         if planned.anew:
-            what = f"{len(planned.anew)} cells are still to be made again, as 'run --force' began to"
-            raise UserError(what, out, records.GIVE)
+            problem = f"{len(planned.anew)} cells are still to be made again, as 'run --force' began to"
+            raise UserError(problem, out, records.GIVE)
         todo = left_of(planned.cells)
         return slurm.submit(planned, out, todo, options) if todo else []
 

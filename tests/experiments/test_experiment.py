@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
 
 import pytest
 
@@ -12,7 +11,7 @@ from hypogoal.core import own_code
 from hypogoal.core.config import describe
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Plan
-from hypogoal.experiments.experiment import Command, about, experiment, load_experiment
+from hypogoal.experiments.experiment import Command, Seeds, experiment, load_experiment
 from hypogoal.experiments.planning import make_plan
 from hypogoal.stages.sweep import config_class_of, plan
 
@@ -21,10 +20,10 @@ OUT = Path("somewhere")
 MODULE = """
 from typing import Annotated
 
-from hypogoal.experiments.experiment import about
+from hypogoal.experiments.experiment import explained
 
 
-def members(*, sizes: Annotated[tuple[int, ...], about("members", low=1)] = (1, 3), small: bool = False):
+def members(*, sizes: Annotated[tuple[int, ...], explained("members", low=1)] = (1, 3), small: bool = False):
     yield "data", "collect doorkey"
     for size in sizes:
         yield f"ensemble/size-{size}", f"train-ensemble @data --members {size}", {"size": size}
@@ -65,7 +64,7 @@ def test_a_generator_of_names_and_commands(tmp_path: Path, monkeypatch: pytest.M
         ('"collect doorkey"', '"collect \'doorkey"', "cannot be read"),
         ('"collect doorkey"', '"collect doorkey --out /tmp"', "given by the sweep"),
         ('"collect doorkey"', '"collect doorkey @ensemble/size-1"', "would read what no cell before it makes"),
-        ('"collect doorkey"', "3", r"yields \(name, command\)"),
+        ('"collect doorkey"', "[3]", r"yields \(name, command\)"),
         ('yield "data"', 'yield "../data"', "name of their own"),
         ('yield "data"', 'yield "logs"', "name of their own"),
         ("ensemble/size-{size}", "ensemble/../{size}", "outside the run"),
@@ -130,7 +129,7 @@ def test_settings_and_presets_of_a_domain() -> None:
     """Spec G4: with a domain, presets, the device and settings of stages apply to all commands of a stage."""
 
     @experiment("doorkey", stages=("collect", "train-ensemble"), rates={"collect": 10})
-    def two(stage: object, *, seeds: Annotated[tuple[int, ...], about("seeds", low=0)] = (0, 1)) -> Iterator[Command]:
+    def two(*, seeds: Seeds = (0, 1)) -> Iterator[Command]:
         yield Command("data", "collect doorkey")
         for seed in seeds:
             yield Command(f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}")

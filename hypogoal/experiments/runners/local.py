@@ -32,18 +32,18 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
     outcome = Outcome(waiting=list(plan.cells))
     places = {cell.name: place for place, cell in enumerate(plan.cells)}
     running: list[Running] = []
-    made: set[Path] = set()
+    done: set[Path] = set()
     startable: list[Cell] = []
     budget = free_memory()
     total, reported = len(plan.cells), time.monotonic()
     try:
         while True:
-            while ready := [cell for cell in outcome.waiting if made.issuperset(cell.needs)]:
+            while ready := [cell for cell in outcome.waiting if done.issuperset(cell.needs)]:
                 for cell in ready:  # a finished one makes others ready
                     outcome.waiting.remove(cell)
                     try:
                         if cell.name not in plan.anew and is_finished(cell) and not check:
-                            made.add(cell.out)
+                            done.add(cell.out)
                         else:
                             startable.append(cell)
                     except UserError as error:
@@ -53,10 +53,10 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                 cell = startable.pop(0)
                 try:
                     running.append(start(cell, run, cores=cores, force=cell.name in plan.anew, check=check))
-                    say(f"[{len(made)}/{total}] {cell.name} ...")
+                    say(f"[{len(done)}/{total}] {cell.name} ...")
                 except UserError as error:
                     _fail(outcome, cell, str(error), say)
-            if not running and not any(made.issuperset(cell.needs) for cell in outcome.waiting):
+            if not running and not any(done.issuperset(cell.needs) for cell in outcome.waiting):
                 return outcome
             time.sleep(POLL_SECONDS)
             for started in [started for started in running if started.process.poll() is not None]:
@@ -66,8 +66,8 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                 else:
                     if started.cell.name in plan.anew:
                         made_anew(run, started.cell)
-                    made.add(started.cell.out)
-                    say(f"[{len(made)}/{total}] {started.cell.name} done in {started.seconds:.0f} s")
+                    done.add(started.cell.out)
+                    say(f"[{len(done)}/{total}] {started.cell.name} done in {started.seconds:.0f} s")
             if running and time.monotonic() - reported > REPORT_SECONDS:
                 reported = time.monotonic()
                 for started in running:

@@ -175,8 +175,8 @@ def _sbatch(script: Path, after: Sequence[str]) -> str:
     dependency = [f"--dependency=afterany:{':'.join(after)}"] if after else []
     done = _command("sbatch", "--parsable", *dependency, str(script))
     if done.returncode:
-        what = f"Slurm refuses the array ({' '.join(done.stderr.split()) or f'exit code {done.returncode}'})"
-        raise UserError(what, script, "Change the options; nothing was left in the queue.")
+        problem = f"Slurm refuses the array ({' '.join(done.stderr.split()) or f'exit code {done.returncode}'})"
+        raise UserError(problem, script, "Change the options; nothing was left in the queue.")
     return done.stdout.strip().partition(";")[0]
 
 
