@@ -4,7 +4,7 @@ D-BAT beside no diversity, one classifier a sub-goal, and the true sub-goals; PP
 have them on the first five layouts, and PPO that is paid where D-BAT's members predict positive.
 
     hypogoal sweep examples.figure6:figure6 --out runs/figure6
-    python -m benchmarks.choosing runs/figure6 docs/results/figure6-doorkey.csv
+    python -m studies.choosing runs/figure6 docs/results/figure6-doorkey.csv
 """
 
 from collections.abc import Iterator

@@ -2,7 +2,7 @@
 its own; options are planned (exact), so nothing here is a matter of option learning.
 
     hypogoal sweep examples.preference:preference --out runs/preference
-    python -m benchmarks.choosing runs/preference docs/results/preference-doorkey.csv
+    python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
 """
 
 from collections.abc import Iterator

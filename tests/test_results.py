@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import (
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from studies import (
     bandits,
     choosing,
     figure6,
@@ -20,8 +21,7 @@ from benchmarks import (
     tuning,
     which_feature,
 )
-from benchmarks.cells import run_cells
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from studies.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {

@@ -1,8 +1,8 @@
 """Spec G1, G2: full disks, signals and turned clocks while stages run; files made to hurt whoever reads them.
 
-``python -m benchmarks.attacks [--family disk ...] [--cases 20] [--seed 0] [--json FILE]`` prints a row for each family.
-A case is bad when a command ends in a traceback, in more than one line, or not at all; when it writes outside its
-output or takes more memory than a small file is worth; when an output is there and not whole, has other bytes after
+``python -m tests.attacks.attacks [--family disk ...] [--cases 20] [--seed 0] [--json FILE]`` prints a row for each
+family. A case is bad when a command ends in a traceback, in more than one line, or not at all; when it writes outside
+its output or takes more memory than a small file is worth; when an output is there and not whole, has other bytes after
 ``--resume`` than an undisturbed one, or when a process outlives its stage. ``--case 7`` runs one case again.
 
 ``disk`` mounts a tmpfs, so it needs root on Linux; ``clock`` and ``writes`` need a C compiler. Without them these are
@@ -31,14 +31,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import hostile
-from benchmarks.hostile import TRAINED
-from benchmarks.kills import PACES, STAGES, Stage, differences, needed, unbroken
-from benchmarks.mutations import state_changed
-from benchmarks.sweeps import TOY
 from hypogoal.core.checkpoints import FOLDER, PACE, Checkpoints
 from hypogoal.core.drafts import draft_folder
 from hypogoal.core.workers import PYTHON
+from tests.attacks import hostile
+from tests.attacks.hostile import TRAINED
+from tests.attacks.kills import PACES, STAGES, Stage, differences, needed, unbroken
+from tests.attacks.mutations import state_changed
+from tests.attacks.sweeps import TOY
 
 SECONDS, WAIT = 60.0, 300.0  # of a core that a command may take; of the clock, on whatever machine
 MEMORY, SMALL = 2**30, 16 * 2**20  # bytes that a file below SMALL may cost
@@ -749,7 +749,9 @@ def main() -> int:
     if "writes" in (given.family or FAMILIES) and "full.so" not in os.environ.get("LD_PRELOAD", "") and COMPILER:
         folder.mkdir(parents=True, exist_ok=True)
         os.environ["LD_PRELOAD"] = str(preloaded(FULL, folder / "full.so"))  # for commands, which are forked from here
-        os.execv(sys.executable, [sys.executable, "-m", "benchmarks.attacks", *sys.argv[1:], "--folder", str(folder)])
+        os.execv(
+            sys.executable, [sys.executable, "-m", "tests.attacks.attacks", *sys.argv[1:], "--folder", str(folder)]
+        )
     prepare()
     box, rows = Box(folder), []
     print("| family | cases | refused in one line | accepted | bad | slowest | memory |\n" + "|---" * 7 + "|")

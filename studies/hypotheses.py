@@ -1,15 +1,15 @@
 """What members know of DoorKey's held-out layouts, by method and length of training: the cells behind the results.
 
-    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 100
-    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 101,102 --until 600
-    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --layouts test --seeds 0-9 --chosen
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 100
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 101,102 --until 600
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --layouts test --seeds 0-9 --chosen
 
 A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps. Its rows, one a look
 and member, are appended to the file as soon as it is done; a run that was cut goes on where it stopped. Layouts for
 choosing a method's length of training are others than those that it is tested on, and so are the seeds. With
 ``--chosen`` a method is trained to its chosen length and looked at there only; without, all the way.
 
-    python -m benchmarks.hypotheses docs/results/hypotheses-doorkey.csv --tables
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --tables
 
 prints the tables of all cells that there are, as Markdown.
 """
@@ -27,7 +27,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from hypogoal.core.compute import prepare
 from hypogoal.core.progress import Progress
 from hypogoal.core.rounding import above
@@ -40,6 +39,7 @@ from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
 from hypogoal.hypotheses.scores import cross_fitted
 from hypogoal.hypotheses.training import fit
 from hypogoal.stages.train_ensemble import score_rows
+from studies.cells import Row, interval, parser_of, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},

@@ -1,10 +1,10 @@
 """How many labelled states does a hypothesis need? DoorKey's held-out layouts by the number of labels.
 
-    python -m benchmarks.labels docs/results/labels-doorkey.csv --seeds 0-4
+    python -m studies.labels docs/results/labels-doorkey.csv --seeds 0-4
 
 A cell is a number of labelled states, a method, a sub-goal and a seed: one training of ``STEPS`` steps on states drawn
 from those of layout 0, half of them positives where there are so many. Kept and gone on with as in
-``benchmarks.hypotheses``; ``--tables`` draws the cells.
+``studies.hypotheses``; ``--tables`` draws the cells.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, parser_of, run_cells, table
-from benchmarks.hypotheses import Looked, settings_of, states_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.seeding import rng_for, seed_for
 from hypogoal.domains.doorkey import DOMAIN
@@ -27,6 +25,8 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import fit
+from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.hypotheses import Looked, settings_of, states_of
 
 LABELS = (5, 10, 20, 50, 200, 0)  # 0: all of them
 TRAINED = ("dbat", "none", "dbat-unpaired")

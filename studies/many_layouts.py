@@ -1,11 +1,11 @@
 """Do options learned over 1,000 layouts work on layouts that nobody played? DoorKey, members' verdicts as reward.
 
-    python -m benchmarks.many_layouts docs/results/many-layouts.csv --seeds 0-4
+    python -m studies.many_layouts docs/results/many-layouts.csv --seeds 0-4
 
 A cell is a method and a seed: all options of an ensemble, learned together, looked at on the way. A look lets each
 option play alone, greedily, from the start of 100 layouts that training drew from (``trained``) and of 100 others
 (``new``), see ``hypogoal.evaluation.zero_shot``. The others are those from ``FIRST`` on whose grid is none of a layout
-that anything was learned on. Kept and gone on with as in ``benchmarks.hypotheses``; ``--tables`` draws the cells.
+that anything was learned on. Kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 
 What limits success is told by controls: ``planned`` options go the shortest way to where members say yes, so what they
 lack is the members' fault; ``oracle`` options learn with the true sub-goals, so what they lack is learning's;
@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Cell, Row, interval, parser_of, run_cells, table
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
@@ -42,6 +41,7 @@ from hypogoal.meta.training import assemble
 from hypogoal.options.loop import OptionLoop
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
+from studies.cells import Cell, Row, interval, parser_of, run_cells, table
 
 TRAINED, FIRST, TRIED = "1000-1999", 5000, 100  # layouts to learn in; where the new ones begin, and how many
 LEARNT = (0, 1, 2)  # layouts of the states that ensembles learn from

@@ -1,9 +1,9 @@
 """Spec G1, G4: a toy sweep or run killed at random moments and started again, against an unbroken one, byte by byte.
 
-``python -m benchmarks.sweeps [--run] [--group] [--kills 20] [--pairs 0] [--seed 0] [--folder DIR]`` prints how often it
-was killed, how many ended, how many of their files differ, and how many processes outlived the sweep. It gets SIGKILL
-alone, and its cells die with it; with ``--group`` they all get it. With ``--pairs`` it is also started twice at once,
-so many times: one of the two does it, or each is told in one line.
+``python -m tests.attacks.sweeps [--run] [--group] [--kills 20] [--pairs 0] [--seed 0] [--folder DIR]`` prints how often
+it was killed, how many ended, how many of their files differ, and how many processes outlived the sweep. It gets
+SIGKILL alone, and its cells die with it; with ``--group`` they all get it. With ``--pairs`` it is also started twice at
+once, so many times: one of the two does it, or each is told in one line.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.kills import differences
 from hypogoal.core.checkpoints import PACE
+from tests.attacks.kills import differences
 
 SMALL = "--set members=2 --set sub_goals=open-red-door"
 QUICK = "--set environments=8 --set warm_up=100 --set max_episode_steps=60 --set random_episodes=5"

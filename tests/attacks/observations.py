@@ -1,4 +1,4 @@
-"""Spec B6: observations of any shape, turned pictures, contradictory labels, at random (``benchmarks.fuzz``)."""
+"""Spec B6: observations of any shape, turned pictures, contradictory labels, at random (``tests.attacks.fuzz``)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """What 'the last 100 episodes that ended' say, where failures last longer than successes: episodes with a known share.
 
-python -m benchmarks.finished docs/results/finished-episodes.csv             simulate, and print the tables
-python -m benchmarks.finished docs/results/finished-episodes.csv --tables    print the tables
+python -m studies.finished docs/results/finished-episodes.csv             simulate, and print the tables
+python -m studies.finished docs/results/finished-episodes.csv --tables    print the tables
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import table
 from hypogoal.learners.episodes import LAST
+from studies.cells import table
 
 ENVIRONMENTS, REPETITIONS, CHANGE = 16, 400, 40_000  # steps, of all environments together, like all steps here
 CAPS = (57, 500)  # steps of a failed episode; a solved one takes 20 to 40

@@ -1,4 +1,4 @@
-"""Damage and malice for ``benchmarks.fuzz``: bytes, JSON and TOML values, safetensors headers, HDF5 structures."""
+"""Damage and malice for ``tests.attacks.fuzz``: bytes, JSON and TOML values, safetensors headers, HDF5 structures."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """Spec G1: every stage killed at random moments and resumed, against the same stage unbroken, byte by byte.
 
-``python -m benchmarks.kills [--kills 50] [--stages train-meta ...] [--seed 0] [--folder DIR]`` prints a table: stage,
-kills, how many of them came while a checkpoint was written, runs that ended, files that differ, losses. A loss is a
-resumed stage that fails, or a checkpoint that cannot be read after a kill. With ``--pairs`` nothing is killed: two
-processes work on one ``--out`` at once, so many times; how many were refused stands in the second column, and
-a loss is a pair of which none made it, or one that was not refused in one line.
+``python -m tests.attacks.kills [--kills 50] [--stages train-meta ...] [--seed 0] [--folder DIR]`` prints a table:
+stage, kills, how many of them came while a checkpoint was written, runs that ended, files that differ, losses. A loss
+is a resumed stage that fails, or a checkpoint that cannot be read after a kill. With ``--pairs`` nothing is killed: two
+processes work on one ``--out`` at once, so many times; how many were refused stands in the second column, and a loss is
+a pair of which none made it, or one that was not refused in one line.
 
 A stage runs as a process of its own, forked from this one so that it need not load its libraries again, and gets
 SIGKILL. It saves a checkpoint every few milliseconds (``HYPOGOAL_CHECKPOINT_SECONDS``).

@@ -1,4 +1,4 @@
-"""Files for ``benchmarks.attacks`` that are made to hurt whoever reads them: each kind by name, and who reads it."""
+"""Files for ``tests.attacks.attacks`` that are made to hurt whoever reads them: each kind by name, and who reads it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from benchmarks.fuzz import OWN, PRESET, resigned
-from benchmarks.mutations import bytes_changed, toml_of
+from tests.attacks.fuzz import OWN, PRESET, resigned
+from tests.attacks.mutations import bytes_changed, toml_of
 
 Rng = random.Random
 Makers = dict[str, Callable[[Path], object]]

@@ -1,6 +1,6 @@
 """The README's picture: what choosing and an ensemble are worth, point by point.
 
-python -m benchmarks.picture docs/results.png
+python -m studies.picture docs/results.png
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """What members know of rooms of Montezuma's Revenge nobody labelled, by labelled ladder groups and length of training.
 
-    python -m benchmarks.ladders docs/results/hypotheses-ladders.csv --groups 1 --seeds 0-9
+    python -m studies.ladders docs/results/hypotheses-ladders.csv --groups 1 --seeds 0-9
 
 A cell is N (labelled ladder groups), a method and a seed: one training, looked at after each of ``LOOKS`` steps.
 Length and member are picked on half of the rooms and scored on the other half, and the other way round. Cells are kept
-and gone on with as in ``benchmarks.hypotheses``; ``--tables`` draws them.
+and gone on with as in ``studies.hypotheses``; ``--tables`` draws them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, parser_of, run_cells, table
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import parse_integers
 from hypogoal.core.progress import Progress
@@ -31,6 +30,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
 from hypogoal.hypotheses.training import fit
+from studies.cells import Row, interval, parser_of, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},

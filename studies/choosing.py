@@ -1,12 +1,12 @@
 """What choosing is worth, played by the agents of a sweep: the rows behind the result, and its tables.
 
 hypogoal run doorkey --preset choosing --out runs/choosing
-python -m benchmarks.choosing runs/choosing docs/results/choosing-doorkey.csv
+python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
 hypogoal run which-feature --out runs/which-feature
-python -m benchmarks.choosing runs/which-feature docs/results/which-feature-rooms.csv
+python -m studies.choosing runs/which-feature docs/results/which-feature-rooms.csv
 hypogoal sweep examples.preference:preference --out runs/preference
-python -m benchmarks.choosing runs/preference docs/results/preference-doorkey.csv
-python -m benchmarks.choosing --tables docs/results/choosing-doorkey.csv
+python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
+python -m studies.choosing --tables docs/results/choosing-doorkey.csv
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import interval, table
 from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
 from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
 from hypogoal.evaluation.curves import LEARNED
+from studies.cells import interval, table
 
 METHODS = {  # by what the names of artefacts have in them, the longest first
     "dbat-truth-shape": "shape: D-BAT, K = 3",

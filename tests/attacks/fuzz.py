@@ -1,8 +1,8 @@
 """Spec G2: thousands of damaged and hostile files of each format, read by every command that reads them.
 
-``python -m benchmarks.fuzz --cases 5000`` prints a table. A case fails when a command ends other than with success or
-with one line and exit code 2, takes longer than ``SECONDS``, needs more than ``MEMORY`` beyond what it began with, or
-changes a file outside its output. ``--format hdf5 --case 17 --debug`` runs one case again with its traceback.
+``python -m tests.attacks.fuzz --cases 5000`` prints a table. A case fails when a command ends other than with success
+or with one line and exit code 2, takes longer than ``SECONDS``, needs more than ``MEMORY`` beyond what it began with,
+or changes a file outside its output. ``--format hdf5 --case 17 --debug`` runs one case again with its traceback.
 """
 
 from __future__ import annotations
@@ -31,7 +31,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-from benchmarks.mutations import (
+from hypogoal.core.artefacts import create_artefact, sha256_of
+from hypogoal.core.errors import UserError
+from hypogoal.core.manifests import sealed
+from hypogoal.dataset import Collected, States, write_dataset
+from tests.attacks.mutations import (
     ENDLESS,
     Rng,
     bytes_changed,
@@ -42,10 +46,6 @@ from benchmarks.mutations import (
     toml_of,
     tree_changed,
 )
-from hypogoal.core.artefacts import create_artefact, sha256_of
-from hypogoal.core.errors import UserError
-from hypogoal.core.manifests import sealed
-from hypogoal.dataset import Collected, States, write_dataset
 
 SECONDS = 60.0  # of the clock: the machine may be busy
 MEMORY = 2**30
@@ -380,7 +380,7 @@ def fuzz_sweep(box: Sandbox, rng: Rng, case: int) -> bool:
 
 def fuzz_observations(box: Sandbox, rng: Rng, case: int) -> bool:
     """What people import: an observation of any shape and type, a turned picture, labels that contradict each other."""
-    from benchmarks.observations import check_labels, check_upright, drawn_observation, outcome_of
+    from tests.attacks.observations import check_labels, check_upright, drawn_observation, outcome_of
 
     check_upright(box.out, rng)
     outcomes = check_labels(rng), outcome_of(*drawn_observation(rng)) != "refused"
@@ -438,7 +438,9 @@ def fuzz(name: str, cases: int, seed: int) -> dict[str, Any]:
     slowest, following = 0.0, 0
     while following < cases:
         arguments = ["--format", name, "--seed", str(seed), "--worker", str(following), str(cases)]
-        with subprocess.Popen([sys.executable, "-m", "benchmarks.fuzz", *arguments], stdout=subprocess.PIPE) as child:
+        with subprocess.Popen(
+            [sys.executable, "-m", "tests.attacks.fuzz", *arguments], stdout=subprocess.PIPE
+        ) as child:
             lines = _lines(child)
             for row in lines:
                 if "begins" in row:

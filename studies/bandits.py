@@ -1,7 +1,7 @@
 """How soon is the right member known? Choosers on the rooms of WhichFeature, a few hundred episodes each.
 
-    python -m benchmarks.bandits runs/which-feature docs/results/which-feature-bandits.csv
-    python -m benchmarks.bandits --tables docs/results/which-feature-bandits.csv
+    python -m studies.bandits runs/which-feature docs/results/which-feature-bandits.csv
+    python -m studies.bandits --tables docs/results/which-feature-bandits.csv
 
 The first path is the folder of ``hypogoal run which-feature``, whose ensembles are played with.
 """
@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cells import Row, interval, run_cells, table
 from hypogoal.cli import main as hypogoal
+from studies.cells import Row, interval, run_cells, table
 
 CHOOSERS = {"thompson": "Thompson sampling", "ppo": "PPO", "random": "uniform-random"}
 # By name as in the CSV; Exp3 is gone, since it was slower than Thompson sampling: for the rows that were made with it.

@@ -1,7 +1,7 @@
 """Where a member should say yes, without a label of another layout: rules for thresholds, compared on DoorKey.
 
-    python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-101
-    python -m benchmarks.thresholds docs/results/thresholds-doorkey.csv --layouts test --seeds 0-4
+    python -m studies.thresholds docs/results/thresholds-doorkey.csv --layouts choice --seeds 100-101
+    python -m studies.thresholds docs/results/thresholds-doorkey.csv --layouts test --seeds 0-4
 
 A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps; ``--tables`` draws
 them. A rule sees a member's probabilities on the labelled and the unlabelled states, and which labelled ones are
@@ -21,8 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from benchmarks.cells import Row, interval, parser_of, run_cells, table
-from benchmarks.hypotheses import METHODS, states_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.seeding import seed_for
 from hypogoal.domains.doorkey import DOMAIN
@@ -31,6 +29,8 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, member_scores
 from hypogoal.hypotheses.thresholds import unlabelled_split
 from hypogoal.hypotheses.training import fit
+from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.hypotheses import METHODS, states_of
 
 Probabilities = NDArray[np.float64]  # of one member
 Rule = Callable[[Any, Any, Any], float | np.floating]  # labelled positives, negatives, unlabelled

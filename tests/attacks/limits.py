@@ -1,9 +1,9 @@
 """Spec G2: every stage under limits of the system, then resumed without them, against the same stage unbroken.
 
-``python -m benchmarks.limits [--stages train-meta ...] [--folder DIR]`` prints a table by stage and limit: tried, ended
-within the limit, refused (one line, and nothing but a draft left), died (of a signal: a library that has no memory
-aborts, which no program can catch; resumed it must be the same all the same), bad. Bad is whatever else: a traceback,
-several lines, an output that is there and not whole, files that differ once it was resumed.
+``python -m tests.attacks.limits [--stages train-meta ...] [--folder DIR]`` prints a table by stage and limit: tried,
+ended within the limit, refused (one line, and nothing but a draft left), died (of a signal: a library that has no
+memory aborts, which no program can catch; resumed it must be the same all the same), bad. Bad is whatever else: a
+traceback, several lines, an output that is there and not whole, files that differ once it was resumed.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from benchmarks.kills import STAGES, begin, differences, needed, unbroken
 from hypogoal.inspection import faults_of
+from tests.attacks.kills import STAGES, begin, differences, needed, unbroken
 
 KB, MB = 2**10, 2**20
 OUTCOMES = ("ended", "refused", "died")

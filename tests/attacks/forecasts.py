@@ -1,7 +1,7 @@
 """Spec G1: the memory and time that ``train-ensemble`` forecasts, beside what it takes, over random data and settings.
 
-``python -m benchmarks.forecasts --cases 100`` prints a line a case, then how many were out by more than ``MAY_DIFFER``.
-Each trains in a process of its own, of which the most memory and the CPU time of a step are measured.
+``python -m tests.attacks.forecasts --cases 100`` prints a line a case, then how many were out by more than
+``MAY_DIFFER``. Each trains in a process of its own, of which the most memory and the CPU time of a step are measured.
 """
 
 import argparse

@@ -1,10 +1,10 @@
 """The leaderboard of WhichFeature: each objective's weight by one rule, and the tables of its page.
 
-    python -m benchmarks.which_feature --grid     every objective at every weight, for hypogoal benchmark --diversity
-    python -m benchmarks.which_feature --gather docs/results/which-feature.csv runs/which-choice/results.csv ...
-    python -m benchmarks.which_feature --chosen   the entries at the weights that the rule chose
-    python -m benchmarks.which_feature            the tables of docs/results/which-feature.md
-    python -m benchmarks.which_feature --two      those of docs/results/which-feature-two.md
+    python -m studies.which_feature --grid     every objective at every weight, for hypogoal benchmark --diversity
+    python -m studies.which_feature --gather docs/results/which-feature.csv runs/which-choice/results.csv ...
+    python -m studies.which_feature --chosen   the entries at the weights that the rule chose
+    python -m studies.which_feature            the tables of docs/results/which-feature.md
+    python -m studies.which_feature --two      those of docs/results/which-feature-two.md
 
 With ``--two`` the grid and the chosen entries are those of two features, too. ``--gather`` makes the first file of the
 others, which the benchmark wrote.
@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cells import table
 from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.page import number
 from hypogoal.which_feature.run import Scored
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS
 from hypogoal.which_feature.table import COLUMNS, Line, summary, with_interval
+from studies.cells import table
 
 WEIGHTS = (1.0, 0.1, 0.01, 0.001, 0.0001)
 OBJECTIVES = (  # in the order in which they are run

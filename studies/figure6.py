@@ -1,9 +1,9 @@
 """Figure 6 at the paper's budget: how soon agents solve a layout, in how many steps, and whether they lose it again.
 
 hypogoal sweep examples.figure6:figure6 --out runs/figure6
-python -m benchmarks.figure6 runs/figure6 docs/results/figure6-doorkey.csv
-python -m benchmarks.figure6 --tables docs/results/figure6-doorkey.csv
-python -m benchmarks.figure6 --tables --picture docs/results/figure6.png docs/results/figure6-doorkey.csv
+python -m studies.figure6 runs/figure6 docs/results/figure6-doorkey.csv
+python -m studies.figure6 --tables docs/results/figure6-doorkey.csv
+python -m studies.figure6 --tables --picture docs/results/figure6.png docs/results/figure6-doorkey.csv
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import interval, table
 from hypogoal.core.artefacts import Artefact, find_artefacts
 from hypogoal.core.seeding import rng_for
 from hypogoal.evaluation.choosing import UNIFORM
@@ -27,6 +26,7 @@ from hypogoal.evaluation.curves import WINDOW, Run, read_run, run_numbers
 from hypogoal.evaluation.frozen import ENVIRONMENTS, play
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.choosers import RandomChooser
+from studies.cells import interval, table
 
 METHODS = {
     "dbat-k3": "D-BAT, K = 3",

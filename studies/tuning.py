@@ -1,6 +1,6 @@
 """A random search for the tuned settings of PPO and DQN on three-key DoorKey, and for the size of PPO's bonus.
 
-    python -m benchmarks.tuning docs/results/tuning-baselines.csv
+    python -m studies.tuning docs/results/tuning-baselines.csv
 
 ``TRIALS`` settings of each agent, number 0 the one that was tuned by hand, the others drawn from ``SPACE``, are tried
 for ``SHORT`` steps on each of ``LAYOUTS``; the best ``FINALISTS`` and number 0 for ``LONG`` steps, with another seed.
@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cells import Cell, Row, parser_of, run_cells, table
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
@@ -34,6 +33,7 @@ from hypogoal.learners.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.meta.training import judged
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
+from studies.cells import Cell, Row, parser_of, run_cells, table
 
 Settings = PPOSettings | DQNSettings
 Draw = Callable[[np.random.Generator], float | int | str]

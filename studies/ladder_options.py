@@ -1,10 +1,10 @@
 """How near to a ladder's base do options stop that were learned on it? Figure 4.
 
-    python -m benchmarks.ladder_options docs/results/figure4-ladders.csv --groups 1 --seeds 10
+    python -m studies.ladder_options docs/results/figure4-ladders.csv --groups 1 --seeds 10
 
 A cell is a method, N (labelled ladder groups), a ladder and a seed: the options of all members of an ensemble, learned
 on that ladder. The stages themselves are run, in the folder of ``--work``; ensembles stay there, of options only the
-rows of the CSV. Kept and gone on with as in ``benchmarks.hypotheses``; ``--tables`` draws the cells.
+rows of the CSV. Kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cells import Row, interval, parser_of, run_cells, table
-from benchmarks.ladders import read as read_lengths
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.config import parse_integers
 from hypogoal.core.rounding import above
@@ -33,6 +31,8 @@ from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.stages.collect import collect
 from hypogoal.stages.train_ensemble import train_ensemble
 from hypogoal.stages.train_options import train_options
+from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.ladders import read as read_lengths
 
 Settings = dict[str, Any]
 # What looks at the window around the agent, taught in room 1, and is made to hold in rooms nobody labelled.
