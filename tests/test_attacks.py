@@ -1,4 +1,4 @@
-"""Full disks, signals and files made to hurt, a few of the many of ``benchmarks.attacks`` (Spec G1, G2)."""
+"""Full disks, signals and files made to hurt, a few of the many of ``tests.attacks.attacks`` (Spec G1, G2)."""
 
 import json
 import subprocess
@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.attacks import RUN_FREE, Bad, Ended
+from tests.attacks.attacks import RUN_FREE, Bad, Ended
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def attacked(folder: Path, *arguments: str) -> list[dict[str, object]]:
     """The rows of the harness."""
-    command = [sys.executable, "-m", "benchmarks.attacks", "--folder", str(folder / "box"), *arguments]
+    command = [sys.executable, "-m", "tests.attacks.attacks", "--folder", str(folder / "box"), *arguments]
     done = subprocess.run([*command, "--json", str(folder / "rows.json")], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return list(json.loads((folder / "rows.json").read_text(encoding="utf-8")))

@@ -16,7 +16,6 @@ import torch
 from corridor import Corridor
 
 import hypogoal
-from benchmarks.fuzz import make_seeds
 from hypogoal.cli import main
 from hypogoal.core.errors import NumericalError, UserError
 from hypogoal.core.files import replace_text
@@ -32,6 +31,7 @@ from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
 from hypogoal.options.termination import oracle_terminations
+from tests.attacks.fuzz import make_seeds
 
 TESTS = Path(__file__).parent
 CONFIG = OptionConfig(environments=4, warm_up=20, update_interval=4, option_batch=16)
@@ -177,7 +177,7 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(tmp_path: Path) -> Non
 
 
 def test_a_command_without_room_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Spec G2: one line, and neither a draft nor a hidden file; ``benchmarks.attacks`` tries each write of each."""
+    """Spec G2: one line, and neither a draft nor a hidden file; ``tests.attacks.attacks`` tries each write of each."""
     run, there = tmp_path / "run", tmp_path / "there"
     run.mkdir()
     there.mkdir()
@@ -308,7 +308,7 @@ def test_nothing_depends_on_the_clock() -> None:
 def test_limits_of_the_system_are_the_users_to_mend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, words: str
 ) -> None:
-    """Spec G2: one line that says which; ``benchmarks/limits.py`` sets them in earnest."""
+    """Spec G2: one line that says which; ``tests/attacks/limits.py`` sets them in earnest."""
 
     def refused(path: Path) -> None:
         raise error

@@ -1,10 +1,10 @@
-"""Damaged and hostile files of every format, a few of the thousands of ``benchmarks.fuzz`` (Spec G2)."""
+"""Damaged and hostile files of every format, a few of the thousands of ``tests.attacks.fuzz`` (Spec G2)."""
 
 import random
 
 import pytest
 
-from benchmarks.fuzz import FORMATS, Sandbox
+from tests.attacks.fuzz import FORMATS, Sandbox
 
 CASES = range(1, 16)  # case 0 trains, which takes seconds
 

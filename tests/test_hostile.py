@@ -25,8 +25,9 @@ from hypogoal.core.tensors import load_fitting, load_tensors
 from hypogoal.dataset import Collected, States, open_dataset, write_dataset
 from hypogoal.domains.base import load_domain
 from hypogoal.experiments.cells import stage_cell
-from hypogoal.experiments.format import make_plan, read_experiment
+from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.records import PLAN, read_plan, write_plan
+from hypogoal.experiments.toml_file import read_toml
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.inspection import CONTENTS, describe_path, faults_of, lines
 
@@ -119,7 +120,7 @@ def test_toml_with_keys_within_keys_is_not_parsed(tmp_path: Path, text: str) -> 
     """Spec G2: of 300 kB of them ``tomllib`` would make nothing in an hour."""
     path = tmp_path / "deep.toml"
     path.write_text(f"format = 1\n{text}\n")
-    for read in (partial(read_experiment, path), partial(load_preset, str(path), "collect")):
+    for read in (partial(read_toml, path), partial(load_preset, str(path), "collect")):
         with pytest.raises(UserError, match=r"not valid TOML \(more than 256 dots in line 2\): .*deep\.toml"):
             read()
     assert preset_digest(str(path)) == ""
@@ -373,7 +374,7 @@ def test_hostile_plans(tmp_path: Path, change: dict[str, Any]) -> None:
     """Spec G2, G4: what a sweep's folder says is to be run is one of our commands, inside it."""
     own = tmp_path / "own.toml"
     own.write_text('format = 1\ncells = [{ name = "data", command = "collect doorkey" }]')
-    write_plan(tmp_path, make_plan(read_experiment(own), tmp_path), 1.0)
+    write_plan(tmp_path, make_plan(read_toml(own), tmp_path), 1.0)
     assert read_plan(tmp_path)[0].cells[0].name == "data"
     plan = json.loads((tmp_path / PLAN).read_text())
     plan["cells"][0] |= change

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.kills import STAGES, needed
 from hypogoal.dataset import Collected, States, write_dataset
+from tests.attacks.kills import STAGES, needed
 
 ROOT = Path(__file__).resolve().parents[1]
 UNIT = {"MB": 1e6, "GB": 1e9}

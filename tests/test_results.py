@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import (
+from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from studies import (
     bandits,
     choosing,
     figure6,
@@ -20,8 +21,7 @@ from benchmarks import (
     tuning,
     which_feature,
 )
-from benchmarks.cells import run_cells
-from hypogoal.learners.baselines.settings import HYPERPARAMETERS
+from studies.cells import run_cells
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 PAGES: dict[str, Callable[[Path], Iterator[str]]] = {
@@ -96,7 +96,7 @@ def test_learned_options_stand_beside_planned_ones(tmp_path: Path) -> None:
 
 
 def test_agents_of_figure_6_are_told_apart() -> None:
-    """By the folders of ``examples/figure6.toml``, where the ensemble's name is in those of other agents, too."""
+    """By the folders of ``examples/figure6.py``, where the ensemble's name is in those of other agents, too."""
     place = "method-dbat-k3-layout-300-seed-3000"
     assert figure6.method_of({}, place) == "dbat-k3"
     assert figure6.method_of({"termination": "oracle"}, place) == "oracle"
@@ -112,8 +112,8 @@ def test_tuned_is_what_the_search_found() -> None:
         for trial, rows in found[agent, tuning.SHORT].items():
             assert {row["settings"] for row in rows} == {tuning.text_of(agent, tuning.settings_of(agent, trial))}
         assert HYPERPARAMETERS[agent, "tuned"] == tuning.settings_of(agent, tuning.best(found, agent))
-    figure = (RESULTS.parents[1] / "examples" / "figure6.toml").read_text(encoding="utf-8")
-    assert re.findall(r"bonus=(\S+)", figure) == [str(tuning.best_bonus(found))]
+    figure = (RESULTS.parents[1] / "examples" / "figure6.py").read_text(encoding="utf-8")
+    assert re.findall(r"bonus=([\d.]+)", figure) == [str(tuning.best_bonus(found))]
 
 
 def test_unfinished_seeds_do_not_count(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import STAGES, needed
 from hypogoal.cli import main
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.core.drafts import draft_folder, unfinished
+from tests.attacks.kills import STAGES, needed
 
 ROOT = Path(__file__).resolve().parents[1]
 WAIT_SECONDS = 300.0
@@ -21,7 +21,7 @@ WAIT_SECONDS = 300.0
 
 def killed(kills: int, stages: list[str], folder: Path) -> dict[str, list[int]]:
     """The rows of the kill harness: stage -> kills, while writing, ended, differences, losses."""
-    command = [sys.executable, "-m", "benchmarks.kills", "--kills", str(kills), "--folder", str(folder)]
+    command = [sys.executable, "-m", "tests.attacks.kills", "--kills", str(kills), "--folder", str(folder)]
     done = subprocess.run([*command, "--stages", *stages], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [line.split() for line in done.stdout.splitlines()[1:]]
@@ -38,7 +38,7 @@ def test_killed_stages_end_with_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_every_killed_stage_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    """Spec G1: all of them; ``python -m benchmarks.kills`` is the long version."""
+    """Spec G1: all of them; ``python -m tests.attacks.kills`` is the long version."""
     rows = killed(5, list(STAGES), tmp_path)
     assert rows.keys() == STAGES.keys()
     assert all(row[3:] == [0, 0] for row in rows.values()), rows

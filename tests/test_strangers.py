@@ -19,8 +19,9 @@ from hypogoal.core.files import json_lines, parse_json, read_bytes, read_json
 from hypogoal.core.own_code import given
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.experiments.cells import Cell, Plan
-from hypogoal.experiments.format import make_plan, read_experiment
+from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.records import LOGS, PLAN, log_of, open_log, read_plan, write_plan
+from hypogoal.experiments.toml_file import read_toml
 from hypogoal.hypotheses.networks import load_network
 from hypogoal.inspection import faults_of
 
@@ -111,7 +112,7 @@ def swept(tmp_path: Path) -> Path:
     """The folder of a sweep that was begun: its plan, its first cell's record and log."""
     (tmp_path / "own.toml").write_text(OWN)
     run = tmp_path / "run"
-    write_plan(run, make_plan(read_experiment(tmp_path / "own.toml"), run), 1.0)
+    write_plan(run, make_plan(read_toml(tmp_path / "own.toml"), run), 1.0)
     (run / LOGS).mkdir()
     (run / LOGS / "data.log").write_text("started\n")
     (run / LOGS / "data.json").write_text('{"attempts": 1, "seconds": 2.0, "code": 2, "started": 0.0, "host": "here"}')
@@ -203,7 +204,7 @@ def test_toml_has_the_same_bounds(tmp_path: Path, number: str) -> None:
     for text in (OWN.replace("minutes = 1 ", f"minutes = {number} "), f"{OWN}\n[settings.a]\nvalue = [{number}]"):
         (tmp_path / "own.toml").write_text(text)
         with pytest.raises(UserError, match="not valid TOML"):
-            read_experiment(tmp_path / "own.toml")
+            read_toml(tmp_path / "own.toml")
 
 
 TYPES = {"F4": 4, "F8_E4M3": 8, "F8_E5M2": 8, "F8_E4M3FNUZ": 8, "F8_E5M2FNUZ": 8, "F8_E8M0": 8, "F6_E2M3": 6,

@@ -88,7 +88,9 @@ def offer(kind: str) -> Any:
         presets, stage = Path(__file__).parents[1] / "presets", ctx.info_name or ""
         named = {path.stem for path in presets.glob("*/*.toml")}
         if kind == "experiment":
-            named = {path.stem for path in presets.glob("*.toml")} | {name for name in named if "figure" in name}
+            from hypogoal.experiments.named import NAMES
+
+            named = {*NAMES}
         elif kind == "setting":
             prefixed = {"": CONFIGS[stage]} if stage in CONFIGS else {f"{name}.": CONFIGS[name] for name in CONFIGS}
             named = {f"{prefix}{field.name}=" for prefix, config in prefixed.items() for field in fields(config)}

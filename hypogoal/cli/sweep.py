@@ -11,7 +11,10 @@ from typer import Argument, Option
 from hypogoal.cli import common as cli
 from hypogoal.core.terminal import draw, give, say
 
-KNOWN = "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or a .toml file of your own."
+KNOWN = (
+    "doorkey, choosing, montezuma-ladders, which-feature, figure3, figure4, figure6, or one of your own: "
+    "a .toml file or module:function."
+)
 DryRun = Annotated[bool, Option("--dry-run", help="List the commands and what they cost; run none.")]
 _slurm = partial(Option, rich_help_panel="Slurm (with --engine slurm)")
 
@@ -37,9 +40,10 @@ def run(
     from hypogoal.stages.sweep import plan
     from hypogoal.stages.sweep import run as stage
 
-    out = place_of(out or Path("runs", Path(experiment).stem))
+    out = place_of(out or Path("runs", Path(experiment.rpartition(":")[2]).stem))
     seeds = None if seed is None else str(seed)
-    planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
+    with own_code.given(experiment):
+        planned = plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device, short=True)
     if dry_run:
         _list(planned)
         return
@@ -98,8 +102,8 @@ def sweep(
         from hypogoal.experiments.status import as_json as status_json
         from hypogoal.experiments.status import lines, read_status
 
-        found = read_status(out)
-        cli.echo(status_json(found), as_json, lines(found))
+        progress = read_status(out)
+        cli.echo(status_json(progress), as_json, lines(progress))
         return
     if cancel:
         from hypogoal.experiments.runners.slurm import cancel as end
@@ -121,7 +125,8 @@ def sweep(
         raise UserError("which experiment?", "sweep", advice("Which there are", "sweep", "--help"))
     if engine not in ("local", "slurm"):
         raise UserError("unknown engine", engine, "Choose local or slurm.")
-    planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)
+    with own_code.given(experiment):
+        planned = stage.plan(experiment, out, preset=preset, assignments=set_ or (), seeds=seeds, device=device)
     if dry_run:
         _list(planned)
         return

@@ -10,19 +10,19 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import path_part
 from hypogoal.settings import CONFIGS, options_of
 
-DERIVED = ("evaluate", "report")  # of a run; made again in minutes from what the other stages made
-RESERVED = ("--out", "--force", "--resume")  # which a sweep gives, and no experiment
-SHORT = frozenset(option for stage in CONFIGS for option in options_of(stage))  # settings, which --set goes before
-COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # of ``results.csv``, behind those of the cell
+DERIVED = ("evaluate", "report")  # stages that only read a run: made again in minutes
+RESERVED = ("--out", "--force", "--resume")  # given by the sweep alone
+SHORT = frozenset(option for stage in CONFIGS for option in options_of(stage))  # short for --set, which wins
+COLUMNS = ("sub_goal", "member", "scope", "number", "value")  # of ``results.csv``, after those of the cell
 Axes = tuple[tuple[str, str | int | float], ...]
 
 
 class Cost(NamedTuple):
-    """What a cell costs, estimated; 0 where that is not known."""
+    """The estimated cost of a cell; 0 if unknown."""
 
     seconds: float = 0.0  # on one core like that of docs/performance.md
     memory: float = 0.0  # bytes, of each of its processes
-    disk: float = 0.0  # bytes that it leaves behind or needs on the way
+    disk: float = 0.0  # bytes, checkpoints included
     cores: int = 1  # processes that it can use
 
 
@@ -36,9 +36,9 @@ class Cell:
     name: str  # for messages and its log
     arguments: tuple[str, ...]  # of ``hypogoal``, without ``--force``
     out: Path  # what it writes
-    needs: tuple[Path, ...] = ()  # outputs of other cells that must be complete first
+    needs: tuple[Path, ...] = ()  # outputs of other cells that it reads
     cost: Cost = UNKNOWN
-    axes: Axes = ()  # where it stands in the experiment: seed, method, ... with its value; columns of ``results.csv``
+    axes: Axes = ()  # its place in the experiment, columns of ``results.csv``: seed, method, ...
 
     @property
     def stage(self) -> str:
@@ -47,7 +47,7 @@ class Cell:
 
     @property
     def parts(self) -> list[list[str]]:
-        """Its command's words: those before all options, then each option with what follows it."""
+        """The words of its command: those before all options, then each option with its values."""
         parts: list[list[str]] = [[]]
         for word in self.arguments:
             if word.startswith("-"):
@@ -67,9 +67,9 @@ class Plan:
 
     experiment: str  # its name
     cells: list[Cell]  # in an order in which they can run
-    workers: int  # how many cores they may use at once
-    anew: frozenset[str] = frozenset()  # names of those that are still to be made again, whatever is there
-    # The preset files that its commands name, each with its digest when the sweep was last started.
+    workers: int  # cores used at once
+    anew: frozenset[str] = frozenset()  # names of cells still to be made again, even if complete
+    # The preset files that its commands name, each with its digest at the last start of the sweep.
     presets: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -91,7 +91,7 @@ def stage_cell(
 
 
 def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> list[Cell]:
-    """Evaluate (which takes ``cost``) and report, when everything else is there."""
+    """Evaluate (which takes ``cost``) and report, when everything else is complete."""
     evaluation = run / "evaluation"
     return [
         Cell("evaluate", ("evaluate", str(run), "--out", str(evaluation)), evaluation, tuple(needs), cost),
@@ -99,21 +99,21 @@ def closing_cells(run: Path, needs: Sequence[Path], cost: Cost = UNKNOWN) -> lis
     ]
 
 
-def moved(cell: Cell, here: str, there: str) -> Cell:
-    """The cell of the same run in another place: ``here`` is what its paths begin with now.
+def moved(cell: Cell, source: str, target: str) -> Cell:
+    """The cell of the same run in another folder, ``target`` instead of ``source``.
 
-    Only what is a place moves: a run may be called like a stage, a domain or the value of a setting.
+    Only paths change: a run may have the name of a stage, a domain or the value of a setting.
     """
 
     def part(text: str) -> str:
-        return there + text[len(here) :] if within(text, here) else text
+        return target + text[len(source) :] if within(text, source) else text
 
     def within(text: str, place: object) -> bool:
         return text == str(place) or text.startswith(f"{place}/")
 
     def is_place(number: int, word: str) -> bool:
-        named = cell.arguments[number - 1] == "--out" or (number == 1 and cell.stage in DERIVED)
-        return named or any(within(word, place) for place in (cell.out, *cell.needs))
+        is_named = cell.arguments[number - 1] == "--out" or (number == 1 and cell.stage in DERIVED)
+        return is_named or any(within(word, place) for place in (cell.out, *cell.needs))
 
     return replace(
         cell,
@@ -124,8 +124,8 @@ def moved(cell: Cell, here: str, there: str) -> Cell:
 
 
 def depths(cells: Sequence[Cell]) -> dict[Path, int]:
-    """How many cells come before each, at least, by what it writes: 0 for those that need nothing."""
-    found: dict[Path, int] = {}
+    """The longest chain of cells before each, by its output: 0 for those that need nothing."""
+    depth: dict[Path, int] = {}
     for cell in cells:
-        found[cell.out] = 1 + max((found[need] for need in cell.needs), default=-1)
-    return found
+        depth[cell.out] = 1 + max((depth[need] for need in cell.needs), default=-1)
+    return depth

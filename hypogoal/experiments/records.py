@@ -1,8 +1,8 @@
-"""What a sweep writes down beside its cells' outputs, for whoever looks or goes on (Spec G4).
+"""What a sweep records beside its cells' outputs: its plan, and how each cell went (Spec G4).
 
 ``sweep.json`` is the plan, in which the run's folder is called ``{run}``: the folder can be moved, and every machine
-that sees it can read it. ``logs/NAME.log`` is what a cell said; who holds the kernel's lock on it runs the cell, and
-the lock goes on to the cell's own processes, so it ends with the last of them. ``logs/NAME.json`` is how it went.
+that sees it can read it. ``logs/NAME.log`` is a cell's output; the process that holds the kernel's lock on it runs the
+cell. The cell's processes inherit the lock, so it ends with the last of them. ``logs/NAME.json`` is the cell's record.
 """
 
 import json
@@ -32,28 +32,28 @@ GIVE = "Give the command that began it, of 'run' with --resume and without --for
 
 @dataclass(frozen=True)
 class Record:
-    """How a cell went so far."""
+    """How a cell has gone so far."""
 
     attempts: int = 0  # how often it was started
-    seconds: float = 0.0  # that it ran, all attempts that ended together
-    code: int | None = None  # its exit code, minus the signal that ended it; None: it runs, or died with whoever ran it
-    started: float = 0.0  # when the last attempt began, seconds of the clock since 1970; for people only
+    seconds: float = 0.0  # total time of the attempts that ended
+    code: int | None = None  # exit code, minus the signal that ended it; None: it runs, or died with its runner
+    started: float = 0.0  # when the last attempt began, Unix time; for people only
     host: str = ""  # where
 
 
 def log_of(run: Path, cell: Cell) -> Path:
-    """Where a cell's words go."""
+    """The log of a cell."""
     return run / LOGS / f"{cell.name}.log"
 
 
 def last_line(log: Path) -> str:
-    """What a cell said last."""
+    """The last line of a cell's log."""
     lines = read_end(log)
     return lines[-1] if lines else "started" if log.is_file() else ""
 
 
 def read_record(run: Path, cell: Cell) -> Record:
-    """How a cell went; an empty record where it was never started, or where what is there cannot be read."""
+    """A cell's record; an empty one if it was never started or its record cannot be read."""
     try:
         record = read_json(run / LOGS / f"{cell.name}.json", "the record is", AGAIN)
     except UserError:
@@ -63,17 +63,17 @@ def read_record(run: Path, cell: Cell) -> Record:
 
 
 def write_record(run: Path, cell: Cell, record: Record) -> None:
-    """Write down how a cell went."""
+    """Write a cell's record."""
     replace_text(run / LOGS / f"{cell.name}.json", json.dumps(asdict(record)) + "\n")
 
 
 def begun(before: Record) -> Record:
-    """The record of a cell that is being started."""
+    """The record of a cell that is about to start."""
     return Record(before.attempts + 1, before.seconds, None, time.time(), socket.gethostname())
 
 
 def excuse(run: Path, cells: Sequence[Cell]) -> None:
-    """Have those of the cells that failed count as stopped: they are tried again."""
+    """Count failed cells as stopped, so that they are tried again."""
     for cell in cells:
         record = read_record(run, cell)
         if record.code:
@@ -81,13 +81,13 @@ def excuse(run: Path, cells: Sequence[Cell]) -> None:
 
 
 def open_log(run: Path, cell: Cell) -> BinaryIO:
-    """A cell's log to append to, locked: nobody else runs the cell while it, or a copy, is open (a ``UserError``)."""
+    """A cell's log to append to, locked: while it or a copy is open, others who start the cell get a ``UserError``."""
     path = log_of(run, cell)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.parent.is_symlink() or path.is_symlink() or (path.exists() and not path.is_file()):
         raise UserError("the cell's log is a link, or no regular file", path, "Remove it.")
     log = path.open("ab", buffering=0)
-    until = time.monotonic() + PATIENCE_SECONDS  # for those that are just dying, or only look
+    until = time.monotonic() + PATIENCE_SECONDS  # for processes that are dying or only look
     while try_lock(log) is False:
         if time.monotonic() > until:
             log.close()
@@ -98,21 +98,21 @@ def open_log(run: Path, cell: Cell) -> BinaryIO:
 
 
 def is_running(run: Path, cell: Cell) -> bool:
-    """Whether some process, on whichever machine, runs the cell.
+    """Whether a process on any machine runs the cell.
 
-    Where the file system cannot lock, a cell that was started and has not ended counts as running.
+    If the file system cannot lock, a cell that was started and has not ended counts as running.
     """
     try:
         with open_file(log_of(run, cell), "the log is", AGAIN) as log:
-            free = try_lock(log, shared=True)
+            is_free = try_lock(log, shared=True)
     except (OSError, UserError):
         return False
     record = read_record(run, cell)
-    return not free if free is not None else record.attempts > 0 and record.code is None
+    return not is_free if is_free is not None else record.attempts > 0 and record.code is None
 
 
 def write_plan(run: Path, plan: Plan, factor: float) -> None:
-    """Write the plan into the run's folder; ``factor``: how much slower this machine is than that of costs."""
+    """Write the plan into the run's folder; ``factor`` is :func:`hypogoal.experiments.costs.machine_factor`."""
     run.mkdir(parents=True, exist_ok=True)
     rows = [
         {
@@ -125,49 +125,49 @@ def write_plan(run: Path, plan: Plan, factor: float) -> None:
         }
         for cell in (moved(cell, str(run), RUN) for cell in plan.cells)
     ]
-    about = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
+    head = {"format": FORMAT_VERSION, "experiment": plan.experiment, "workers": plan.workers, "factor": factor}
+    head |= {"anew": sorted(plan.anew)} if plan.anew else {}
+    head |= {"presets": dict(plan.presets)} if plan.presets else {}
     lines = ",\n".join(f"  {json.dumps(row)}" for row in rows)
-    about |= {"anew": sorted(plan.anew)} if plan.anew else {}
-    about |= {"presets": dict(plan.presets)} if plan.presets else {}
-    head = json.dumps(about)[:-1]
-    replace_text(run / PLAN, f'{head}, "cells": [\n{lines}\n]}}\n')
+    replace_text(run / PLAN, f'{json.dumps(head)[:-1]}, "cells": [\n{lines}\n]}}\n')
 
 
 class LostPlan(UserError):
-    """The plan of a sweep that was begun is there and cannot be read."""
+    """The plan of a sweep exists but cannot be read."""
 
 
 def read_plan(run: Path) -> tuple[Plan, float]:
-    """The plan of a run's folder and its machine's factor, see :func:`write_plan`; damaged, it is ``LostPlan``."""
+    """The plan of a run's folder and its factor, see :func:`write_plan`; a damaged one is ``LostPlan``."""
     path = run / PLAN
     if not path.is_file():
         raise UserError("no sweep here", run, "Give the folder of a sweep that was started as --out.")
     try:
-        about = read_json(path, "the sweep's plan is", GIVE)
+        content = read_json(path, "the sweep's plan is", GIVE)
     except UserError as error:
         raise LostPlan(error.what, path, GIVE) from None
-    if isinstance(about, dict) and is_count(about.get("format")) and about["format"] > FORMAT_VERSION:
+    if isinstance(content, dict) and is_count(content.get("format")) and content["format"] > FORMAT_VERSION:
         raise UserError("the sweep's plan is of a newer format", path, "Upgrade hypogoal.")
-    key = misfit(about, PLAN_KEYS, PLAN_MAY)
+    key = misfit(content, PLAN_KEYS, PLAN_MAY)
     if key is None:
-        faults = (f"{fault} of cell {n}" for n, row in enumerate(about["cells"]) if (fault := _fault(row)) is not None)
-        key = next(faults, None)
+        faults = ((number, _fault(row)) for number, row in enumerate(content["cells"]))
+        key = next((f"{fault} of cell {number}" for number, fault in faults if fault is not None), None)
     if key is not None:
         raise LostPlan(f"the sweep's plan is damaged ({key or 'no JSON object'})", path, GIVE)
-    anew, cells = frozenset(about.get("anew", ())), [_cell(row, run) for row in about["cells"]]
-    known: set[Path] = set()
+    anew, cells = frozenset(content.get("anew", ())), [_cell(row, run) for row in content["cells"]]
+    outs: set[Path] = set()
     for cell in cells:
-        if not known.issuperset(cell.needs) or cell.out in known:
+        if not outs.issuperset(cell.needs) or cell.out in outs:
             raise LostPlan(f"the sweep's plan is damaged (what {cell.name} needs or writes)", path, GIVE)
-        known.add(cell.out)
+        outs.add(cell.out)
     names = {cell.name for cell in cells}
     if len(names) < len(cells) or not anew <= names:
         raise LostPlan("the sweep's plan is damaged (the names of cells)", path, GIVE)
-    return Plan(about["experiment"], cells, about["workers"], anew, about.get("presets", {})), float(about["factor"])
+    plan = Plan(content["experiment"], cells, content["workers"], anew, content.get("presets", {}))
+    return plan, float(content["factor"])
 
 
 def _cell(row: dict[str, Any], run: Path) -> Cell:
-    """A cell of a plan that has no :func:`_fault`, in the run's folder."""
+    """A cell in the run's folder, from a row without a :func:`_fault`."""
     cost = Cost(*(row[name] for name in Cost._fields))
     needs = tuple(map(Path, row["needs"]))
     cell = Cell(row["name"], tuple(row["arguments"]), Path(row["out"]), needs, cost, tuple(row["axes"].items()))
@@ -175,18 +175,18 @@ def _cell(row: dict[str, Any], run: Path) -> Cell:
 
 
 def _is_place(value: Any) -> bool:
-    """Whether a text is a place within the run."""
+    """Whether a text is a path within the run."""
     parts = Path(value).parts if is_text(value) else ()
     return len(parts) > 1 and parts[0] == RUN and all(map(path_part, parts))
 
 
 def _fault(row: Any) -> str | None:
-    """Which key of a cell is malformed; its command must be of a stage and lead out of the run nowhere, or no key."""
+    """Which key of a cell is malformed, or None; its command must be a stage that stays within the run."""
     key = misfit(row, CELL)
     if key is not None:
         return key
     words, out = row["arguments"], row["out"]
-    if words[:1] and words[0] in DERIVED:  # which read the run
+    if words[:1] and words[0] in DERIVED:  # they read the run
         closing = closing_cells(Path(RUN), ())
         return None if (words, out) in [([*cell.arguments], str(cell.out)) for cell in closing] else "arguments"
     reserved = [pair for pair in pairwise([*words, ""]) if pair[0].split("=")[0] in RESERVED]
@@ -223,46 +223,46 @@ PLAN_MAY: Schema = {"anew": is_list(is_text), "presets": is_table(is_text)}
 
 
 def made_anew(run: Path, cell: Cell) -> None:
-    """Write down that a cell which was to be made again has been."""
+    """Record that a cell which was to be made again has been."""
     plan, factor = read_plan(run)
     write_plan(run, replace(plan, anew=plan.anew - {cell.name}), factor)
 
 
 def check_same(run: Path, cells: Sequence[Cell]) -> None:
-    """Refuse (``UserError``) cells without all that the folder has, with the same commands and presets."""
+    """Refuse (``UserError``) cells that lack any of the folder's plan, or have other commands or presets."""
     if not (run / PLAN).is_file():
         return
     do = "Give the settings it was begun with, or choose another --out."
-    there, digests = read_plan(run)[0], preset_digests(cells)
-    for path, digest in there.presets.items():
+    plan, digests = read_plan(run)[0], preset_digests(cells)
+    for path, digest in plan.presets.items():
         if digests.get(path, digest) != digest:
             raise UserError("this preset was changed since the sweep here was begun", path, do)
-    now = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
-    for cell in there.cells:
-        before, after = moved(cell, str(run), RUN), now.get(cell.out.relative_to(run))
+    by_place = {cell.out.relative_to(run): moved(cell, str(run), RUN) for cell in cells}
+    for cell in plan.cells:
+        before, after = moved(cell, str(run), RUN), by_place.get(cell.out.relative_to(run))
         if after is None:
             raise UserError(f"the sweep here has a cell that this one lacks: {cell.name}", run, do)
         old, new = _meaning(before), _meaning(after)
         if old != new:
-            one, other = (next((part for part in a if part not in b), "") for a, b in ((old, new), (new, old)))
-            raise UserError(f"{cell.name} of the sweep here was begun with '{one}', not '{other}'", run, do)
+            first, second = (next((part for part in a if part not in b), "") for a, b in ((old, new), (new, old)))
+            raise UserError(f"{cell.name} of the sweep here was begun with '{first}', not '{second}'", run, do)
 
 
 def _meaning(cell: Cell) -> list[str]:
-    """A cell's command in parts, sorted where their order changes nothing: the same for two that mean the same.
+    """A cell's command in parts, in an order that is the same for commands that mean the same.
 
-    Of options and settings of one name the order stays or the last one counts; settings go before their options.
+    The last setting of a name counts, and ``--set`` wins over an option that is short for it.
     """
     first, *options = cell.parts
-    short, given, rest = [], [], []
+    short, settings_of_set, rest = [], [], []
     for group in options:
         if len(group) == 2 and group[0] in SHORT:
             short.append(f"{group[0][2:]}={group[1]}")
         elif len(group) == 2 and group[0] == "--set" and "=" in group[1]:
-            given.append(group[1])
+            settings_of_set.append(group[1])
         else:
             rest.append(group)
-    settings = parse_assignments([*short, *given])
+    settings = parse_assignments([*short, *settings_of_set])
     rest.sort(key=lambda group: group[0])
     parts = [" ".join(group) for group in (first, *rest)]
     return [*parts, *(f"{key}={settings[key]}" for key in sorted(settings)), str(cell.out)]

@@ -1,7 +1,7 @@
-"""``results.csv``: every number of a sweep, one a row, with its place in the experiment (Spec G4).
+"""``results.csv``: every number of a sweep, one per row, with its place in the experiment (Spec G4).
 
-Made from the sweep's evaluation, and from the cells' own artefacts where that has nothing of them. Nothing that differs
-between two runs of the same commands is in it: no time, no machine, no path.
+Made from the sweep's evaluation, and from the artefacts of cells that it does not cover. It contains nothing that
+differs between two runs of the same commands: no time, no machine, no path.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,20 +23,20 @@ from hypogoal.experiments.status import done_of
 
 
 def write_results(plan: Plan, run: Path) -> Path:
-    """Write ``results.csv``, every number of cells that are done; a ``UserError`` where an artefact is damaged."""
+    """Write ``results.csv``, every number of the cells done; a damaged artefact is a ``UserError``."""
     names = list(dict.fromkeys(name for cell in plan.cells for name, _ in cell.axes))
     path = run / RESULTS
     try:
         write_table(path, ["cell", "stage", *names, *COLUMNS], _lines(plan, run, names))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        what = f"an artefact is damaged ({type(error).__name__} {error})"
-        raise UserError(what, run, advice("Which one", "verify", run)) from None
+        problem = f"an artefact is damaged ({type(error).__name__} {error})"
+        raise UserError(problem, run, advice("Which one", "verify", run)) from None
     return path
 
 
 def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
-    there = done_of(plan)
-    done = [cell for cell in plan.cells if cell.out in there]
+    outs = done_of(plan)
+    done = [cell for cell in plan.cells if cell.out in outs]
     evaluated: dict[str, list[Row]] = {}
     for cell in done:
         if cell.stage == "evaluate":
@@ -44,15 +44,17 @@ def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
                 evaluated.setdefault(row.artefact, []).append(row)
     for cell in done:
         axes = dict(cell.axes)
-        about = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
+        place = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
         for row in _of_cell(cell, evaluated.get(cell.out.relative_to(run).as_posix(), [])):
-            yield [*about, row.sub_goal, row.member, row.scope, row.quantity, row.value]
+            yield [*place, row.sub_goal, row.member, row.scope, row.quantity, row.value]
 
 
 def _of_cell(cell: Cell, evaluated: Sequence[Row]) -> Iterator[Row]:
-    """How many states were collected; what was logged last of each sub-goal's ensemble; what the evaluation says of a
-    run or of options, or would say: it has not been made, or takes them for a part of others; and how random play does
-    where an agent was trained."""
+    """A cell's numbers: the counts of collected states, the last logged losses of each sub-goal's ensemble, the
+    evaluation's numbers of a run or of options, and the success of random play where an agent was trained.
+
+    Numbers that the evaluation lacks, because it is not made or counts the artefact as a part of others, are made here.
+    """
     if cell.stage == "collect":
         yield from _states(cell.out)
         return
@@ -62,21 +64,21 @@ def _of_cell(cell: Cell, evaluated: Sequence[Row]) -> Iterator[Row]:
     files = artefact.manifest["files"] if artefact.kind in ("options", "meta", "baseline") else {}
     yield from evaluated
     if "executions.csv" in files:
-        about = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
         if not evaluated:
-            found = distance.rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
-            yield from _of_metrics({"distance": {"options": [{**about, **row} for row in found]}})
+            axes = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
+            rows = distance.rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
+            yield from _of_metrics({"distance": {"options": [{**axes, **row} for row in rows]}})
     elif "episodes.csv" in files:
         layout = read_layout(artefact.path / "layout.json")
         if not evaluated:
             episodes = read_episodes(artefact.path / "episodes.csv")
-            one = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
-            yield from _of_metrics({"agents": [curves.agent_metrics("", [one])]})
+            run = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
+            yield from _of_metrics({"agents": [curves.agent_metrics("", [run])]})
         yield from rows_of({"random_success": layout["random_success"]})
 
 
 def _of_metrics(metrics: dict[str, Any]) -> Iterator[Row]:
-    """What stands in ``metrics.json`` of each artefact: members, options, runs."""
+    """The numbers of each artefact in ``metrics.json``: members, options, runs."""
     metrics = {"ensembles": [], "agents": [], "layouts": [], "distance": {"options": []}, **metrics}
     for rows in (hypotheses.rows, distance.rows, curves.rows):
         yield from rows(metrics, {})

@@ -1,7 +1,7 @@
-"""How far a sweep is, from its files alone: while it runs and after, on any machine that sees them (Spec A8, G4).
+"""How far a sweep is, from its files alone: during and after it, on any machine that sees them (Spec A8, G4).
 
-A cell is finished when its output's manifest says so, which is held against the files and inputs. It costs the reading
-of the output's files once (some ms per MB); ``hypogoal verify`` reads what is in them, too.
+A cell is finished when its output's manifest says so and agrees with the files and inputs. That reads the output's
+files once (some ms per MB); ``hypogoal verify`` checks their content, too.
 """
 
 import stat
@@ -20,23 +20,23 @@ from hypogoal.experiments.cells import DERIVED, Cell, Plan
 from hypogoal.experiments.records import Record, is_running, last_line, log_of, read_plan, read_record
 
 DONE, RUNNING, FAILED, STOPPED, WAITING, HELD = "done", "running", "failed", "stopped", "waiting", "held"
-STOPS = (None, 0, 130, 143, -2, -15)  # exit codes of cells that were stopped, or died with whoever ran them
+STOPS = (None, 0, 130, 143, -2, -15)  # exit codes of cells that were stopped, or died with their runner
 MOST_SHOWN = 20
 
 
 @dataclass(frozen=True)
 class State:
-    """Where one cell is."""
+    """How far one cell is."""
 
     cell: Cell
-    state: str  # one of those above: stopped ones go on with the next start, held ones wait for one that failed
+    state: str  # see above: stopped cells go on at the next start, held ones need a failed one
     record: Record
-    text: str = ""  # of one that runs or failed, what it said last
+    text: str = ""  # the last line of its log, if it runs or failed
 
 
 @dataclass(frozen=True)
 class Status:
-    """Where all cells of a sweep are."""
+    """How far all cells of a sweep are."""
 
     run: Path
     experiment: str
@@ -49,7 +49,7 @@ class Status:
 
 
 def read_status(run: Path) -> Status:
-    """Look at every cell; done is as of :func:`done_of`, which the next start checks file by file."""
+    """The state of every cell; done means :func:`done_of`, which the next start checks file by file."""
     plan, factor = read_plan(run)
     states: list[State] = []
     done = done_of(plan)
@@ -73,9 +73,9 @@ def read_status(run: Path) -> Status:
 
 
 def done_of(plan: Plan) -> set[Path]:
-    """The outputs of the cells that are done: there (what has a manifest is whole), and not to be made again.
+    """The outputs of cells that are done: complete, as a manifest says, and not to be made again.
 
-    An evaluation or report of less than what the plan has now, or of something else, is not.
+    An evaluation or report of less than the plan now has, or of something else, is not done.
     """
     done: set[Path] = set()
     for cell in plan.cells:
@@ -87,15 +87,14 @@ def done_of(plan: Plan) -> set[Path]:
 
 
 def time_left(states: Sequence[State], workers: int, factor: float) -> float | None:
-    """Seconds until all that can be done is done; None where nothing is known of a cell that is left.
+    """Seconds until every cell that can be done is done; None if nothing is known of one of those left.
 
-    Costs of cells that are done are held against what they took; where a cell's cost is not known, it is what cells of
-    its stage took.
+    Estimates are scaled by what done cells took; without an estimate, done cells of the same stage are the guide.
     """
     done = [row for row in states if row.state == DONE and row.record.seconds > 0]
-    known = [row for row in done if row.cell.cost.seconds > 0]
-    if known:
-        factor = sum(row.record.seconds for row in known) / sum(row.cell.cost.seconds for row in known)
+    estimated = [row for row in done if row.cell.cost.seconds > 0]
+    if estimated:
+        factor = sum(row.record.seconds for row in estimated) / sum(row.cell.cost.seconds for row in estimated)
     left = []
     for row in states:
         if row.state in (DONE, FAILED, HELD):
@@ -109,8 +108,8 @@ def time_left(states: Sequence[State], workers: int, factor: float) -> float | N
             seconds = 0.0
         else:
             return None
-        if (told := said_left(row.text)) is not None:  # what it says itself is nearer
-            left.append(told)
+        if (remaining := said_left(row.text)) is not None:  # the cell's own forecast is better
+            left.append(remaining)
             continue
         spent = row.record.seconds + (time.time() - row.record.started if row.state == RUNNING else 0.0)
         left.append(max(0.0, seconds - spent))
@@ -118,7 +117,7 @@ def time_left(states: Sequence[State], workers: int, factor: float) -> float | N
 
 
 def lines(status: Status) -> list[str]:
-    """The status as text: a line of numbers, then what runs and what failed."""
+    """The status as text: a line of numbers, then the cells that run or failed."""
     left = status.count(STOPPED, WAITING, HELD)
     numbers = [f"{status.count(state)} {state}" for state in (DONE, RUNNING, FAILED)]
     held = f" ({status.count(HELD)} wait for failed ones)" if status.count(HELD) else ""
@@ -163,10 +162,10 @@ def as_json(status: Status) -> dict[str, Any]:
 
 
 def is_finished(cell: Cell) -> bool:
-    """Whether the cell's output is there, whole, and made of what is there now; asked when all that it needs is.
+    """Whether the cell's output is complete and made from its present inputs, which must be complete.
 
-    An evaluation or report of less than what is there now, or of something else, is not finished. What a training stage
-    made is never replaced by itself, it may be weeks of work: what is something else, or changed, is a ``UserError``.
+    An evaluation or report of less than the run now has, or of something else, is not finished. The output of a
+    training stage may be weeks of work and is never replaced: one of something else, or changed, is a ``UserError``.
     """
     if not cell.out.exists() or (cell.out.is_dir() and not any(cell.out.iterdir())):
         return False
@@ -181,17 +180,17 @@ def is_finished(cell: Cell) -> bool:
 
 
 def stamp_of(cell: Cell) -> tuple[int, int] | None:
-    """Which whole output of a cell is there: its file's number, and when that was written, in ns; None: none."""
+    """Identifies the complete output of a cell: its inode, and when it was written, in ns; None: there is none."""
     place = cell.out if cell.stage == "collect" else cell.out / MANIFEST
     try:
-        found = place.stat()
+        status = place.stat()
     except OSError:
         return None
-    return (found.st_ino, found.st_mtime_ns) if stat.S_ISREG(found.st_mode) else None
+    return (status.st_ino, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None
 
 
 def left_of(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells that are not :func:`is_finished`, and evaluation and report of what is still to be made."""
+    """The cells that are not :func:`is_finished`, with the evaluation and report that read any of them."""
     left: list[Cell] = []
     pending: set[Path] = set()
     for cell in cells:
@@ -202,7 +201,7 @@ def left_of(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def _fault(cell: Cell) -> str:
-    """What is wrong with an output that is there; empty when nothing is."""
+    """What is wrong with an existing output; empty if nothing is."""
     if cell.stage == "collect":
         open_dataset(cell.out)
         return ""
@@ -216,14 +215,14 @@ def _fault(cell: Cell) -> str:
 
 
 def is_current(cell: Cell) -> bool:
-    """Whether an evaluation or report that is there is of what is there now, as manifests say; no other file is read.
+    """Whether an existing evaluation or report read the present outputs, as manifests say; no other file is read.
 
-    Not by when they were written: copies of a run have other times.
+    Times of files say nothing: copies of a run have other ones.
     """
     try:
         read = {entry["sha256"] for entry in open_artefact(cell.out).manifest["inputs"]}
         run = Path(cell.arguments[1])
-        sources = [one.path for one in find(run).everything()] if cell.stage == "evaluate" else cell.needs
+        sources = [part.path for part in find(run).everything()] if cell.stage == "evaluate" else cell.needs
         return read.issuperset(sha256_of(path / MANIFEST) for path in sources)
     except (UserError, OSError):
         return False

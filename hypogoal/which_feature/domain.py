@@ -1,7 +1,7 @@
 """WhichFeature as a domain: rooms, one of which has the feature that is rewarded (Spec H1).
 
-An agent stands before some rooms and goes into one. Labels were given where several features say the same, so which
-of them the reward asks for only the reward can tell: ``truth`` of the world an agent is trained in.
+An agent stands before some rooms and enters one. In the labelled states several features agree, so only the reward can
+tell which of them counts: ``truth`` of the world that an agent is trained in.
 """
 
 from collections.abc import Mapping
@@ -19,10 +19,9 @@ from hypogoal.domains.base import Domain, Engine, Plan, Step
 from hypogoal.which_feature import states
 from hypogoal.which_feature.states import FACTORS, KNOWN, MOVED, SIDE, crossed_states, drawn
 
-DECKS = 64  # sets of rooms of a layout; episodes go round them
+DECKS = 64  # sets of rooms of a layout; episodes cycle through them
 SUB_GOALS = ("right-room",)
-HELDOUT = 20  # layouts' worth of held-out states
-
+HELDOUT = 20  # layouts of held-out states
 
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "train-ensemble": {
@@ -50,12 +49,12 @@ class RoomsConfig:
 
 
 class RoomsEngine(Engine):
-    """Environments of one layout: ``DECKS`` sets of rooms, gone round. An action is the room to go into.
+    """Environments of one layout: ``DECKS`` sets of rooms in turn. An action is the room to enter.
 
-    The right room has the true feature, none of the others has; every other feature is drawn evenly. Going into a room
-    ends the episode, with a reward of 1 if it is the right one. Before them the agent sees a scene in which no feature
-    holds. States are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck.
-    ``layout_seed`` draws the rooms. An episode has one step, so it is never cut.
+    Only the right room has the true feature; every other feature is drawn evenly. Entering a room ends the episode,
+    with a reward of 1 if it is the right one. Before the rooms the agent sees a scene in which no feature holds. States
+    are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck. ``layout_seed`` draws the rooms. An episode has
+    one step, so it is never truncated.
     """
 
     resumes = alike = True
@@ -125,18 +124,21 @@ class RoomsDomain(Domain):
     observation_shape = (SIDE, SIDE, 3)
 
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
-        """Labelled, unlabelled and fully crossed held-out states; ``layout_seed`` of the latter parts them in 20."""
+        """Labelled, unlabelled and fully crossed held-out states, the latter in 20 parts by ``layout_seed``."""
         names, column = config.factors, _column(config.factors, config.truth)
         progress.expect(1)
-        sets = [
+        scenes = [
             states.labelled_states(config.labelled, seed, names),
             states.unlabelled_states(config.unlabelled, config.mix, seed, names),
             crossed_states(HELDOUT * 4, seed, names),
         ]
         progress.advance()
-        parts = [{"layout_seed": np.arange(len(one.factors)) % HELDOUT} for one in sets]
-        told = [States(one.observations, one.factors[:, [column]], of) for one, of in zip(sets, parts, strict=True)]
-        labelled, unlabelled, heldout = told
+        labelled, unlabelled, heldout = (
+            States(
+                part.observations, part.factors[:, [column]], {"layout_seed": np.arange(len(part.factors)) % HELDOUT}
+            )
+            for part in scenes
+        )
         return Collected(self.observation_shape, SUB_GOALS, labelled, unlabelled, heldout)
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
@@ -146,8 +148,8 @@ class RoomsDomain(Domain):
 
 def _column(factors: tuple[str, ...], truth: str) -> int:
     if truth not in factors or len(set(factors)) < len(factors) or MOVED in factors:
-        what = "each feature is planted once, the true one among them, and all are seen in one frame"
-        raise UserError(what, f"factors={','.join(factors)}, truth={truth}", f"Choose of {', '.join(FACTORS)}.")
+        rule = "each feature is planted once, the true one among them, and all are seen in one frame"
+        raise UserError(rule, f"factors={','.join(factors)}, truth={truth}", f"Choose from {', '.join(FACTORS)}.")
     return factors.index(truth)
 
 

@@ -1,4 +1,4 @@
-"""Spec H1: entries of the benchmark, the cells they are scored in, and the folder that keeps cell by cell."""
+"""Spec H1: the benchmark's entries, their training and scores, and the folder of its results."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,10 +20,10 @@ from hypogoal.evaluation.plots import slug
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import fit
 from hypogoal.which_feature.scores import balanced_accuracies, labels_needed, rankings
-from hypogoal.which_feature.states import FACTORS, KNOWN, States, crossed_states, labelled_states, unlabelled_states
+from hypogoal.which_feature.states import FACTORS, KNOWN, Scenes, crossed_states, labelled_states, unlabelled_states
 
-CNN, ORACLE = "cnn", "oracle"  # entries that are no objectives: one member, and one taught by each factor's truth
-DEFAULTS: Mapping[str, Any] = {  # of settings that train-ensemble has other ones of
+CNN, ORACLE = "cnn", "oracle"  # entries without objective: one member, and one trained on the truth of each factor
+DEFAULTS: Mapping[str, Any] = {  # where they differ from those of train-ensemble
     "members": 4,
     "diversity_weight": 0.01,
     "network": "tiles",
@@ -38,7 +38,7 @@ AGAIN = "Remove it and give the same command again, or choose another --out."
 
 @dataclass(frozen=True)
 class WhichFeatureConfig(EnsembleConfig):
-    """What is run; settings of ensembles are those of training, but for ``diversity``, which names all entries."""
+    """Settings of ensembles are those of training, except ``diversity``, which names all entries."""
 
     mix: tuple[float, ...] = setting((0.5,), "shares of unlabelled states with crossed factors", low=0.0, high=1.0)
     seeds: tuple[int, ...] = setting((0, 1, 2, 3, 4), "seeds", low=0)
@@ -62,8 +62,8 @@ class Entry(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One training of one entry, scored on crossed states; F factors, K members."""
+class Scored:
+    """An entry, trained and scored on crossed states; F factors, K members."""
 
     entry: str
     mix: float
@@ -75,14 +75,14 @@ class Cell:
 
 
 def copies(factors: Sequence[str]) -> int:
-    """Of each combination of factors in the test, and as many for the oracle: 320 states, more where there are five."""
+    """Copies of each combination of factors for the test and the oracle: 320 states, more with five factors."""
     return max(20, 320 >> len(factors))
 
 
 def parse_entry(text: str) -> Entry:
-    """``dbat``, ``module:object``, ``cnn`` or ``oracle``; of objectives also with a weight, ``dbat:0.01``.
+    """``dbat``, ``module:object``, ``cnn`` or ``oracle``; objectives may have a weight, ``dbat:0.01``.
 
-    No such objective, code that was not allowed, or no weight is a ``UserError``.
+    An unknown objective, code that was not allowed, or a wrong weight is a ``UserError``.
     """
     objective, _, last = text.rpartition(":")
     try:
@@ -98,7 +98,7 @@ def parse_entry(text: str) -> Entry:
 
 
 def objectives_in(text: str) -> list[str]:
-    """What may stand for an objective in entries that a user gave, for :func:`hypogoal.core.own_code.given`."""
+    """The possible names of objectives in a user's entries, for :func:`hypogoal.core.own_code.given`."""
     names = [name.strip() for name in text.split(",")]
     return [*names, *(name.rpartition(":")[0] for name in names)]
 
@@ -111,8 +111,8 @@ def config_of(entry: Entry, config: WhichFeatureConfig) -> WhichFeatureConfig:
     return from_values(WhichFeatureConfig, {**as_dict(config), "diversity": entry.objective, **weight}, entry.name)
 
 
-def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) -> Cell:
-    """Train an entry's members with the product's own ``fit`` and score them on crossed states.
+def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) -> Scored:
+    """Train an entry's members with ``fit``, as train-ensemble does, and score them on crossed states.
 
     Entries of one seed have the same states, initial weights and batches.
     """
@@ -121,18 +121,17 @@ def run_cell(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig) ->
     ranked = rankings(probabilities, test.factors)
     at_half, at_best = balanced_accuracies(probabilities, test.factors)
     labels = labels_needed(probabilities, test.factors, ranked, rng_for(seed, "which-feature", "labels"))
-    return Cell(entry.name, mix, seed, ranked, at_half, at_best, labels)
+    return Scored(entry.name, mix, seed, ranked, at_half, at_best, labels)
 
 
-def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: States) -> NDArray[np.float32]:
+def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, test: Scenes) -> NDArray[np.float32]:
     """Probabilities (N, K) of the trained members on the test states."""
     names = config.factors
     if entry.objective == ORACLE:
-        told = crossed_states(copies(names), seed, names, split=ORACLE)
-        seeds = [seed_for(seed, ORACLE, factor) for factor in range(told.factors.shape[1])]
+        crossed = crossed_states(copies(names), seed, names, split=ORACLE)
         members = [
-            fit(told.observations, truth, told.observations[:0], config, own)
-            for truth, own in zip(told.factors.T, seeds, strict=True)
+            fit(crossed.observations, truth, crossed.observations[:0], config, seed_for(seed, ORACLE, factor))
+            for factor, truth in enumerate(crossed.factors.T)
         ]
         return np.concatenate([member.predict(test.observations) for member in members], axis=1)
     labelled = labelled_states(LABELLED, seed, names)
@@ -141,14 +140,14 @@ def _trained(entry: Entry, mix: float, seed: int, config: WhichFeatureConfig, te
     return ensemble.predict(test.observations)
 
 
-def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
-    """Every cell that is not in ``out`` yet, seed by seed; then all that are there, ``results.csv`` with them.
+def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Scored]:
+    """Score what ``out`` lacks, seed by seed, and write ``results.csv`` of everything in it; returns all scores.
 
-    A ``UserError`` where ``out`` is something else, was begun with other settings, or a cell in it is damaged.
+    A ``UserError`` if ``out`` is something else or was begun with other settings, or if a file in it is damaged.
     """
     entries = [parse_entry(name) for name in dict.fromkeys(name.strip() for name in config.diversity.split(","))]
     for entry in entries:
-        config_of(entry, config)  # whose weight may be none
+        config_of(entry, config)  # refuses a wrong weight
     if not config.factors or len(set(config.factors)) < len(config.factors):
         raise UserError("each feature is planted once", f"factors {config.factors}", "Name each once.")
     wanted = [(entry, mix, seed) for seed in config.seeds for mix in config.mix for entry in entries]
@@ -160,16 +159,16 @@ def run(config: WhichFeatureConfig, out: Path, quiet: bool) -> list[Cell]:
         progress.resume(sum(path.exists() for path in paths))
         for cell, path in zip(wanted, paths, strict=True):
             if not path.exists():
-                made = vars(run_cell(*cell, config))
-                replace_text(path, json.dumps(made, default=lambda array: array.tolist()) + "\n")
+                scored = vars(run_cell(*cell, config))
+                replace_text(path, json.dumps(scored, default=lambda array: array.tolist()) + "\n")
                 progress.advance()
     cells = [_read(path, config.factors) for path in sorted((out / "cells").glob("*.json"))]
     write_table(out / "results.csv", COLUMNS, rows_of(cells, config.factors))
     return cells
 
 
-def rows_of(cells: Iterable[Cell], factors: Sequence[str]) -> Iterator[tuple[Any, ...]]:
-    """The lines of ``results.csv``: one for each cell, member and factor, in ``COLUMNS``."""
+def rows_of(cells: Iterable[Scored], factors: Sequence[str]) -> Iterator[tuple[Any, ...]]:
+    """The lines of ``results.csv``, by entry, mix, seed, member and factor: the values of ``COLUMNS``."""
     for cell in cells:
         for member, factor in np.ndindex(*cell.ranking.shape):
             scores = (table[member, factor] for table in (cell.ranking, cell.balanced_accuracy, cell.at_best))
@@ -178,13 +177,13 @@ def rows_of(cells: Iterable[Cell], factors: Sequence[str]) -> Iterator[tuple[Any
 
 
 def shared(config: WhichFeatureConfig) -> dict[str, Any]:
-    """The settings that all cells of a folder have in common, as JSON."""
-    own = ("diversity", "mix", "seeds", "high", "low")
-    return {name: value for name, value in as_dict(config).items() if name not in own}
+    """The settings that all results of a folder share, as JSON."""
+    varied = ("diversity", "mix", "seeds", "high", "low")
+    return {name: value for name, value in as_dict(config).items() if name not in varied}
 
 
 def _begin(out: Path, config: WhichFeatureConfig) -> None:
-    """The folder, with the settings of its cells."""
+    """Make the folder and write its settings."""
     path = out / "settings.json"
     if not path.exists():
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -198,8 +197,8 @@ def _begin(out: Path, config: WhichFeatureConfig) -> None:
         sweep_up(folder)
 
 
-def _read(path: Path, factors: Sequence[str]) -> Cell:
-    """A cell from its file, which may be anyone's."""
+def _read(path: Path, factors: Sequence[str]) -> Scored:
+    """Scores from their file, which may come from anyone."""
     data = read_json(path, "the cell is", AGAIN)
     try:
         ranked, at_half, at_best = (np.array(data[name], dtype=np.float64) for name in COLUMNS[5:8])
@@ -209,8 +208,8 @@ def _read(path: Path, factors: Sequence[str]) -> Cell:
         raise UserError("the cell is damaged", path, AGAIN) from None
     shape = (len(ranked) if ranked.ndim else 0, len(factors))
     shapes = [array.shape for array in (ranked, at_half, at_best, labels)]
-    fitting = shapes == [shape, shape, shape, shape[1:]] and shape[0] > 0
+    fits = shapes == [shape, shape, shape, shape[1:]] and shape[0] > 0
     within = all(((table >= 0) & (table <= 1)).all() for table in (ranked, at_half, at_best))
-    if not (fitting and within):
+    if not (fits and within):
         raise UserError("the cell is damaged", path, AGAIN)
-    return Cell(*named, ranked, at_half, at_best, labels)
+    return Scored(*named, ranked, at_half, at_best, labels)

@@ -1,4 +1,4 @@
-"""Spec H1: scenes with planted factors, drawn with MiniGrid's own tiles, the truth of each factor beside its image."""
+"""Spec H1: scenes with planted factors, drawn with MiniGrid's tiles, and the truth of each factor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from hypogoal.core.seeding import rng_for
 FACTORS = ("colour", "shape", "place", "count")
 MOVED = "moved"  # needs two frames
 KNOWN = (*FACTORS, MOVED)
-INNER, TILE = 4, 8  # free cells a side within the walls; pixels of a cell
+INNER, TILE = 4, 8  # free cells per side within the walls; pixels per cell
 SIDE = (INNER + 2) * TILE  # pixels of an image
 CELLS = INNER * INNER
 BOX_COLOURS = ("yellow", "purple", "grey")
-MOST_BOXES = 4  # few are one or two, many are three or four
-FLOOR, WALL, AGENT, OBJECT, BOX, GOAL = 0, 1, 2, 6, 10, 13  # where in the tiles each kind begins
+MOST_BOXES = 4  # few: one or two; many: three or four
+FLOOR, WALL, AGENT, OBJECT, BOX, GOAL = 0, 1, 2, 6, 10, 13  # index of the first tile of each kind
 
 
 @dataclass(frozen=True)
-class States:
+class Scenes:
     """Scenes and which factors hold in them.
 
     ``colour``: the object is blue; ``shape``: it is a ball; ``place``: it is in the right half; ``count``: there are
@@ -32,36 +32,35 @@ class States:
     """
 
     observations: NDArray[np.uint8]  # (N, 48, 48, 3); with ``moved`` (N, 48, 48, 6), the frame before and the frame now
-    factors: NDArray[np.bool_]  # (N, F), those that were asked for; others are drawn evenly
+    factors: NDArray[np.bool_]  # (N, F), the requested ones; others are drawn evenly
 
 
-def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS) -> States:
-    """The labelled context: half of the states are positives, in which every factor holds; in the others none does."""
+def labelled_states(count: int, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
+    """The labelled context: every factor holds in half of the states, the positives, and none in the others."""
     rng = rng_for(seed, "which-feature", "labelled")
     holds = rng.permutation(np.arange(count) % 2 == 0)
     return drawn(np.repeat(holds[:, None], len(names), axis=1), names, rng)
 
 
-def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str] = FACTORS) -> States:
-    """States of which members are told nothing.
+def unlabelled_states(count: int, mix: float, seed: int, names: Sequence[str] = FACTORS) -> Scenes:
+    """States without labels.
 
-    ``mix`` is the probability with which a state's factors are drawn each for itself, evenly; else all are one even
-    bit.
+    ``mix`` is the probability that a state's factors are drawn independently and evenly; else all are one even bit.
     """
     rng = rng_for(seed, "which-feature", "unlabelled")
-    own, one = rng.random((count, len(names))) < 0.5, rng.random((count, 1)) < 0.5
-    return drawn(np.where(rng.random((count, 1)) < mix, own, one), names, rng)
+    independent, joint = rng.random((count, len(names))) < 0.5, rng.random((count, 1)) < 0.5
+    return drawn(np.where(rng.random((count, 1)) < mix, independent, joint), names, rng)
 
 
-def crossed_states(copies: int, seed: int, names: Sequence[str] = FACTORS, *, split: str = "test") -> States:
-    """Every combination of factors ``copies`` times, in random order; each ``split`` has random numbers of its own."""
+def crossed_states(copies: int, seed: int, names: Sequence[str] = FACTORS, *, split: str = "test") -> Scenes:
+    """Every combination of factors ``copies`` times, in random order; each ``split`` has its own random numbers."""
     rng = rng_for(seed, "which-feature", split)
     every = np.array(list(product((False, True), repeat=len(names))))
     return drawn(rng.permutation(np.repeat(every, copies, axis=0)), names, rng)
 
 
-def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Generator) -> States:
-    """Scenes of these factors, bool (N, F); all else is drawn at random, in the same way whatever the factors are."""
+def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Generator) -> Scenes:
+    """Scenes with these factors, bool (N, F); everything else is random and independent of them."""
     count = len(factors)
     truth = dict(zip(names, factors.T, strict=True))
     truth |= {name: rng.random(count) < 0.5 for name in FACTORS if name not in truth}
@@ -71,7 +70,7 @@ def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Gener
     up = np.where(y == 0, False, (y == INNER - 1) | (rng.random(count) < 0.5))
     now, before = y * INNER + x, np.where(up, y - 1, y + 1) * INNER + x
     order = rng.random((count, CELLS))
-    order[rows, now], order[rows, before] = -1.0, 2.0  # nothing else is where the object was or may have been
+    order[rows, now], order[rows, before] = -1.0, 2.0  # nothing else stands where the object is or may have been
     cells = order.argsort(axis=1)
     things = np.full((count, CELLS), FLOOR)
     things[:, 0] = OBJECT + 2 * shape + colour
@@ -89,7 +88,7 @@ def drawn(factors: NDArray[np.bool_], names: Sequence[str], rng: np.random.Gener
         moved = rows[truth[MOVED]]
         earlier[moved, now[moved]], earlier[moved, before[moved]] = FLOOR, things[moved, 0]
         frames.insert(0, _image(earlier))
-    return States(np.concatenate(frames, axis=-1), factors)
+    return Scenes(np.concatenate(frames, axis=-1), factors)
 
 
 def _image(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -105,5 +104,5 @@ def tiles() -> NDArray[np.uint8]:
     objects = [shape(colour) for shape in (Key, Ball) for colour in ("red", "blue")]
     things = [None, Wall(), None, None, None, None, *objects, *map(Box, BOX_COLOURS), Goal()]
     directions = {AGENT + direction: direction for direction in range(4)}
-    drawn = [Grid.render_tile(thing, directions.get(kind), tile_size=TILE) for kind, thing in enumerate(things)]
-    return np.stack(drawn).astype(np.uint8)  # MiniGrid draws in floats, and cuts them when it fills a picture
+    images = [Grid.render_tile(thing, directions.get(kind), tile_size=TILE) for kind, thing in enumerate(things)]
+    return np.stack(images).astype(np.uint8)  # MiniGrid draws in floats, and truncates them when it fills a picture

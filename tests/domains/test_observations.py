@@ -13,12 +13,12 @@ import pytest
 from gymnasium import spaces
 from test_numbers import Says
 
-from benchmarks.observations import DTYPES, drawn_observation, outcome_of
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.dataset import NUMBERS, PICTURE, open_dataset
 from hypogoal.domains.gymnasium_engine import reader_of
 from hypogoal.own_data.parts import Parts, as_observations, collected_of
+from tests.attacks.observations import DTYPES, drawn_observation, outcome_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"
 TABLE = re.search(r"^\| one observation .*?(?=\n\n)", PAGE.read_text(encoding="utf-8"), re.M | re.S)

@@ -10,10 +10,11 @@ import pytest
 from hypogoal.core.errors import UserError
 from hypogoal.experiments.cells import Cell, Cost, Plan, depths, moved
 from hypogoal.experiments.costs import Estimates, cost_lines
+from hypogoal.experiments.named import EXPERIMENTS
 from hypogoal.experiments.records import check_same, write_plan
 from hypogoal.experiments.runners.local import Outcome
 from hypogoal.settings import configuration
-from hypogoal.stages.sweep import EXPERIMENTS, plan, sweep
+from hypogoal.stages.sweep import plan, sweep
 
 OUT = Path("somewhere")
 
@@ -122,7 +123,7 @@ def test_controls_and_baselines_keep_the_agents_budget() -> None:
         if cell.stage == "train-meta":
             assert has["chooser"] == ("random" if agent == "meta-random" else "ppo")
     for given, instead in (("train-meta.layout_seed=3", "layout_seeds"), ("train-baseline.agent=dqn", "baselines")):
-        with pytest.raises(UserError, match=f"Give --set {instead}="):
+        with pytest.raises(UserError, match=f"Set .*{instead}.* instead"):
             plan("doorkey", OUT, assignments=[given])
 
 

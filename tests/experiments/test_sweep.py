@@ -388,8 +388,8 @@ def test_what_was_to_be_made_anew_is_so_until_it_is(
 
 @pytest.mark.slow
 def test_a_sweep_killed_at_random_ends_with_the_same_results(tmp_path: Path) -> None:
-    """Spec G1, G4: ``python -m benchmarks.sweeps`` is the long version."""
-    command = [sys.executable, "-m", "benchmarks.sweeps", "--kills", "4", "--folder", str(tmp_path)]
+    """Spec G1, G4: ``python -m tests.attacks.sweeps`` is the long version."""
+    command = [sys.executable, "-m", "tests.attacks.sweeps", "--kills", "4", "--folder", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -11,8 +11,9 @@ from toy_data import write
 from hypogoal.cli import main
 from hypogoal.core import own_code
 from hypogoal.dataset import Collected, States, write_dataset
-from hypogoal.experiments.format import make_plan, read_experiment
+from hypogoal.experiments.planning import make_plan
 from hypogoal.experiments.records import last_line
+from hypogoal.experiments.toml_file import read_toml
 
 ROOT = Path(__file__).resolve().parents[2]
 HYPOGOAL = str(Path(sysconfig.get_path("scripts")) / "hypogoal")
@@ -79,7 +80,7 @@ def test_a_strangers_experiment_runs_none_of_its_code(
     assert len(told) == 3
     for name, value in own_code.environment_of_children().items():
         monkeypatch.setenv(name, value)
-    cells = make_plan(read_experiment(experiment(tmp_path / "all.toml", commands, axes)), tmp_path / "all").cells
+    cells = make_plan(read_toml(experiment(tmp_path / "all.toml", commands, axes)), tmp_path / "all").cells
     assert len(cells) == len(SPELLINGS)
     for cell in cells:
         assert main([*cell.arguments, "--resume"]) == 2, cell

@@ -11,11 +11,11 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 import hypogoal  # noqa: F401 - registers the environments
-from benchmarks.kills import STAGES, needed
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.own_data.minari import read_minari
 from hypogoal.stages.export_episodes import dataset_id
+from tests.attacks.kills import STAGES, needed
 
 LAYOUT = 100
 EPISODES = 3

@@ -17,7 +17,6 @@ from corridor_env import ALWAYS, NEVER, SUB_GOALS, CorridorEnv, all_labels, at_l
 from own_domain import CorridorConfig, CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
-from benchmarks.own_code import FAMILIES
 from hypogoal.cli import main
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
@@ -29,6 +28,7 @@ from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium_domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.hypotheses.networks import NETWORKS
 from hypogoal.testing import Verdict, check_domain, check_network, check_objective, domains, require
+from tests.attacks.own_code import FAMILIES
 
 TESTS = Path(__file__).parents[1]
 
@@ -381,7 +381,7 @@ def test_a_wrapper_that_breaks_the_contract_is_named(
 
 @pytest.mark.parametrize("family", [*FAMILIES])
 def test_a_few_of_many_stacks_and_commands(family: str) -> None:
-    """Spec B6, G2: a few of the cases of ``benchmarks.own_code``."""
+    """Spec B6, G2: a few of the cases of ``tests.attacks.own_code``."""
     assert all(FAMILIES[family](random.Random(f"test {family} {case}")) for case in range(30))
 
 

@@ -14,7 +14,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.which_feature.run import parse_entry, resolved, run_cell
 from hypogoal.which_feature.scores import owned
 from hypogoal.which_feature.states import FACTORS, KNOWN
-from hypogoal.which_feature.table import summary, told
+from hypogoal.which_feature.table import summary, with_interval
 
 COMMAND = ["benchmark", "which-feature", "--quiet", "--set", "steps=2", "--members", "2"]
 OWN = """
@@ -141,9 +141,9 @@ def test_own_code_needs_the_users_word() -> None:
 
 def test_seeds_are_told_by_their_number() -> None:
     """Points below three, then mean and interval; entries that cover most come first."""
-    assert told(np.array([0.5, 0.25])) == "0.50, 0.25"
-    assert told(np.array([0.0, 0.5, 1.0])) == "0.50 ± 1.24"
-    assert told(np.array([np.nan])) == "–"
+    assert with_interval(np.array([0.5, 0.25])) == "0.50, 0.25"
+    assert with_interval(np.array([0.0, 0.5, 1.0])) == "0.50 ± 1.24"
+    assert with_interval(np.array([np.nan])) == "–"
     cells = [run_cell(parse_entry(name), 0.5, 0, resolved({"steps": 30})) for name in ("cnn", "oracle")]
     lines = summary(cells, 0.5, 1.0)
     assert [line.entry for line in lines] == ["oracle", "cnn"]

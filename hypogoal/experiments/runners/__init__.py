@@ -1,4 +1,4 @@
-"""One cell's process: what every runner starts, on whichever machine (Spec G4)."""
+"""The process of one cell, which every runner starts (Spec G4)."""
 
 import os
 import subprocess
@@ -15,14 +15,14 @@ from hypogoal.experiments.cells import Cell
 from hypogoal.experiments.records import Record, begun, open_log, read_record, write_record
 from hypogoal.experiments.status import stamp_of
 
-# Of the libraries beneath the stages: one thread a process, unless the user says otherwise.
+# Libraries use one thread per process, unless the user sets these.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 LEFT = "hypogoal: it ended as if all were well, but made nothing: own code has left the process (sys.exit, os._exit)"
 
 
 @dataclass
 class Running:
-    """A cell that runs in a process of its own, its log locked until :meth:`ended`."""
+    """A cell that runs in its own process; its log is locked until :meth:`ended`."""
 
     cell: Cell
     run: Path
@@ -35,11 +35,11 @@ class Running:
 
     @property
     def seconds(self) -> float:
-        """Since it was started."""
+        """Since its start."""
         return time.monotonic() - self.since
 
     def ended(self, code: int) -> int:
-        """Write down how it ended, and let go of the log; returns the exit code, of one that made nothing not 0."""
+        """Record how it ended and close the log; returns the exit code, which is not 0 if it made nothing."""
         if code == 0 and stamp_of(self.cell) in (None, self.before):
             self.log.write(f"{LEFT}\n".encode())
             code = 2
@@ -49,21 +49,20 @@ class Running:
 
 
 def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False, check: bool = False) -> Running:
-    """Start a cell, a ``UserError`` where another process runs it; it goes on where it was, and ends when this process
-    does.
+    """Start a cell at its last checkpoint; it ends with this process. If another process runs it: ``UserError``.
 
-    ``cores`` are the processes that it may use. ``force``: make it again, whatever is there; what an attempt of that
-    has begun is gone on with. ``check``: it is there, have its stage say whether this command makes what is there.
+    ``cores`` are the processes that it may use. ``force``: make it again even if it is complete; an attempt at that
+    which has begun is continued. ``check``: its stage only checks that this command would make the existing output.
     """
     log = open_log(run, cell)
     try:
         before = read_record(run, cell)
         record = begun(before)
         write_record(run, cell, record)
-        log.write(b"started\n")  # not to take the last words of a stopped one for those of this one
-        fresh = (force or cell.out.exists()) and not check  # what is there is an evaluation of before
+        log.write(b"started\n")  # the last line of the previous attempt is no longer the last of the log
+        fresh = (force or cell.out.exists()) and not check  # what exists is an outdated evaluation
         again = "--force" if fresh and not (before.attempts and unfinished(cell.out)) else "--resume"
-        made = None if check else stamp_of(cell)
+        existing = None if check else stamp_of(cell)
         command = [*PYTHON, "-m", "hypogoal", *cell.arguments, again]
         environment = {**dict.fromkeys(THREADS, "1"), **os.environ, CORES: str(cores), **environment_of_children()}
         process = subprocess.Popen(
@@ -77,13 +76,13 @@ def start(cell: Cell, run: Path, *, cores: int = 1, force: bool = False, check: 
     except BaseException:
         log.close()
         raise
-    return Running(cell, run, process, cores, log, record, time.monotonic(), made)
+    return Running(cell, run, process, cores, log, record, time.monotonic(), existing)
 
 
 def _follow(parent: int) -> Callable[[], None]:
     def follow() -> None:
         die_with_parent()
-        if os.getppid() != parent:  # it died before the kernel was told
+        if os.getppid() != parent:  # it died before the call above
             os._exit(1)
 
     return follow

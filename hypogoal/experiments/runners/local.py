@@ -1,4 +1,4 @@
-"""The cells on this machine, in the plan's order: as many at once as cores and memory allow (Spec G4)."""
+"""Runs cells on this machine in the plan's order, as many at once as cores and memory allow (Spec G4)."""
 
 import time
 from collections.abc import Callable
@@ -18,45 +18,45 @@ REPORT_SECONDS = 15.0
 
 @dataclass
 class Outcome:
-    """What became of the cells: of each that failed why, and those that wait for such a one."""
+    """How the cells ended: the reasons of those that failed, and the cells that wait for one of them."""
 
     failed: dict[str, str] = field(default_factory=dict)
     waiting: list[Cell] = field(default_factory=list)
 
 
 def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool = False) -> Outcome:
-    """Run what is not finished; a cell that fails stops only those that need it. ``say`` is told what happens.
+    """Run unfinished cells; a failing cell stops only those that need it. ``say`` gets messages on the progress.
 
-    ``check``: all are there, have the stage of each say whether its command makes what is there.
+    ``check``: all are complete; the stage of each only checks that its command would make the existing output.
     """
     outcome = Outcome(waiting=list(plan.cells))
     places = {cell.name: place for place, cell in enumerate(plan.cells)}
     running: list[Running] = []
-    made: set[Path] = set()
+    done: set[Path] = set()
     startable: list[Cell] = []
     budget = free_memory()
-    total, told = len(plan.cells), time.monotonic()
+    total, reported = len(plan.cells), time.monotonic()
     try:
         while True:
-            while ready := [cell for cell in outcome.waiting if made.issuperset(cell.needs)]:
-                for cell in ready:  # of which those that are finished make others ready
+            while ready := [cell for cell in outcome.waiting if done.issuperset(cell.needs)]:
+                for cell in ready:  # a finished one makes others ready
                     outcome.waiting.remove(cell)
                     try:
                         if cell.name not in plan.anew and is_finished(cell) and not check:
-                            made.add(cell.out)
+                            done.add(cell.out)
                         else:
                             startable.append(cell)
                     except UserError as error:
                         _fail(outcome, cell, str(error), say)
-            startable.sort(key=lambda cell: places[cell.name])  # not those first that wait for nothing
+            startable.sort(key=lambda cell: places[cell.name])  # not first those that wait for nothing
             while startable and (cores := _allotted(startable, running, plan.workers, budget)):
                 cell = startable.pop(0)
                 try:
                     running.append(start(cell, run, cores=cores, force=cell.name in plan.anew, check=check))
-                    say(f"[{len(made)}/{total}] {cell.name} ...")
+                    say(f"[{len(done)}/{total}] {cell.name} ...")
                 except UserError as error:
                     _fail(outcome, cell, str(error), say)
-            if not running and not any(made.issuperset(cell.needs) for cell in outcome.waiting):
+            if not running and not any(done.issuperset(cell.needs) for cell in outcome.waiting):
                 return outcome
             time.sleep(POLL_SECONDS)
             for started in [started for started in running if started.process.poll() is not None]:
@@ -66,10 +66,10 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
                 else:
                     if started.cell.name in plan.anew:
                         made_anew(run, started.cell)
-                    made.add(started.cell.out)
-                    say(f"[{len(made)}/{total}] {started.cell.name} done in {started.seconds:.0f} s")
-            if running and time.monotonic() - told > REPORT_SECONDS:
-                told = time.monotonic()
+                    done.add(started.cell.out)
+                    say(f"[{len(done)}/{total}] {started.cell.name} done in {started.seconds:.0f} s")
+            if running and time.monotonic() - reported > REPORT_SECONDS:
+                reported = time.monotonic()
                 for started in running:
                     say(f"    {started.cell.name}: {last_line(log_of(run, started.cell))}")
     finally:
@@ -82,23 +82,23 @@ def run_cells(plan: Plan, run: Path, *, say: Callable[[str], None], check: bool 
 def _allotted(startable: list[Cell], running: list[Running], workers: int, budget: int | None) -> int:
     """How many processes the next cell gets; 0: it has to wait.
 
-    It does not wait until all are free that it could use: small cells would be preferred for ever. Where several can
-    start, they share.
+    It does not wait for all the cores that it could use, or small cells would always go first. Cells that can start at
+    the same time share the cores.
     """
     cell = startable[0]
     free = workers - sum(started.cores for started in running)
     if free <= 0:
         return 0
     cores = max(1, min(cell.cost.cores, free // len(startable)))
-    if budget is None or not running:  # one runs in any case; it says itself when memory is too little
+    if budget is None or not running:  # the first one always runs; its stage refuses if memory is too little
         return cores
     left = budget - sum(started.cell.cost.memory * started.cores for started in running)
     return min(cores, max(0, int(left // cell.cost.memory))) if cell.cost.memory else cores
 
 
-def _fail(outcome: Outcome, cell: Cell, why: str, say: Callable[[str], None]) -> None:
-    outcome.failed[cell.name] = why
-    say(f"{cell.name} FAILED: {why}")
+def _fail(outcome: Outcome, cell: Cell, reason: str, say: Callable[[str], None]) -> None:
+    outcome.failed[cell.name] = reason
+    say(f"{cell.name} FAILED: {reason}")
 
 
 def reason(run: Path, cell: Cell, code: int) -> str:

@@ -1,8 +1,8 @@
-"""The cells as Slurm job arrays (Spec G4): Slurm decides where and when, the cells' manifests say what is done.
+"""Cells as Slurm job arrays (Spec G4): Slurm decides where and when, the manifests of cells say what is done.
 
-One array for the cells of one stage at one depth of the experiment. An array begins when those that make what it needs
-have ended, whichever way (``afterany``): an element whose own needs are not there ends at once, the others run.
-Nothing is asked of Slurm's accounting, which need not be there.
+There is an array for the cells of a stage at a depth of the experiment. It begins when the arrays that it reads have
+ended, successfully or not (``afterany``): elements whose inputs are missing end at once, the others run. Slurm's
+accounting is not needed.
 """
 
 import getpass
@@ -26,16 +26,16 @@ from hypogoal.core.workers import PYTHON
 from hypogoal.experiments.cells import Cell, Plan, depths
 
 FOLDER, JOBS = "slurm", "jobs.json"
-MOST_ELEMENTS = 1000  # of one array, where Slurm does not say: its limit, if nobody changed it, is 1001
+MOST_ELEMENTS = 1000  # of an array, if Slurm does not say: its default limit is 1001
 LEAST_MEMORY = 500e6
-MARGIN, BESIDE = 1.1, 100e6  # of what is estimated: some clusters kill at the limit; bytes of the job's own process
+MARGIN, BESIDE = 1.1, 100e6  # factor on estimates, as some clusters kill at the limit; bytes of the job itself
 CANCEL_SECONDS = 120.0
 GATHER = "gather"
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is asked of Slurm for every cell; what is empty is left to Slurm, or estimated (memory, cpus)."""
+    """What every cell requests from Slurm; empty values are left to Slurm, or estimated (memory, cpus)."""
 
     partition: str = ""
     time: str = ""  # limit of a cell, as ``sbatch --time`` takes it
@@ -43,13 +43,13 @@ class Options:
     gpus: int = 0  # of a cell
     cpus: int = 0  # of a cell; 0: as many processes as it can use
     cap: int = 0  # cells of an array that run at once, at most; 0: no limit
-    warn: int = 120  # seconds before the time limit at which a cell saves, to be queued again
+    warn: int = 120  # seconds before the time limit at which a cell saves and is queued again
     extra: tuple[str, ...] = ()  # further options of ``sbatch``
 
 
 @dataclass(frozen=True)
 class Array:
-    """One array: its name, its cells, and the names of the arrays that come before it."""
+    """An array: its name, its cells, and the names of the arrays that it waits for."""
 
     name: str
     cells: list[Cell]
@@ -57,30 +57,29 @@ class Array:
 
 
 def arrays(plan: Plan, todo: Sequence[Cell], most: int = MOST_ELEMENTS) -> list[Array]:
-    """The arrays of the cells that are to be run, of ``most`` at most, each after those that make what it needs."""
+    """The arrays of the cells to run, each of at most ``most``, after the arrays that it reads."""
     depth = depths(plan.cells)
     groups: dict[tuple[int, str], list[Cell]] = {}
     for cell in todo:
         groups.setdefault((depth[cell.out], cell.stage), []).append(cell)
-    made: dict[Path, str] = {}
-    found = []
+    array_of: dict[Path, str] = {}
+    result = []
     for (level, stage), cells in sorted(groups.items()):
         needs = {need for cell in cells for need in cell.needs}
-        after = list(dict.fromkeys(made[need] for need in made if need in needs))
+        after = list(dict.fromkeys(name for out, name in array_of.items() if out in needs))
         for number in range(ceil(len(cells) / most)):
             part = cells[number * most : (number + 1) * most]
             name = f"{level:02d}-{stage}" + (f"-{number}" if number else "")
-            found.append(Array(name, part, after))
-            made.update((cell.out, name) for cell in part)
-    return found
+            result.append(Array(name, part, after))
+            array_of.update((cell.out, name) for cell in part)
+    return result
 
 
 def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> list[dict[str, Any]]:
-    """Write a script for each array of ``todo`` into ``run/slurm`` and submit it; one more job gathers the numbers at
-    the end.
+    """Write a script for each array of ``todo`` into ``run/slurm`` and submit it; a last job gathers the numbers.
 
-    Every node must see the run's folder under the same path. Returns of each job its number (``id``), name and cells.
-    No Slurm, one that refuses, or jobs of this sweep still in its queue are a ``UserError``.
+    Every node must see the run's folder under the same path. Returns the number (``id``), name and cells of each job.
+    No Slurm, a refusal by Slurm, or jobs of this sweep still in its queue are a ``UserError``.
     """
     check(run, options)
     if alive := queued(run):
@@ -110,22 +109,22 @@ def submit(plan: Plan, run: Path, todo: Sequence[Cell], options: Options) -> lis
 
 
 def most_elements() -> int:
-    """How many cells an array may have here, as Slurm's configuration says."""
+    """How many cells an array may have, by Slurm's configuration."""
     if shutil.which("scontrol") is None:
         return MOST_ELEMENTS
-    told = re.search(r"^MaxArraySize\s*=\s*(\d+)", _command("scontrol", "show", "config").stdout, re.MULTILINE)
-    return max(1, int(told[1]) - 1) if told else MOST_ELEMENTS
+    match = re.search(r"^MaxArraySize\s*=\s*(\d+)", _command("scontrol", "show", "config").stdout, re.MULTILINE)
+    return max(1, int(match[1]) - 1) if match else MOST_ELEMENTS
 
 
 def check(run: Path, options: Options) -> None:
-    """Refuse (``UserError``), before anything is written, where there is no Slurm, or what no batch script can have."""
+    """Refuse (``UserError``) missing Slurm and options that a batch script cannot have, before anything is written."""
     if shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     for text in (options.partition, options.time, options.memory, *options.extra):
         if not text.isprintable():
             raise UserError("not an option of sbatch", repr(text), "See 'man sbatch'.")
     place = str(run.resolve())
-    if "\\" in place or not place.isprintable():  # upon a backslash Slurm takes %A and %a literally
+    if "\\" in place or not place.isprintable():  # after a backslash Slurm takes %A and %a literally
         raise UserError("a batch script cannot hold a path with such characters", repr(place), "Choose another --out.")
 
 
@@ -142,11 +141,11 @@ def _head(run: Path, name: str, options: Options) -> list[str]:
 
 
 def _script(array: Array, run: Path, options: Options) -> str:
-    """A plain batch script: element N runs the Nth of the cells it names."""
+    """A plain batch script: element N runs the Nth cell that it names."""
     cpus = options.cpus or max(cell.cost.cores for cell in array.cells)
     estimated = cpus * max(cell.cost.memory for cell in array.cells)
-    asked = MARGIN * max(estimated, LEAST_MEMORY) + BESIDE
-    memory = options.memory or (f"{ceil(asked / 2**20)}M" if estimated else "")
+    requested = MARGIN * max(estimated, LEAST_MEMORY) + BESIDE
+    memory = options.memory or (f"{ceil(requested / 2**20)}M" if estimated else "")
     lines = _head(run, array.name, options)
     lines += [
         f"#SBATCH --array=0-{len(array.cells) - 1}" + (f"%{options.cap}" if options.cap else ""),
@@ -167,8 +166,8 @@ def _script(array: Array, run: Path, options: Options) -> str:
     return "\n".join([*lines, *_sweep(run, '--cell "$1"')]) + "\n"
 
 
-def _sweep(run: Path, what: str) -> list[str]:
-    command = f"{shlex.join(PYTHON)} -m hypogoal sweep --out {shlex.quote(str(run))} {what}"
+def _sweep(run: Path, option: str) -> list[str]:
+    command = f"{shlex.join(PYTHON)} -m hypogoal sweep --out {shlex.quote(str(run))} {option}"
     return [f"cd {shlex.quote(str(Path.cwd()))} || exit 1", f"exec {command}"]
 
 
@@ -176,8 +175,8 @@ def _sbatch(script: Path, after: Sequence[str]) -> str:
     dependency = [f"--dependency=afterany:{':'.join(after)}"] if after else []
     done = _command("sbatch", "--parsable", *dependency, str(script))
     if done.returncode:
-        what = f"Slurm refuses the array ({' '.join(done.stderr.split()) or f'exit code {done.returncode}'})"
-        raise UserError(what, script, "Change the options; nothing was left in the queue.")
+        problem = f"Slurm refuses the array ({' '.join(done.stderr.split()) or f'exit code {done.returncode}'})"
+        raise UserError(problem, script, "Change the options; nothing was left in the queue.")
     return done.stdout.strip().partition(";")[0]
 
 
@@ -186,7 +185,7 @@ def _command(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def jobs_of(run: Path) -> list[str]:
-    """The numbers of the jobs that were last submitted for a run; none where there were none."""
+    """The numbers of the jobs last submitted for a run."""
     path = run / FOLDER / JOBS
     if not path.is_file():
         return []
@@ -198,7 +197,7 @@ def jobs_of(run: Path) -> list[str]:
 
 
 def queued(run: Path) -> list[str]:
-    """Which of a run's jobs Slurm still has waiting or running; none where there is no Slurm."""
+    """The numbers of a run's jobs that wait or run; none without Slurm."""
     numbers = jobs_of(run)
     if not numbers or shutil.which("squeue") is None:
         return []
@@ -209,12 +208,12 @@ def queued(run: Path) -> list[str]:
 
 
 def cancel(run: Path) -> int:
-    """Have Slurm end all jobs of a run (none: a ``UserError``), running cells save first; returns how many."""
+    """End all jobs of a run, whose running cells save first; returns how many. No jobs are a ``UserError``."""
     alive = queued(run)
     if not alive:
         raise UserError("no jobs in Slurm's queue", run, "A sweep on this machine is ended with Ctrl-C or SIGTERM.")
     numbers = jobs_of(run)
-    # Those that wait first, or they would begin as others end. Then all; Slurm tells running ones by SIGTERM.
+    # Waiting jobs first, or they would begin as others end. Then all; running ones get SIGTERM.
     for state in (["--state=PENDING"], []):
         _command("scancel", *state, *numbers)
     until = time.monotonic() + CANCEL_SECONDS

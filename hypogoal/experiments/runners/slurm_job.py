@@ -1,4 +1,4 @@
-"""One cell inside a Slurm job: it saves and is queued again before its time is up, and saves when it is cancelled."""
+"""A cell inside a Slurm job: it saves before its time limit, to be queued again, and when it is cancelled."""
 
 import os
 import signal
@@ -18,33 +18,33 @@ from hypogoal.experiments.status import is_finished
 
 WARNING = signal.SIGUSR2
 SLOW = "nothing new could be saved before the time limit: give a longer --time, or an earlier --warn"
-TOLD = (128 + signal.SIGTERM, -signal.SIGTERM)  # how a stage ends that was told to stop; the latter: before it listened
+STOPPED = (128 + signal.SIGTERM, -signal.SIGTERM)  # exit codes after SIGTERM; the latter: before the stage listened
 
 
 class _Signals:
-    """What Slurm says to the job: passed on to the cell as SIGTERM, upon which its stage saves."""
+    """Slurm's signals to the job, passed on to the cell as SIGTERM, at which its stage saves."""
 
     def __init__(self) -> None:
         self.warned = self.stopped = False
         self.running: Running | None = None
         for number in (WARNING, signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._heard)
+            signal.signal(number, self._receive)
 
-    def _heard(self, number: int, frame: FrameType | None) -> None:
+    def _receive(self, number: int, frame: FrameType | None) -> None:
         self.warned |= number == WARNING
         self.stopped |= number != WARNING
-        self.tell()
+        self.pass_on()
 
-    def tell(self) -> None:
-        """Pass on what was heard."""
+    def pass_on(self) -> None:
+        """Stop the cell if a signal was received."""
         if self.running is not None and (self.warned or self.stopped):
             self.running.process.terminate()
 
 
 def run_job(run: Path, name: str) -> None:
-    """Run the cell called ``name`` of the sweep in ``run``; the job's processors are what it may use.
+    """Run the cell called ``name`` of the sweep in ``run`` on the job's processors.
 
-    Where there is no such cell, what it needs is not there, or it fails, it is a ``UserError``.
+    An unknown cell, a missing input or a failure is a ``UserError``.
     """
     signals = _Signals()
     plan, _ = read_plan(run)
@@ -60,15 +60,15 @@ def run_job(run: Path, name: str) -> None:
     before = _saved(cell)
     processors = os.environ.get("SLURM_CPUS_PER_TASK", "1")
     signals.running = start(cell, run, cores=int(processors) if processors.isdigit() else 1)
-    signals.tell()  # what came in between
+    signals.pass_on()  # what came in between
     code = signals.running.process.wait()
-    again = code in TOLD and signals.warned and not signals.stopped
-    if again and (not unfinished(cell.out) or _saved(cell) == before):  # it would come here for ever
+    again = code in STOPPED and signals.warned and not signals.stopped
+    if again and (not unfinished(cell.out) or _saved(cell) == before):  # or it would never end
         signals.running.log.write(f"hypogoal: {SLOW}\n".encode())
         again, code = False, 1
     code = signals.running.ended(code)
     if again:
-        # By array and element: the last element's own number is the array's too, and would queue all of them again.
+        # By array and element: the last element's own number is also the array's and would queue all of them again.
         job = "_".join(os.environ.get(name, "") for name in ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID"))
         say(f"{cell.name}: saved, queued again (job {job})", err=True)
         done = subprocess.run(["scontrol", "requeue", job], capture_output=True, text=True, check=False)
@@ -81,6 +81,6 @@ def run_job(run: Path, name: str) -> None:
 
 
 def _saved(cell: Cell) -> list[tuple[str, int]]:
-    """Which checkpoints a cell has, and when each was written."""
-    found = (draft_folder(cell.out) / FOLDER).glob("*.safetensors")
-    return sorted((path.name, path.stat().st_mtime_ns) for path in found)
+    """A cell's checkpoints, and when each was written."""
+    paths = (draft_folder(cell.out) / FOLDER).glob("*.safetensors")
+    return sorted((path.name, path.stat().st_mtime_ns) for path in paths)

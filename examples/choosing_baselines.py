@@ -1,0 +1,41 @@
+"""PPO and DQN on primitive actions, in the worlds of the preset choosing: a wrong key ends the episode, as do 1.5
+shortest paths.
+
+    hypogoal sweep examples.choosing_baselines:choosing_baselines --out runs/choosing-baselines
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Annotated
+
+from hypogoal.experiments.choosing import LAYOUTS
+from hypogoal.experiments.doorkey import RATES
+from hypogoal.experiments.experiment import (
+    Command,
+    Layouts,
+    Names,
+    Paired,
+    Seeds,
+    agents_of,
+    experiment,
+    explained,
+)
+
+
+@experiment("doorkey", stages=("collect", "train-baseline"), rates={**RATES, "collect": 3})
+def choosing_baselines(
+    *,
+    layouts: Layouts = LAYOUTS,
+    seeds: Seeds = tuple(range(920, 930)),
+    paired: Paired = True,
+    agents: Annotated[Names, explained("agents")] = ("ppo", "dqn"),
+) -> Iterator[Command]:
+    """Every agent on every layout."""
+    yield Command("data", "collect doorkey --set heldout_layouts=1", {"group": "data"})
+    for agent, (layout, seed) in product(agents, agents_of(layouts, seeds, paired=paired)):
+        command = f"train-baseline doorkey --data @data --agent {agent} --seed {seed} --layout-seed {layout}"
+        yield Command(
+            f"baseline/agent-{agent}-layout-{layout}-seed-{seed}",
+            f"{command} --set world=wrong_key=ends --set cap=1.5 --set steps=50000",
+            {"agent": agent, "layout_seed": layout, "seed": seed},
+        )

@@ -1,0 +1,101 @@
+"""The paper's Figure 6 at its own budget: 1.5 million steps on ten layouts, practice of options included.
+
+D-BAT beside no diversity, one classifier a sub-goal, and the true sub-goals; PPO and DQN tuned, as the paper's tables
+have them on the first five layouts, and PPO that is paid where D-BAT's members predict positive.
+
+    hypogoal sweep examples.figure6:figure6 --out runs/figure6
+    python -m studies.choosing runs/figure6 docs/results/figure6-doorkey.csv
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Annotated
+
+from hypogoal.experiments.doorkey import RATES
+from hypogoal.experiments.experiment import (
+    Command,
+    Integers,
+    Layouts,
+    Names,
+    Paired,
+    Seeds,
+    agents_of,
+    check_among,
+    experiment,
+    explained,
+)
+
+METHODS = {
+    "dbat-k3": "--diversity dbat --members 3",
+    "none-k3": "--diversity none --members 3",
+    "one": "--diversity none --members 1",
+}
+BASELINES = {"ppo-tuned": "--agent ppo --set setting=tuned", "dqn-tuned": "--agent dqn --set setting=tuned"}
+FEW_LAYOUTS, FEW_SEEDS = tuple(range(300, 305)), tuple(range(3000, 3005))
+PAPERS = {"ppo-paper": "--agent ppo --set setting=paper", "dqn-paper": "--agent dqn --set setting=paper"}
+
+
+@experiment(
+    "doorkey",
+    stages=("collect", "train-ensemble", "train-options", "train-meta", "train-baseline"),
+    rates={**RATES, "step": {"light": 0.3e-3}},
+)
+def figure6(
+    *,
+    layouts: Layouts = tuple(range(300, 310)),
+    seeds: Seeds = tuple(range(3000, 3010)),
+    paired: Paired = True,
+    methods: Annotated[Names, explained("ensembles", choices=METHODS)] = tuple(METHODS),
+    told: Annotated[Names, explained("ensembles whose options end at the true sub-goal instead: the control")] = (
+        "dbat-k3",
+    ),
+    baselines: Annotated[Names, explained("agents on the primitive actions", choices=BASELINES)] = tuple(BASELINES),
+    paid: Annotated[Names, explained("ensembles whose members' first positives in an episode PPO is paid for")] = (
+        "dbat-k3",
+    ),
+    papers: Annotated[Names, explained("the same agents as the paper's tables have them", choices=PAPERS)] = tuple(
+        PAPERS
+    ),
+    paper_layouts: Annotated[
+        Integers, explained("layouts of these, which take five times as long", low=0)
+    ] = FEW_LAYOUTS,
+    paper_seeds: Annotated[Integers, explained("seeds of these", low=0)] = FEW_SEEDS,
+) -> Iterator[Command]:
+    """For each method and seed its ensemble, options and agents; then the control and the baselines."""
+    agents = agents_of(layouts, seeds, paired=paired)
+    paper_agents = agents_of(paper_layouts, paper_seeds, paired=paired)
+    for name, values in (("told", told), ("paid", paid)):
+        check_among(values, name, methods, "methods", "ensembles")
+    yield Command("data", "collect doorkey")
+    for method, seed in product(methods, seeds):
+        ensemble, columns = f"ensemble/method-{method}-seed-{seed}", {"method": method, "seed": seed}
+        yield Command(ensemble, f"train-ensemble @data {METHODS[method]} --seed {seed}", columns)
+        of_seed = [agent for agent in agents if agent[1] == seed]
+        for agent in of_seed:
+            yield on_layout(f"options/method-{method}", f"train-options @{ensemble}", method, agent, 40_000)
+        for layout, _ in of_seed:
+            command = f"train-meta @{ensemble} --options @options/method-{method}-layout-{layout}-seed-{seed}"
+            yield on_layout(f"agent/method-{method}", command, method, (layout, seed), 1_460_000)
+    for method, agent in product(told, agents):
+        command = f"train-meta @ensemble/method-{method}-seed-{agent[1]} --set termination=oracle"
+        yield on_layout(f"oracle/method-{method}", command, "oracle", agent)
+    for baseline, agent in product(baselines, agents):
+        command = f"train-baseline doorkey --data @data {BASELINES[baseline]}"
+        yield on_layout(f"baseline/agent-{baseline}", command, baseline, agent)
+    for method, agent in product(paid, agents):
+        command = f"train-baseline doorkey --data @data --ensemble @ensemble/method-{method}-seed-{agent[1]}"
+        command = f"{command} --agent ppo --set setting=tuned --set bonus=0.2"
+        yield on_layout(f"ppo-bonus/method-{method}", command, "ppo-bonus", agent)
+    for paper, agent in product(papers, paper_agents):
+        command = f"train-baseline doorkey --data @data {PAPERS[paper]}"
+        yield on_layout(f"paper/agent-{paper}", command, paper, agent)
+
+
+def on_layout(name: str, command: str, method: str, agent: tuple[int, int], steps: int = 1_500_000) -> Command:
+    """A command for an agent's layout and seed."""
+    layout, seed = agent
+    return Command(
+        f"{name}-layout-{layout}-seed-{seed}",
+        f"{command} --seed {seed} --layout-seed {layout} --set steps={steps}",
+        {"method": method, "layout_seed": layout, "seed": seed},
+    )

@@ -1,0 +1,119 @@
+"""A user's sweep in TOML: axes, and commands with ``{axis}`` (Spec G4; docs/formats.md).
+
+The file is data. Its commands are stages of hypogoal and nothing else, and write into the sweep's folder only.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hypogoal.core.config import MAX_PRESET_BYTES, parse_integers, setting
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import parse_toml, path_part, read_text
+from hypogoal.experiments.cells import COLUMNS, Cost
+from hypogoal.experiments.experiment import UNKNOWN, Command, Experiment, Value, run_config
+
+FORMAT_VERSION = 1
+NUMBER = (int, float)
+KEYS: Mapping[str, Any] = {"format": int, "evaluate": bool, "workers": int, "axes": dict, "cells": list}
+CELL_KEYS: Mapping[str, Any] = {"name": str, "command": str, "axes": list, "minutes": NUMBER, "memory_gb": NUMBER}
+FORMER = ("domain", "settings", "pairs", "short", "estimate", "for", "first", "if", "out", "columns", "evaluated")
+TAKEN = ("run", "workers", "evaluate", "cell", "stage", "group", *COLUMNS)  # axes become columns
+MOST = 1e7  # minutes, gigabytes
+MEND = "Mend the file, see docs/formats.md."
+REFERENCE = re.compile(r"\{([^{}]*)\}")
+
+Point = Mapping[str, Value]
+
+
+def read_toml(path: Path) -> Experiment:
+    """The experiment in a TOML file; a ``UserError`` where there is none."""
+    text = read_text(path, "the experiment is", "Give a .toml file.", MAX_PRESET_BYTES)
+    table = parse_toml(text, path, "the experiment is", MEND)
+    _check_keys(table, KEYS, path)
+    if table.get("format") != FORMAT_VERSION:
+        raise UserError(f"format must be {FORMAT_VERSION}", path, MEND)
+    axes = {name: _values(name, values, path) for name, values in table.get("axes", {}).items()}
+    rows: dict[str, Mapping[str, Any]] = {}
+    for row in table.get("cells", []):
+        _check_row(row, axes, path)
+        if row.get("name", "") in (*rows, *axes):
+            raise UserError("cells need a name of their own", f"cells {row.get('name', '')!r} in {path}", MEND)
+        rows[row.get("name", "")] = row
+
+    def commands(**values: tuple[Value, ...]) -> Iterator[Command]:
+        for name, chosen in values.items():
+            _values(name, list(chosen), "--set")
+        for row in rows.values():
+            names = row.get("axes", [])
+            for combination in product(*(values[name] for name in names)):
+                yield _command(row, rows, dict(zip(names, combination, strict=True)))
+
+    settings = [(name, _kind(values), setting(values, "")) for name, values in axes.items()]
+    defaults = {key: table[key] for key in ("workers", "evaluate") if key in table}
+    return Experiment(path.stem, commands, run_config(settings, closing=True, **defaults))
+
+
+def _check_keys(table: Any, kinds: Mapping[str, Any], path: Path) -> None:
+    if not isinstance(table, dict):
+        raise UserError("cells must be tables", path, MEND)
+    for key, value in table.items():
+        if key in FORMER or (kinds is CELL_KEYS and key == "axes" and isinstance(value, dict)):
+            do = "Write it as a Python function and give module:function, see docs/formats.md."
+            raise UserError(f"an experiment in TOML can no longer say {key!r}", path, do)
+        if key not in kinds:
+            raise UserError("no such key in an experiment", key, f"{path} may have {', '.join(kinds)}.")
+        if not isinstance(value, kinds[key]) or (isinstance(value, bool) and kinds[key] is not bool):
+            raise UserError("wrong kind of value in an experiment", f"{key} in {path}", MEND)
+
+
+def _check_row(row: Any, axes: Mapping[str, Any], path: Path) -> None:
+    _check_keys(row, CELL_KEYS, path)
+    where, names = f"cells {row.get('name', '')!r} in {path}", row.get("axes", [])
+    if not all(isinstance(name, str) and name in axes for name in names) or len({*names}) < len(names):
+        raise UserError("cells over an axis that does not exist", where, MEND)
+    if not all(0 <= row.get(key, 0) < MOST for key in ("minutes", "memory_gb")):
+        raise UserError("minutes and memory_gb cannot have these values", where, MEND)
+
+
+def _values(name: str, values: Any, where: object) -> tuple[Value, ...]:
+    """An axis: its values make names of folders, so they must be fit for that."""
+    if not name.isidentifier() or name in TAKEN:
+        raise UserError("an axis cannot have this name", repr(name), MEND)
+    if isinstance(values, str):
+        values = list(parse_integers(values))
+    fits = isinstance(values, list) and values and len({str(value) for value in values}) == len(values)
+    if not fits or not all(isinstance(value, Value) and path_part(str(value)) for value in values):
+        raise UserError("an axis needs values that differ and can be parts of names", f"{name} in {where}", MEND)
+    return tuple(values)
+
+
+def _kind(values: Sequence[Value]) -> Any:
+    kinds = {type(value) for value in values}
+    return tuple[int, ...] if kinds == {int} else tuple[float, ...] if kinds == {float} else tuple[str, ...]
+
+
+def _command(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], point: Point) -> Command:
+    """``{axis}`` is its value, ``{name}`` the output of the cells of that name for the same values."""
+
+    def filled(match: re.Match[str]) -> str:
+        key = match[1]
+        if key in point:
+            return str(point[key])
+        if key not in rows or rows[key] is row or not point.keys() >= {*rows[key].get("axes", [])}:
+            problem = f"{{{key}}} is neither an axis of these cells nor the name of cells above over some of their axes"
+            raise UserError(problem, f"cells {row.get('name', '')!r}", MEND)
+        return f"@{_name(rows[key], point)}"
+
+    words = Command(row.get("name", ""), row.get("command", "")).words
+    cost = Cost(60.0 * row.get("minutes", 0), 1e9 * row["memory_gb"] if "memory_gb" in row else UNKNOWN.memory)
+    columns = {"group": row.get("name", ""), **point}
+    return Command(_name(row, point), [REFERENCE.sub(filled, word) for word in words], columns, cost)
+
+
+def _name(row: Mapping[str, Any], point: Point) -> str:
+    """NAME, or NAME/AXIS-VALUE-AXIS-VALUE."""
+    values = "-".join(f"{axis}-{point[axis]}" for axis in row.get("axes", []))
+    return f"{row.get('name', '')}/{values}" if values else row.get("name", "")

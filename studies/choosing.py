@@ -1,0 +1,220 @@
+"""What choosing is worth, played by the agents of a sweep: the rows behind the result, and its tables.
+
+hypogoal run doorkey --preset choosing --out runs/choosing
+python -m studies.choosing runs/choosing docs/results/choosing-doorkey.csv
+hypogoal run which-feature --out runs/which-feature
+python -m studies.choosing runs/which-feature docs/results/which-feature-rooms.csv
+hypogoal sweep examples.preference:preference --out runs/preference
+python -m studies.choosing runs/preference docs/results/preference-doorkey.csv
+python -m studies.choosing --tables docs/results/choosing-doorkey.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable, Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import Artefact, find_artefacts, open_artefact
+from hypogoal.evaluation.choosing import OF_CHOICE, OF_PLAY, UNIFORM, play_agent
+from hypogoal.evaluation.curves import LEARNED
+from studies.cells import interval, table
+
+METHODS = {  # by what the names of artefacts have in them, the longest first
+    "dbat-truth-shape": "shape: D-BAT, K = 3",
+    "divdis-truth-shape": "shape: DivDis, K = 3",
+    "none-truth-shape": "shape: no diversity, K = 3",
+    "one-truth-shape": "shape: one classifier, K = 1",
+    "dbat-truth-place": "place: D-BAT, K = 3",
+    "divdis-truth-place": "place: DivDis, K = 3",
+    "none-truth-place": "place: no diversity, K = 3",
+    "one-truth-place": "place: one classifier, K = 1",
+    "dbat-k3": "D-BAT, K = 3",
+    "none-k3": "no diversity, K = 3",
+    "dbat": "D-BAT, K = 6",
+    "none": "no diversity, K = 6",
+    "one": "one classifier, K = 1",
+    "ppo": "PPO on primitive actions",
+    "dqn": "DQN on primitive actions",
+}
+BASELINES = ("ppo", "dqn")
+PLANNED = "planned"
+POLICIES = {"learned": "learned options", PLANNED: "planned options"}  # baselines have none
+PRACTICE, PRACTISED = "practice", "practised"  # steps in the plain world, and whether chance solved it by then
+MOST_LAYOUTS = 10  # side by side in a table; more are in the rows alone
+ROOMS = {"third": "", "second": "-second", "first": "-first"}  # settings, by what their files' names end in
+COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
+SHOWN = {
+    "success": "solved",
+    "near": "within 1.5 shortest paths",
+    "within_rho": "within-rho",
+    "pair": "better of two",
+    "score": "score",
+}
+
+
+def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
+    """Play every agent of a run, frozen, as the evaluation does, and chance with its options: a row per number.
+
+    Of evaluated baselines it takes the last training episodes. Rows that are there of agents that the run has not stay.
+    """
+    rows = [row for artefact in find_artefacts(run, "meta") for row in _played(artefact)]
+    if baselines:
+        rows += [row for row in _numbers(baselines) if row["seed"] and not row["step"] and row["quantity"] in OF_PLAY]
+    kept: list[tuple[str, ...]] = []
+    for row in rows:
+        method = next(name for name in METHODS if f"-{name}-" in row["artefact"])
+        chooser = "uniform" if row["method"] == UNIFORM else "agent"
+        value = f"{float(row['value']):.4f}"
+        kept.append((method, row.get("policy", ""), row["layout"], row["seed"], chooser, row["quantity"], value))
+    made = {row[:3] for row in kept}
+    before = [tuple(row[column] for column in COLUMNS) for row in _read(path)] if path.exists() else []
+    kept += [row for row in before if row[:3] not in made]
+    known = (*METHODS, *POLICIES, "agent", "uniform", *OF_PLAY, *OF_CHOICE, PRACTICE, PRACTISED)
+    order = {name: place for place, name in enumerate(("", *known))}
+    kept.sort(key=lambda row: (order[row[0]], order[row[1]], int(row[2]), order[row[4]], order[row[5]]))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(kept)
+
+
+def _played(artefact: Artefact) -> list[dict[str, str]]:
+    config, seed = artefact.config, artefact.manifest["seed"]
+    policy = PLANNED if config["network"] == PLANNED else "learned"
+    about = {"policy": policy, "layout": str(config["layout_seed"]), "seed": str(seed), "artefact": artefact.path.name}
+    played, rows = play_agent(artefact, seed), []
+    assert played is not None
+    for method, numbers in ((LEARNED, played), (UNIFORM, played["uniform"])):
+        known = [name for name in (*OF_PLAY, *OF_CHOICE) if not np.isnan(numbers[name])]
+        rows += [about | {"method": method, "quantity": name, "value": str(numbers[name])} for name in known]
+    if "options_ended_at" in config:
+        options = open_artefact(artefact.input("options"), "options").config
+        came = {PRACTICE: options["ended_at"], PRACTISED: int(options["until_reached"])}
+        rows += [about | {"method": LEARNED, "quantity": name, "value": str(value)} for name, value in came.items()]
+    return rows
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    """The rows; in files from before there was a policy all options are planned."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [{"policy": "" if row["method"] in BASELINES else PLANNED, **row} for row in rows]
+
+
+def _numbers(run: Path) -> list[dict[str, str]]:
+    with (run / "evaluation" / "numbers.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the rows say, as lines of Markdown."""
+    rows = _read(path)
+    layouts = sorted({row["layout"] for row in rows}, key=int)
+    there = {(row["method"], row["policy"]) for row in rows}
+    both = set(POLICIES) <= {policy for _, policy in there}
+    agents = {
+        (method, policy): f"{title}, {POLICIES[policy]}" if both and policy else title
+        for (method, title), policy in product(METHODS.items(), ("", *POLICIES))
+        if (method, policy) in there
+    }
+    optioned = [agent for agent in agents if agent[0] not in BASELINES]
+
+    def of(agent: tuple[str, str], chooser: str, quantity: str) -> NDArray[np.float64]:
+        found = {
+            row["layout"]: float(row["value"])
+            for row in rows
+            if (row["method"], row["policy"], row["chooser"], row["quantity"]) == (*agent, chooser, quantity)
+        }
+        return np.array([found.get(layout, np.nan) for layout in layouts])
+
+    def by_layout(cells: Callable[[tuple[str, str]], Iterator[str]], shown: list[tuple[str, str]]) -> Iterator[str]:
+        yield ""
+        yield from table(["", *layouts], ([agents[agent], *cells(agent)] for agent in shown))
+
+    def shares(agent: tuple[str, str]) -> Iterator[str]:
+        for solved, chance in zip(of(agent, "agent", "success"), of(agent, "uniform", "success"), strict=True):
+            yield "-" if np.isnan(solved) else f"{solved:.2f} / {chance:.2f}"
+
+    def practice(agent: tuple[str, str]) -> Iterator[str]:
+        for steps, solved in zip(of(agent, "agent", PRACTICE), of(agent, "agent", PRACTISED), strict=True):
+            yield "-" if np.isnan(steps) else f"{steps / 1000:.0f}" + ("" if solved else " (limit)")
+
+    yield f"Mean over {len(layouts)} layouts and Student's 95 % interval; of choices, where they are defined."
+    yield ""
+    yield from table(
+        ["", "chooser", *SHOWN.values(), "95 % solved on", "90 % on"],
+        (
+            [
+                title,
+                "agent" if chooser == "agent" else UNIFORM,
+                *(_mean(of(agent, chooser, quantity)) for quantity in SHOWN),
+                *(f"{(of(agent, chooser, 'success') >= least).sum()} of {len(layouts)}" for least in (0.95, 0.9)),
+            ]
+            for agent, title in agents.items()
+            for chooser in (("agent", "uniform") if agent in optioned else ("agent",))
+        ),
+    )
+    if len(layouts) <= MOST_LAYOUTS:
+        yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
+        yield from by_layout(shares, optioned)
+    if practised := [agent for agent in optioned if not np.isnan(of(agent, "agent", PRACTICE)).all()]:
+        yield "Practice by uniform-random choice, thousands of steps until 95 of 100 were solved, or the limit."
+        yield from by_layout(practice, practised)
+
+
+def rooms(path: Path) -> Iterator[str]:
+    """Three settings side by side, and the seeds of the third; every other number is in the rows."""
+    settings = {which: _read(path.with_stem(path.stem + suffix)) for which, suffix in ROOMS.items()}
+
+    def of(rows: list[dict[str, str]], method: str, chooser: str, quantity: str) -> NDArray[np.float64]:
+        wanted = (method, chooser, quantity)
+        return np.array([float(r["value"]) for r in rows if (r["method"], r["chooser"], r["quantity"]) == wanted])
+
+    def shown(rows: list[dict[str, str]], method: str) -> str:
+        solved, uniform = (of(rows, method, chooser, "success") for chooser in ("agent", "uniform"))
+        many = f"({(solved >= 0.9).sum()})"
+        return f"{interval(solved, 2)} {many} / {uniform.mean():.2f}" if len(solved) else "-"
+
+    methods = [method for method in METHODS if any(row["method"] == method for row in settings["first"])]
+    yield "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
+    yield ""
+    titles = [f"{which} setting" for which in settings]
+    yield from table(["", *titles], ([METHODS[m], *(shown(rows, m) for rows in settings.values())] for m in methods))
+    yield "Seed by seed, the third setting: the agent."
+    yield ""
+    third = settings["third"]
+    seeds = sorted({row["layout"] for row in third}, key=int)
+    known = [method for method in methods if len(of(third, method, "agent", "success"))]
+    yield from table(
+        ["", *seeds], ([METHODS[m], *(f"{v:.2f}" for v in of(third, m, "agent", "success"))] for m in known)
+    )
+
+
+def _mean(values: NDArray[np.float64]) -> str:
+    known = values[~np.isnan(values)]
+    few = f" (n = {len(known)})" if len(known) < len(values) else ""
+    return f"{interval(known, 2)}{few}"
+
+
+def main() -> None:
+    """Take the numbers of a run, or draw the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
+    parser.add_argument("csv", type=Path, help="the file of rows")
+    parser.add_argument("--baselines", type=Path, help="the folder of the sweep of baselines")
+    parser.add_argument("--tables", action="store_true", help="print the tables only")
+    arguments = parser.parse_args()
+    if not arguments.tables:
+        collect(arguments.run, arguments.csv, arguments.baselines)
+    drawn = rooms if arguments.csv.stem == "which-feature-rooms" else tables
+    print("\n".join(drawn(arguments.csv)))
+
+
+if __name__ == "__main__":
+    main()

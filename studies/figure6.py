@@ -1,0 +1,237 @@
+"""Figure 6 at the paper's budget: how soon agents solve a layout, in how many steps, and whether they lose it again.
+
+hypogoal sweep examples.figure6:figure6 --out runs/figure6
+python -m studies.figure6 runs/figure6 docs/results/figure6-doorkey.csv
+python -m studies.figure6 --tables docs/results/figure6-doorkey.csv
+python -m studies.figure6 --tables --picture docs/results/figure6.png docs/results/figure6-doorkey.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import Artefact, find_artefacts
+from hypogoal.core.seeding import rng_for
+from hypogoal.evaluation.choosing import UNIFORM
+from hypogoal.evaluation.curves import WINDOW, Run, read_run, run_numbers
+from hypogoal.evaluation.frozen import ENVIRONMENTS, play
+from hypogoal.meta.episodes import agent_of
+from hypogoal.options.choosers import RandomChooser
+from studies.cells import interval, table
+
+METHODS = {
+    "dbat-k3": "D-BAT, K = 3",
+    "none-k3": "no diversity, K = 3",
+    "one": "one classifier, K = 1",
+    "oracle": "true sub-goals",
+    "ppo-bonus": "PPO, D-BAT's verdicts as a bonus",
+    "ppo-tuned": "PPO",
+    "dqn-tuned": "DQN",
+    "ppo-paper": "PPO, the paper's setting",
+    "dqn-paper": "DQN, the paper's setting",
+    "literal": "D-BAT, the paper's networks, 150,000 steps",
+}
+COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
+POINTS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1000, 1250, 1500)  # thousands of steps: of a curve
+LINES = {  # colour, dashes
+    "dbat-k3": ("#0b5394", "-"),
+    "none-k3": ("#e69138", "--"),
+    "one": ("#38761d", "-."),
+    "oracle": ("#8a8a8a", ":"),
+    "ppo-tuned": ("#990000", (0, (6, 2))),
+    "dqn-tuned": ("#c27ba0", (0, (3, 1, 1, 1))),
+    "ppo-bonus": ("#000000", (0, (1, 1))),
+    "ppo-paper": ("#990000", (0, (1, 3))),
+    "dqn-paper": ("#c27ba0", (0, (1, 3))),
+}
+
+
+def collect(run: Path, path: Path) -> None:
+    """A row for every number of every finished agent, those that are there first."""
+    there: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                there.setdefault((row["method"], row["layout"]), []).append(row)
+    for kind in ("meta", "baseline"):
+        for artefact in find_artefacts(run, kind):
+            read = read_run(artefact, artefact.path.name)
+            method = method_of(read.config, artefact.path.name)
+            key = (method, str(read.layout["layout_seed"]))
+            if key not in there:
+                about = dict(zip(COLUMNS, (*key, str(read.seed)), strict=False))
+                there[key] = [
+                    about | {"chooser": chooser, "quantity": name, "value": f"{value:.4f}"}
+                    for chooser, name, value in _numbers(artefact, read)
+                ]
+    order = list(METHODS)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        for place in sorted(there, key=lambda key: (order.index(key[0]), int(key[1]))):
+            writer.writerows(there[place])
+
+
+def method_of(config: Mapping[str, Any], place: str) -> str:
+    """Which of ``METHODS`` an agent is, by its settings and the name of its folder."""
+    if config.get("termination") == "oracle":
+        return "oracle"
+    if config.get("network") == "paper":
+        return "literal"
+    return "ppo-bonus" if config.get("bonus") else next(name for name in METHODS if f"-{name}-" in f"-{place}-")
+
+
+def _numbers(artefact: Artefact, run: Run) -> Iterator[tuple[str, str, float]]:
+    """Chooser, quantity and value of one agent: of its training, and of frozen play where it chooses options."""
+    shortest = run.layout["shortest_path"]
+    found = run_numbers(run.episodes, shortest)
+    reached = found["steps_to_95"]
+    yield "agent", "steps", float(run.budget)
+    yield "agent", "shortest_path", float(shortest)
+    yield "agent", "steps_to_95", math.inf if reached is None else float(reached)
+    for name in ("success", "length_over_shortest", "near"):
+        yield "agent", name, float(found[name] or 0.0)
+    yield "agent", "lowest_after", lowest_after(run.episodes.step, run.episodes.succeeded, reached)
+    for step in (1_000 * point for point in POINTS if 1_000 * point <= run.budget):
+        seen = run.episodes.at(run.episodes.step <= step).last()
+        yield "agent", f"success_at_{step}", float(seen.succeeded.mean())
+        yield "agent", f"length_at_{step}", float(seen.length.mean()) / shortest
+    if artefact.kind == "meta":
+        loop = agent_of(artefact, run.seed, ENVIRONMENTS)
+        choosers = {"frozen": loop.chooser, UNIFORM: RandomChooser(rng_for(run.seed, "uniform-choice"))}
+        for name, chooser in choosers.items():
+            episodes = play(loop, chooser)
+            for quantity in ("success", "near"):
+                yield name, quantity, float(episodes.scores(shortest)[quantity].mean())
+            yield name, "length_over_shortest", float(episodes.length.mean()) / shortest
+
+
+def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: float | None) -> float:
+    """The lowest share solved of any ``WINDOW`` consecutive episodes that end after step ``since``; NaN if never."""
+    if since is None:
+        return math.nan
+    sums = np.concatenate([[0], np.cumsum(succeeded.astype(np.int64))])
+    recent = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
+    return float(recent[step[WINDOW - 1 :] >= since].min())
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the rows say, as lines of Markdown."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    methods = [method for method in METHODS if any(row["method"] == method for row in rows)]
+    layouts = sorted({row["layout"] for row in rows}, key=int)
+
+    def of(method: str, quantity: str, chooser: str = "agent") -> NDArray[np.float64]:
+        found = {
+            row["layout"]: float(row["value"])
+            for row in rows
+            if (row["method"], row["quantity"], row["chooser"]) == (method, quantity, chooser)
+        }
+        return np.array([found.get(layout, np.nan) for layout in layouts])
+
+    def known(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values[np.isfinite(values)]
+
+    def training(method: str) -> list[str]:
+        reached = of(method, "steps_to_95")
+        ran = int((~np.isnan(reached)).sum())
+        soon = np.sort(reached[~np.isnan(reached)])[ran // 2]
+        lowest = known(of(method, "lowest_after"))
+        return [
+            METHODS[method],
+            f"{np.isfinite(known(reached)).sum()} of {ran}",
+            f"{soon:,.0f}" if np.isfinite(soon) else "never",
+            interval(known(of(method, "success")), 2),
+            interval(known(of(method, "length_over_shortest")), 2),
+            interval(known(of(method, "near")), 2),
+            f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
+        ]
+
+    yield f"Training, {len(layouts)} layouts; of the last 100 episodes mean over layouts, Student's 95 % interval."
+    yield ""
+    titles = ["", "reached 95 %", "95 % at, median", "solved", "length / shortest", "within 1.5 shortest paths"]
+    yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
+    frozen = [method for method in methods if len(known(of(method, "success", "frozen")))]
+    yield "Without further training: the agent / uniform-random choice among its own options."
+    yield ""
+    yield from table(
+        ["", "solved", "length / shortest", "within 1.5 shortest paths", "layouts"],
+        (
+            [
+                METHODS[method],
+                *(
+                    " / ".join(interval(known(of(method, quantity, who)), 2) for who in ("frozen", UNIFORM))
+                    for quantity in ("success", "length_over_shortest", "near")
+                ),
+                str(len(known(of(method, "success", "frozen")))),
+            ]
+            for method in frozen
+        ),
+    )
+    yield "95 % at, in thousands of steps, layout by layout."
+    yield ""
+    yield from table(
+        ["", *layouts],
+        ([METHODS[method], *(_thousands(steps) for steps in of(method, "steps_to_95").tolist())] for method in methods),
+    )
+
+
+def draw(path: Path, out: Path) -> None:
+    """The curves: means over the layouts of each method, in the last 100 episodes before a step."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    figure, places = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    titles = {"success": "share of episodes solved", "length": "episode length / shortest path"}
+    for axes, (quantity, title) in zip(places, titles.items(), strict=True):
+        for method, (colour, dashes) in LINES.items():
+            means = []
+            for point in POINTS:
+                name = f"{quantity}_at_{1_000 * point}"
+                found = [float(row["value"]) for row in rows if (row["method"], row["quantity"]) == (method, name)]
+                means.append(float(np.mean(found)) if found else math.nan)
+            if np.isfinite(means).any():
+                axes.plot(POINTS, means, color=colour, linestyle=dashes, lw=1.8, label=METHODS[method])
+        axes.set_xscale("log")
+        axes.set_xticks(POINTS[::2], [f"{point:,}" for point in POINTS[::2]], fontsize=8)
+        axes.minorticks_off()
+        axes.set_xlabel("environment steps, thousands", fontsize=9)
+        axes.set_title(title, fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+    places[1].set_yscale("log")
+    places[1].set_yticks([1, 2, 5, 10, 30], ["1", "2", "5", "10", "30"], fontsize=8)
+    places[1].minorticks_off()
+    figure.legend(*places[0].get_legend_handles_labels(), loc="outside right center", fontsize=8, frameon=False)
+    figure.savefig(out, dpi=150)
+
+
+def _thousands(steps: float) -> str:
+    return "-" if math.isnan(steps) else "never" if math.isinf(steps) else f"{steps / 1000:.0f}"
+
+
+def main() -> None:
+    """Take the numbers of a run, or draw the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path, nargs="?", help="the folder of the sweep")
+    parser.add_argument("csv", type=Path, help="the file of rows")
+    parser.add_argument("--tables", action="store_true", help="print the tables only")
+    parser.add_argument("--picture", type=Path, help="draw the curves, a .png file")
+    arguments = parser.parse_args()
+    if not arguments.tables:
+        collect(arguments.run, arguments.csv)
+    if arguments.picture:
+        draw(arguments.csv, arguments.picture)
+    print("\n".join(tables(arguments.csv)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,316 @@
+"""What members know of DoorKey's held-out layouts, by method and length of training: the cells behind the results.
+
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 100
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --layouts choice --seeds 101,102 --until 600
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --layouts test --seeds 0-9 --chosen
+
+A cell is a method, a sub-goal and a seed: one training, looked at after each of ``LOOKS`` steps. Its rows, one a look
+and member, are appended to the file as soon as it is done; a run that was cut goes on where it stopped. Layouts for
+choosing a method's length of training are others than those that it is tested on, and so are the seeds. With
+``--chosen`` a method is trained to its chosen length and looked at there only; without, all the way.
+
+    python -m studies.hypotheses docs/results/hypotheses-doorkey.csv --tables
+
+prints the tables of all cells that there are, as Markdown.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hypogoal.core.compute import prepare
+from hypogoal.core.progress import Progress
+from hypogoal.core.rounding import above
+from hypogoal.core.seeding import seed_for
+from hypogoal.dataset import Collected, States
+from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
+from hypogoal.hypotheses import patches
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import PATCH_CHUNK, Ensemble
+from hypogoal.hypotheses.scores import cross_fitted
+from hypogoal.hypotheses.training import Watcher, fit
+from hypogoal.stages.train_ensemble import score_rows
+from studies.cells import Row, interval, parser_of, run_cells, table
+
+METHODS: dict[str, dict[str, Any]] = {
+    "dbat": {"diversity": "dbat"},
+    "none": {"diversity": "none"},
+    "dbat-unpaired": {"diversity": "dbat-unpaired"},
+    "say-no": {"diversity": "say-no"},
+    "cnn": {"members": 1, "diversity": "none"},
+}
+WEIGHTS = (1e-5, 1e-4, 1e-3, 1e-2)
+LOOKS = (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1300, 1600, 2000, 2600)
+LONG = (150, 600, 1000, 2600)  # looks at the seed that was trained longer
+LAYOUTS = {"choice": 500, "test": 1000}  # the first of twenty held-out layouts
+KEYS = ("layouts", "method", "sub_goal", "seed", "step", "member")
+OF_ALL = ("ranking", "balanced_accuracy", "precision", "recall", "at_q95", "at_best")
+OF_HALVES = ("ranking", "balanced_accuracy", "at_q95")
+COLUMNS = (*KEYS, *OF_ALL, *(f"{name}_{half}" for half in ("first", "second") for name in OF_HALVES))
+
+
+def settings_of(method: str) -> dict[str, Any]:
+    """What a method changes: one of ``METHODS`` or an objective's name, with ``@`` and a weight behind it or not."""
+    name, _, weight = method.partition("@")
+    return METHODS.get(name, {"diversity": name}) | ({"diversity_weight": float(weight)} if weight else {})
+
+
+@lru_cache(maxsize=1)
+def states_of(layouts: str) -> Collected:
+    """The labelled and unlabelled states of ``hypogoal collect doorkey``, and held-out ones of these layouts."""
+    config = DoorKeyConfig(heldout_first=LAYOUTS[layouts])
+    return DOMAIN.collect(config, 0, Progress("collect", 1, quiet=True))
+
+
+class Looked:
+    """An ensemble that predicts the states of :func:`states_of` again and again: their patches are found once."""
+
+    def __init__(self, ensemble: Ensemble, layouts: str):
+        self.ensemble, self.layouts = ensemble, layouts
+
+    def __len__(self) -> int:
+        return len(self.ensemble)
+
+    def predict(self, observations: NDArray[np.uint8], positions: None = None) -> NDArray[np.float32]:
+        """As :meth:`Ensemble.predict`."""
+        networks = self.ensemble.eval().networks
+        with torch.inference_mode():
+            rows = [
+                torch.stack([patches.forward(network, batch) for network in networks]).softmax(dim=-1)[..., 1].T.numpy()
+                for batch in _batches(self.layouts, observations is states_of(self.layouts).unlabelled.observations)
+            ]
+        self.ensemble.train()
+        return np.concatenate(rows)
+
+
+@lru_cache(maxsize=2)
+def _batches(layouts: str, unlabelled: bool) -> list[patches.Batch]:
+    """The distinct patches of the held-out or the unlabelled states, in the chunks of :meth:`Ensemble.predict`."""
+    split = states_of(layouts).unlabelled if unlabelled else states_of(layouts).heldout
+    observations = split.observations
+    network = Ensemble(EnsembleConfig().network, observations.shape[1:], 1, torch.Generator()).networks[0]
+    batches = []
+    for start in range(0, len(observations), PATCH_CHUNK):
+        tables = patches.make_tables(observations[start : start + PATCH_CHUNK], network)
+        assert tables is not None
+        batches.append(patches.take(tables, np.arange(len(observations[start : start + PATCH_CHUNK]))))
+    return batches
+
+
+def run_cell(layouts: str, method: str, sub_goal: str, seed: int, looks: Sequence[int] = LOOKS) -> list[Row]:
+    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and score it on the way."""
+    prepare()
+    data = states_of(layouts)
+    column = data.sub_goals.index(sub_goal)
+    heldout = States(data.heldout.observations, data.heldout.labels[:, column], data.heldout.origins)
+    rows: dict[tuple[int, int], Row] = {}
+
+    def look(step: int, ensemble: Ensemble) -> None:
+        for scores in score_rows(
+            cast(Ensemble, Looked(ensemble, layouts)), heldout, data.unlabelled.observations, None
+        ):
+            key = (layouts, method, sub_goal, seed, step, scores["member"])
+            row = rows.setdefault((step, scores["member"]), dict(zip(KEYS, key, strict=True)))
+            half = "" if scores["scope"] == "all" else f"_{scores['scope']}"
+            row |= {f"{name}{half}": scores[name] for name in (OF_HALVES if half else OF_ALL)}
+
+    config = dataclasses.replace(EnsembleConfig(steps=looks[-1]), **settings_of(method))
+    fit(
+        data.labelled.observations,
+        data.labelled.labels[:, column],
+        data.unlabelled.observations,
+        config,
+        seed_for(seed, "ensemble", sub_goal),
+        Watcher(look=look, look_at=looks),
+    )
+    return list(rows.values())
+
+
+Cell = tuple[str, str, int]  # method, sub-goal, seed
+Numbers = dict[Cell, dict[int, dict[str, NDArray[np.float64]]]]  # by step and column (K,)
+
+
+def read(path: Path, layouts: str) -> Numbers:
+    """The finished seeds of some layouts: for each cell, step and column the members' numbers (K,)."""
+    numbers: Numbers = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["layouts"] == layouts]
+    for row in rows:
+        steps = numbers.setdefault((row["method"], row["sub_goal"], int(row["seed"])), {})
+        columns = steps.setdefault(int(row["step"]), {name: np.empty(0) for name in COLUMNS[len(KEYS) :]})
+        for name, values in columns.items():
+            columns[name] = np.append(values, float(row[name] or "nan"))
+    # A method's seed counts when all of its sub-goals are there: means over others are not comparable.
+    whole = {(m, seed) for m, _, seed in numbers if all((m, goal, seed) in numbers for goal in DOMAIN.sub_goals)}
+    return {cell: steps for cell, steps in numbers.items() if (cell[0], cell[2]) in whole}
+
+
+def crossed(members: dict[str, NDArray[np.float64]], name: str) -> float:
+    """The cross-fitted best member of one ensemble."""
+    return cross_fitted(members[f"{name}_first"], members[f"{name}_second"])
+
+
+def curve(numbers: Numbers, method: str, of: Callable[[dict[str, NDArray[np.float64]]], float]) -> dict[int, float]:
+    """By length of training that all got to, the mean of something over a method's sub-goals and seeds."""
+    cells = [steps for (name, _, _), steps in numbers.items() if name == method]
+    looks = [step for step in LOOKS if cells and all(step in steps for steps in cells)]
+    return {step: float(np.mean([of(steps[step]) for steps in cells])) for step in looks}
+
+
+def lengths(choice: Numbers) -> dict[str, int]:
+    """The rule: each method's length is the look with the highest cross-fitted ranking on the layouts for choosing."""
+    others = sorted({method for method, _, _ in choice} - set(METHODS))
+    curves = {
+        method: curve(choice, method, lambda members: crossed(members, "ranking")) for method in (*METHODS, *others)
+    }
+    return {method: max(steps, key=lambda step: steps[step]) for method, steps in curves.items() if steps}
+
+
+def by_seed(
+    numbers: Numbers, method: str, step: int, of: Callable[[dict[str, NDArray[np.float64]]], float], sub_goals: Any
+) -> NDArray[np.float64]:
+    """The mean over sub-goals of something, for each seed of which all of these are there."""
+    seeds = sorted({seed for name, _, seed in numbers if name == method})
+    means = [[numbers.get((method, goal, seed)) for goal in sub_goals] for seed in seeds]
+    return np.array([np.mean([of(steps[step]) for steps in cells if steps]) for cells in means if all(cells)])
+
+
+SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
+    "ranking, cross-fitted best": lambda members: crossed(members, "ranking"),
+    "ranking, mean member": lambda members: float(members["ranking"].mean()),
+    "balanced accuracy at 0.5, cross-fitted best": lambda members: crossed(members, "balanced_accuracy"),
+    "mean member": lambda members: float(members["balanced_accuracy"].mean()),
+    "worst member": lambda members: float(members["balanced_accuracy"].min()),
+    "above the 95th percentile, mean": lambda members: float(members["at_q95"].mean()),
+    "at its best threshold, mean": lambda members: float(members["at_best"].mean()),
+}
+CROSSED = ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best")
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    choice, test = read(path, "choice"), read(path, "test")
+    everything = lengths(choice)
+    chosen = {method: steps for method, steps in everything.items() if method in METHODS}
+    scores = "ranking / balanced accuracy at 0.5 of the cross-fitted best member, by steps"
+    yield f"Layouts for choosing, {_seeds(choice)}: {scores}; in bold the chosen length."
+    yield ""
+    yield from _curves(choice, chosen, LOOKS)
+    first = min(seed for _, _, seed in choice)
+    alone = {cell: steps for cell, steps in choice.items() if cell[2] == first}
+    yield f"Seed {first} alone, trained longer: the same."
+    yield ""
+    yield from _curves(alone, dict.fromkeys(chosen, 0), LONG)
+    if len(everything) > len(chosen):
+        yield f"Other weights and objectives there, seed {first} alone: the highest ranking by weight (at steps)."
+        yield ""
+        yield from table(["", *(f"{weight:g}" for weight in WEIGHTS)], _weights(alone))
+    chosen = everything
+    tested = [method for method in chosen if any(name == method for name, _, _ in test)]
+    if not tested:
+        return
+    yield f"Test layouts, {_seeds(test)}, mean over the five sub-goals and Student's 95 % interval over seeds."
+    yield ""
+    every = DOMAIN.sub_goals
+    yield from table(
+        ["", "steps", *SHOWN],
+        (
+            [m, str(chosen[m]), *(interval(by_seed(test, m, chosen[m], of, every)) for of in SHOWN.values())]
+            for m in tested
+        ),
+    )
+    yield "By sub-goal: ranking / balanced accuracy at 0.5, cross-fitted best."
+    yield ""
+
+    def both(method: str, goal: str) -> str:
+        return " / ".join(f"{by_seed(test, method, chosen[method], SHOWN[n], [goal]).mean():.3f}" for n in CROSSED)
+
+    yield from table(["", *every], ([m, *(both(m, goal) for goal in every)] for m in tested))
+    yield "D-BAT minus the other, cross-fitted ranking, seed by seed (seeds in which D-BAT is above)."
+    yield ""
+    yield from table(["", "all", *every], _differences(test, chosen, tested))
+
+
+def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> Iterator[str]:
+    curves = {method: [curve(numbers, method, SHOWN[name]) for name in CROSSED] for method in chosen}
+    looks = [step for step in shown if any(step in scores for scores, _ in curves.values())]
+
+    def cell(method: str, step: int) -> str:
+        text = " / ".join(f"{scores[step]:.3f}" if step in scores else "-" for scores in curves[method])
+        return f"**{text}**" if step == chosen[method] else text
+
+    yield from table(["", *map(str, looks)], ([m, *(cell(m, step) for step in looks)] for m in chosen))
+
+
+def _weights(numbers: Numbers) -> Iterator[list[str]]:
+    methods = dict.fromkeys(method.partition("@")[0] for method, _, _ in numbers if method not in ("none", "cnn"))
+    for method in methods:
+        cells = []
+        for weight in WEIGHTS:
+            of = f"{method}@{weight:g}"
+            if weight == EnsembleConfig().diversity_weight and of not in {name for name, _, _ in numbers}:
+                of = method
+            steps = curve(numbers, of, SHOWN["ranking, cross-fitted best"])
+            best = max(steps, key=lambda step: steps[step]) if steps else 0
+            cells.append(f"{steps[best]:.3f} ({best})" if steps else "-")
+        yield [method, *cells]
+
+
+def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -> Iterator[list[str]]:
+    for method in tested:
+        cells = []
+        for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
+            own, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
+            cells.append(f"{interval(own - other)} ({above(own, other).sum()})" if len(own) == len(other) else "-")
+        if method != "dbat":
+            yield [method, *cells]
+
+
+def _seeds(numbers: Numbers) -> str:
+    seeds = sorted({seed for _, _, seed in numbers})
+    return f"seeds {seeds[0]} to {seeds[-1]}" if seeds else "no seeds"
+
+
+def main() -> None:
+    """Run the cells that are not in the file yet."""
+    parser = parser_of(__doc__, "0-9")
+    parser.add_argument("--layouts", choices=LAYOUTS, default="test")
+    parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
+    parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
+    parser.add_argument("--chosen", action="store_true", help="each method at its chosen length, and no other")
+    arguments = parser.parse_args()
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+        return
+    methods = arguments.methods.split(",")
+    chosen = lengths(read(arguments.csv, "choice")) if arguments.chosen else {}
+    until = tuple(step for step in LOOKS if step <= arguments.until)
+    looks = {method: (chosen[method],) if chosen else until for method in methods}
+    run_cells(
+        arguments.csv,
+        COLUMNS,
+        KEYS[:4],
+        {
+            (arguments.layouts, method, sub_goal, str(seed)): partial(
+                run_cell, arguments.layouts, method, sub_goal, seed, looks[method]
+            )
+            for seed in arguments.seeds
+            for method in methods
+            for sub_goal in DOMAIN.sub_goals
+        },
+        lambda cell: looks[cell[1]],
+        arguments.workers,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,361 @@
+"""How near to a ladder's base do options stop that were learned on it? Figure 4.
+
+    python -m studies.ladder_options docs/results/figure4-ladders.csv --groups 1 --seeds 10
+
+A cell is a method, N (labelled ladder groups), a ladder and a seed: the options of all members of an ensemble, learned
+on that ladder. The stages themselves are run, in the folder of ``--work``; ensembles stay there, of options only the
+rows of the CSV. Kept and gone on with as in ``studies.hypotheses``; ``--tables`` draws the cells.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.config import parse_integers
+from hypogoal.core.rounding import above
+from hypogoal.core.workers import in_processes
+from hypogoal.domains.montezuma import DOMAIN, MontezumaConfig
+from hypogoal.evaluation.distance import NEAR, option_numbers
+from hypogoal.evaluation.run import read_executions
+from hypogoal.hypotheses.config import TrainEnsembleConfig
+from hypogoal.meta.config import TrainOptionsConfig
+from hypogoal.stages.collect import collect
+from hypogoal.stages.train_ensemble import train_ensemble
+from hypogoal.stages.train_options import train_options
+from studies.cells import Row, interval, parser_of, run_cells, table
+from studies.ladders import read as read_lengths
+
+Settings = dict[str, Any]
+# What looks at the window around the agent, taught in room 1, and is made to hold in rooms nobody labelled.
+WINDOW: Settings = {
+    "network": "montezuma-crop",
+    "view": "agent-crop",
+    "batch_kind": "per-ladder",
+    "augment": "grey-context",
+    "jitter": 3,
+    "threshold": "positives-median",
+    "steps": 600,
+}
+HOLDS: Settings = {"termination": "patience:10000"}
+CARRIED, HOME, MORE = "carried", "1L,1M,1R", 5_000  # learned at home, then as they are elsewhere, then so much further
+METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of the ensemble and of its options
+    "dbat": ("D-BAT", {"diversity": "dbat"}, {}),
+    "none": ("no diversity", {"diversity": "none"}, {}),
+    "cnn": ("single CNN", {"members": 1, "diversity": "none"}, {}),
+    "holds-dbat": ("D-BAT", WINDOW, HOLDS),
+    "holds-none": ("no diversity", WINDOW | {"diversity": "none"}, HOLDS),
+    "holds-ram": ("true position", WINDOW | {"localiser": "ram"}, HOLDS),
+    "no-context": ("without other surroundings", WINDOW | {"augment": "grey"}, HOLDS),
+    "no-median": ("threshold .5", WINDOW | {"threshold": "0.5"}, HOLDS),
+    "no-patience": ("without patience", WINDOW, {}),
+    CARRIED: ("carried over", WINDOW, HOLDS | {"policy_view": "agent-crop"}),
+    "oracle": ("true sub-goal", {}, {"termination": "oracle"}),  # whatever the ensemble
+}
+# Whose ensemble is another method's.
+ENSEMBLES = {CARRIED: "holds-dbat", "no-patience": "holds-dbat", "oracle": "dbat"}
+MEMBERS, STEPS = 3, 40_000
+FEWEST = 8  # ladders of which a mean is shown
+# The paper's Figure 4 has twelve; the tops of the last three are bases themselves.
+LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13", "4-10", "11-19", "13-21")
+RUN_ON = ("0-4", "5-11", "7-13")  # their bases are tops of the next ladder
+KEYS = ("groups", "method", "seed", "ladder", "step", "member")
+NUMBERS = ("distance", "reached_base", "inside_at_start", "timed_out", "died", "duration")
+COLUMNS = (*KEYS, "ensemble_steps", *NUMBERS)
+LENGTHS = Path("docs/results/hypotheses-ladders.csv")
+
+
+def length(groups: int, method: str) -> int:
+    """The rule: the look at which the best member's balanced accuracy over all rooms is highest, mean over seeds."""
+    seeds = read_lengths(LENGTHS, groups)[method].values()
+    looks = next(iter(seeds))
+    return max(looks, key=lambda look: np.mean([of[look]["balanced_accuracy_all"].max() for of in seeds]))
+
+
+def ensemble_of(work: Path, groups: int, method: str, seed: int) -> Path:
+    """Where the ensemble is; trained if it is not there."""
+    out = work / f"{method}-{groups}-{seed}"
+    if not (out / "manifest.json").exists():
+        own = METHODS[method][1]
+        settings = {**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "workers": 1, **own}
+        config = TrainEnsembleConfig(**{"steps": own.get("steps") or length(groups, method), **settings})
+        train_ensemble(work / f"groups-{groups}.h5", config, out, seed=seed, force=True, quiet=True)
+    return out
+
+
+def run_cell(work: Path, groups: int, method: str, seed: int, ladder: str) -> list[Row]:
+    """Learn the options of one ensemble on one ladder; of each member the last executions' numbers."""
+    ensemble = ensemble_of(work, groups, ENSEMBLES.get(method, method), seed)
+    out = work / f"options-{groups}-{method}-{seed}-{ladder}"
+    if method != CARRIED:
+        return _learned(ensemble, out, (groups, method, seed, ladder, STEPS))
+    home = work / f"carried-{groups}-{seed}"
+    if not (home / "manifest.json").exists():
+        _train(ensemble, home, seed, METHODS[method][2] | {"start": HOME, "steps": STEPS})
+    # First as they are (a warm-up so long that nothing is learned), then with learning.
+    rows = _learned(ensemble, out, (groups, method, seed, ladder, 0), home, {"steps": MORE, "warm_up": 10**9})
+    return rows + _learned(ensemble, out, (groups, method, seed, ladder, MORE), home, {"steps": MORE})
+
+
+def _train(ensemble: Path, out: Path, seed: int, changes: Settings, options: Path | None = None) -> None:
+    config = TrainOptionsConfig(**{**DOMAIN.defaults["train-options"], **changes})
+    train_options(ensemble, config, out, options=options, seed=seed, force=True, quiet=True)
+
+
+def _learned(
+    ensemble: Path, out: Path, cell: tuple[Any, ...], options: Path | None = None, changes: Settings | None = None
+) -> list[Row]:
+    _, method, seed, ladder, _ = cell
+    _train(ensemble, out, seed, {"start": ladder, "steps": STEPS, **METHODS[method][2], **(changes or {})}, options)
+    executions, members = read_executions(out / "executions.csv"), open_artefact(out, "options").config["members"]
+    trained = open_artefact(ensemble, "ensemble").config["steps"]
+    rows = []
+    for member in range(members):
+        numbers = option_numbers(executions.of(member))
+        place = dict(zip(KEYS, (*cell, member), strict=True))
+        rows.append(place | {"ensemble_steps": trained} | {name: float(numbers[name]) for name in NUMBERS})
+    shutil.rmtree(out)
+    return rows
+
+
+Distances = dict[tuple[str, str], dict[int, NDArray[np.float64]]]  # by method and ladder, by seed: (K,)
+
+
+def read(path: Path, groups: int, name: str = "distance") -> Distances:
+    """A number of the cells of one N."""
+    found: Distances = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if int(row["groups"]) == groups:
+                method = row["method"] if row["method"] != CARRIED else f"{CARRIED}-{row['step']}"
+                seeds = found.setdefault((method, row["ladder"]), {})
+                seed = int(row["seed"])
+                seeds[seed] = np.append(seeds.get(seed, np.empty(0)), float(row[name]))
+    return found
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    for groups in range(1, 8):
+        if found := read(path, groups):
+            yield from _tables(groups, found, read(path, groups, "reached_base"), read(path, groups, "inside_at_start"))
+
+
+def _tables(groups: int, found: Distances, reached: Distances, inside: Distances) -> Iterator[str]:
+    methods = [method for method in METHODS if any(name == method for name, _ in found)]
+    learned = [method for method in methods if method != "oracle"]  # the control may lag behind
+    whole = [ladder for ladder in LADDERS if all((method, ladder) in found for method in learned)]
+    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one if equal)."
+    yield ""
+    yield from table(
+        ["ladder", *(METHODS[method][0] for method in methods), "started inside: D-BAT, no diversity, CNN"],
+        (
+            [
+                ladder,
+                *(_three(found.get((method, ladder), {})) for method in methods),
+                " / ".join(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned),
+            ]
+            for ladder in whole
+        ),
+    )
+    if len(whole) < FEWEST:
+        return
+    seeds = sorted(set.intersection(*(set(found[method, ladder]) for method in learned for ladder in whole)))
+    yield f"Mean over {len(whole)} ladders, Student's 95 % interval over ladders; seeds {', '.join(map(str, seeds))}."
+    yield ""
+    yield from table(
+        ["", "best member", "mean member", f"best within {NEAR} of a base", "mean member minus D-BAT's"],
+        (
+            [
+                METHODS[method][0],
+                interval(over(found, method, whole, seeds, np.min), 1),
+                interval(over(found, method, whole, seeds, np.mean), 1),
+                interval(over(reached, method, whole, seeds, np.max), 2),
+                _against(found, method, whole, seeds),
+            ]
+            for method in learned
+        ),
+    )
+
+
+def tables_that_hold(path: Path) -> Iterator[str]:
+    """What the cells of options that hold say, as lines of Markdown."""
+    found, reached = read(path, 1), read(path, 1, "reached_base")
+    methods = [method for method in ("holds-dbat", "holds-none", "holds-ram", "oracle") if _ladders(found, method)]
+    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds (how many)."
+    yield ""
+    yield from table(
+        ["ladder", *(METHODS[method][0] for method in methods), "D-BAT's mean member, seed by seed"],
+        (
+            [
+                ladder,
+                *(_bold(found.get((method, ladder), {})) for method in methods),
+                " ".join(f"{members.mean():.1f}" for _, members in sorted(found["holds-dbat", ladder].items())),
+            ]
+            for ladder in _ladders(found, "holds-dbat")
+        ),
+    )
+    inside = read(path, 1, "inside_at_start")
+    # Where the true sub-goal itself is counted as missed: most of its executions begin inside.
+    shares = {ladder: np.mean([*inside.get(("oracle", ladder), {}).values()] or 0) for ladder in LADDERS}
+    missed = [ladder for ladder, share in shares.items() if above(share, 0.5)]
+    groups = {
+        "nine whose base does not run on": [ladder for ladder in LADDERS if ladder not in RUN_ON],
+        f"of these without {', '.join(missed)}": [ladder for ladder in LADDERS if ladder not in (*RUN_ON, *missed)],
+        "three whose base runs on": list(RUN_ON),
+    }
+    yield "Mean member, mean over ladders; Student's 95 % interval over the seeds that have all of these ladders."
+    yield ""
+    yield from table(
+        ["", *groups],
+        (
+            *(
+                [METHODS[method][0], *(_of_group(found, [method], ladders) for ladders in groups.values())]
+                for method in methods
+            ),
+            [
+                "no diversity minus D-BAT, same seeds",
+                *(_of_group(found, ["holds-none", "holds-dbat"], ladders) for ladders in groups.values()),
+            ],
+        ),
+    )
+    parts = [method for method in ("holds-dbat", "no-context", "no-median", "no-patience") if _ladders(found, method)]
+    if len(parts) > 1:
+        yield "Each part left out: best / **mean** / worst member, mean over the same seeds."
+        yield ""
+        ladders = ("3-9", "2-6")
+        seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in parts for ladder in ladders))
+        of = {
+            key: {seed: members[seed] for seed in seeds}
+            for key, members in found.items()
+            if key[0] in parts and key[1] in ladders
+        }
+        rows = ([METHODS[method][0], *(_bold(of[method, ladder]) for ladder in ladders)] for method in parts)
+        yield from table(["", *ladders], rows)
+    if shaped := found.get(("shaped", "14-22")):  # by a setting that is gone: it gained nothing
+        plain = {seed: found["holds-dbat", "14-22"][seed] for seed in shaped}
+        yield "14-22 with and without `shaping=0.5`: best / **mean** / worst member, mean over the same seeds."
+        yield ""
+        yield from table(["", "14-22"], [["without", _bold(plain)], ["with shaping", _bold(shaped)]])
+    if _ladders(found, f"{CARRIED}-0"):
+        yield "Carried over from 1L, 1M and 1R: share of executions that end at a base, mean member (distance)."
+        yield ""
+        yield from table(
+            ["ladder", "as they are", f"after {MORE:,} steps more"],
+            (
+                [ladder, *(_share(reached, found, f"{CARRIED}-{step}", ladder) for step in (0, MORE))]
+                for ladder in _ladders(found, f"{CARRIED}-0")
+            ),
+        )
+
+
+def _ladders(found: Distances, method: str) -> list[str]:
+    return [ladder for ladder in LADDERS if (method, ladder) in found]
+
+
+def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
+    if not seeds:
+        return "-"
+    best, mean, worst = _best_mean_worst(seeds)
+    text = f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
+    return f"{text} ({len(seeds)})"
+
+
+def _best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:
+    best, mean, worst = (
+        float(np.mean([of(members) for members in seeds.values()])) for of in (np.min, np.mean, np.max)
+    )
+    return best, mean, worst
+
+
+def _of_group(found: Distances, methods: list[str], ladders: list[str]) -> str:
+    """The mean member's mean over ladders, of two methods the first's minus the second's; seeds that have all."""
+    seeds = set.intersection(*(set(found.get((method, ladder), {})) for method in methods for ladder in ladders))
+    means = [
+        [np.mean([found[method, ladder][seed].mean() for ladder in ladders]) for method in methods] for seed in seeds
+    ]
+    return interval(np.array([each[0] - sum(each[1:]) for each in means]), 1) if means else "-"
+
+
+def _share(reached: Distances, found: Distances, method: str, ladder: str) -> str:
+    shares, distances = (
+        np.mean([members.mean() for members in of[method, ladder].values()]) for of in (reached, found)
+    )
+    return f"{shares:.2f} ({distances:.0f})"
+
+
+def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
+    if not seeds:
+        return "-"
+    numbers = [f"{number:.0f}" for number in _best_mean_worst(seeds)]
+    return " / ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
+
+
+def over(
+    found: Distances,
+    method: str,
+    ladders: list[str],
+    seeds: list[int],
+    of: Callable[[NDArray[np.float64]], np.floating[Any]],
+) -> NDArray[np.float64]:
+    """A number of each ladder's members, mean over seeds: float64 (ladders,)."""
+    return np.array([np.mean([of(found[method, ladder][seed]) for seed in seeds]) for ladder in ladders])
+
+
+def _against(found: Distances, method: str, ladders: list[str], seeds: list[int]) -> str:
+    if method == "dbat":
+        return "-"
+    apart = [over(found, name, ladders, seeds, np.mean) for name in (method, "dbat")]
+    return interval(apart[0] - apart[1], 1)
+
+
+def _steps(cell: tuple[str, ...]) -> tuple[int, ...]:
+    return (0, MORE) if cell[1] == CARRIED else (STEPS,)
+
+
+def main() -> None:
+    """Run the cells that are not in the file yet."""
+    parser = parser_of(__doc__, "10")
+    parser.add_argument(
+        "--work", type=Path, default=Path("runs/ladder-options"), help="the folder of data and ensembles"
+    )
+    parser.add_argument("--groups", type=parse_integers, default=(1,), help="N: 1 or 1,2")
+    parser.add_argument("--methods", default="dbat,none,cnn,oracle", help=f"of {', '.join(METHODS)}")
+    parser.add_argument("--ladders", default=",".join(LADDERS[:9]), help=f"of {', '.join(LADDERS)}")
+    arguments = parser.parse_args()
+    if arguments.tables:
+        print("\n".join((tables_that_hold if "hold" in arguments.csv.stem else tables)(arguments.csv)))
+        return
+    work, methods = arguments.work, arguments.methods.split(",")
+    for groups in arguments.groups:
+        if not (work / f"groups-{groups}.h5").exists():
+            collect(DOMAIN, MontezumaConfig(groups=groups, workers=1), work / f"groups-{groups}.h5", quiet=True)
+    trained = {ENSEMBLES.get(method, method) for method in methods}
+    ensembles = [
+        partial(ensemble_of, work, groups, method, seed)
+        for groups in arguments.groups
+        for seed in arguments.seeds
+        for method in sorted(trained)
+    ]
+    if arguments.workers > 1:  # else each when it is needed
+        in_processes(ensembles, arguments.workers, lambda *_: None)
+    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+        (str(groups), method, str(seed), ladder): partial(run_cell, work, groups, method, seed, ladder)
+        for groups in arguments.groups
+        for seed in arguments.seeds
+        for ladder in arguments.ladders.split(",")
+        for method in methods
+    }
+    run_cells(arguments.csv, COLUMNS, KEYS[:4], jobs, _steps, arguments.workers)
+
+
+if __name__ == "__main__":
+    main()

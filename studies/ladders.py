@@ -1,0 +1,243 @@
+"""What members know of rooms of Montezuma's Revenge nobody labelled, by labelled ladder groups and length of training.
+
+    python -m studies.ladders docs/results/hypotheses-ladders.csv --groups 1 --seeds 0-9
+
+A cell is N (labelled ladder groups), a method and a seed: one training, looked at after each of ``LOOKS`` steps.
+Length and member are picked on half of the rooms and scored on the other half, and the other way round. Cells are kept
+and gone on with as in ``studies.hypotheses``; ``--tables`` draws them.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.compute import prepare
+from hypogoal.core.config import parse_integers
+from hypogoal.core.progress import Progress
+from hypogoal.core.rounding import above
+from hypogoal.core.seeding import seed_for
+from hypogoal.dataset import Collected
+from hypogoal.domains.montezuma import DOMAIN, SEEN_NOWHERE, MontezumaConfig
+from hypogoal.hypotheses.config import EnsembleConfig
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.scores import halves, member_scores, ranking
+from hypogoal.hypotheses.training import Watcher, fit
+from studies.cells import Row, interval, parser_of, run_cells, table
+
+METHODS: dict[str, dict[str, Any]] = {
+    "dbat": {"diversity": "dbat"},
+    "none": {"diversity": "none"},
+    "cnn": {"members": 1, "diversity": "none"},
+    "dbat-unpaired": {"diversity": "dbat-unpaired"},
+    "say-no": {"diversity": "say-no"},
+}
+MEMBERS = 3
+LOOKS = (10, 25, 50, 100, 200, 300, 450, 600, 800, 1000)
+SHOWN = (10, 25, 50, 100, 300, 600, 1000)  # of these in the table
+SCOPES = ("all", "unseen", "first", "second")  # all rooms; those of no training set, and both halves of these
+KEYS = ("groups", "method", "seed", "step", "member")
+COLUMNS = (*KEYS, *(f"{name}_{scope}" for scope in SCOPES for name in ("ranking", "balanced_accuracy", "accuracy")))
+(SUB_GOAL,) = DOMAIN.sub_goals
+# 'Accuracy', three seeds each: experiments/divdis_monte/classifier_plot.py of the authors' repository.
+AUTHORS = {
+    "dbat": {
+        1: (0.7215, 0.66, 0.7203),
+        2: (0.9680, 0.9461, 0.9734),
+        3: (0.9818, 0.9831, 0.9804),
+        4: (0.9837, 0.9846, 0.9836),
+        5: (0.9869, 0.9867, 0.9866),
+        6: (0.9893, 0.9916, 0.9915),
+        7: (0.9914, 0.9915, 0.9926),
+    },
+    "none": {
+        1: (0.5985, 0.6228, 0.6586),
+        2: (0.9716, 0.9664, 0.9726),
+        3: (0.9779, 0.9846, 0.9820),
+        4: (0.9831, 0.9847, 0.9843),
+        5: (0.9841, 0.9912, 0.9880),
+        6: (0.9898, 0.9911, 0.9905),
+        7: (0.9915, 0.9928, 0.9926),
+    },
+    "cnn": {
+        1: (0.4429, 0.5872, 0.5931),
+        2: (0.9597, 0.9065, 0.8671),
+        3: (0.9824, 0.9661, 0.9560),
+        4: (0.9657, 0.9811, 0.9815),
+        5: (0.9862, 0.9825, 0.9729),
+        6: (0.9845, 0.9847, 0.9889),
+        7: (0.9879, 0.9902, 0.9914),
+    },
+}
+
+
+@lru_cache(maxsize=1)
+def states_of(groups: int) -> Collected:
+    """The states of ``hypogoal collect montezuma --set groups=N``."""
+    return DOMAIN.collect(MontezumaConfig(groups=groups, workers=1), 0, Progress("collect", 1, quiet=True))
+
+
+def run_cell(groups: int, method: str, seed: int, looks: tuple[int, ...]) -> list[Row]:
+    """Train one ensemble as ``hypogoal train-ensemble --seed`` would, and score it on the way."""
+    prepare()
+    data = states_of(groups)
+    labels, unseen = data.heldout.labels[:, 0], data.heldout.origins["seen"] == SEEN_NOWHERE
+    first = halves(data.heldout.origins["room"][unseen])
+    assert first is not None
+    scopes = dict.fromkeys(SCOPES, np.ones(len(labels), dtype=np.bool_))
+    scopes["unseen"] = unseen
+    for name, half in (("first", first), ("second", ~first)):
+        scopes[name] = np.zeros(len(labels), dtype=np.bool_)
+        scopes[name][np.flatnonzero(unseen)[half]] = True
+    rows: list[Row] = []
+
+    def look(step: int, ensemble: Ensemble) -> None:
+        probabilities = ensemble.predict(data.heldout.observations)
+        columns: dict[str, NDArray[np.float64]] = {}
+        for scope, inside in scopes.items():
+            scores = member_scores(probabilities[inside] > 0.5, labels[inside])
+            columns[f"ranking_{scope}"] = ranking(probabilities[inside], labels[inside])
+            columns |= {f"{name}_{scope}": scores[name] for name in ("balanced_accuracy", "accuracy")}
+        for member in range(len(ensemble)):
+            place = {"groups": groups, "method": method, "seed": seed, "step": step, "member": member}
+            rows.append(place | {name: float(values[member]) for name, values in columns.items()})
+
+    config = EnsembleConfig(**{**DOMAIN.defaults["train-ensemble"], "members": MEMBERS, "steps": looks[-1]})
+    fit(
+        data.labelled.observations,
+        data.labelled.labels[:, 0],
+        data.unlabelled.observations,
+        dataclasses.replace(config, **METHODS[method]),
+        seed_for(seed, "ensemble", SUB_GOAL),
+        Watcher(look=look, look_at=looks),
+    )
+    return rows
+
+
+Seeds = dict[int, dict[int, dict[str, NDArray[np.float64]]]]  # by seed, step and column: (K,)
+Numbers = dict[str, Seeds]  # by method
+
+
+def read(path: Path, groups: int) -> Numbers:
+    """The cells of one N; seeds that every method has, so that all are compared on the same ones."""
+    numbers: Numbers = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if int(row["groups"]) == groups:
+                steps = numbers.setdefault(row["method"], {}).setdefault(int(row["seed"]), {})
+                columns = steps.setdefault(int(row["step"]), {})
+                for name in COLUMNS[len(KEYS) :]:
+                    columns[name] = np.append(columns.get(name, np.empty(0)), float(row[name] or "nan"))
+    shared = set.intersection(*map(set, numbers.values())) if numbers else set()
+    return {method: {seed: seeds[seed] for seed in sorted(shared)} for method, seeds in numbers.items()}
+
+
+def picked(seeds: Seeds, half: str) -> int:
+    """The rule: the look at which the best member's ranking on half of the rooms is highest, mean over seeds."""
+    steps = next(iter(seeds.values()))
+    return max(steps, key=lambda step: np.mean([looks[step][f"ranking_{half}"].max() for looks in seeds.values()]))
+
+
+def crossed(seeds: Seeds, name: str) -> NDArray[np.float64]:
+    """A score of the member that ranks best on one half of the rooms, on the other, at the length of that half.
+
+    Returns:
+        float64 (seeds,): the mean of both directions.
+    """
+    directions = []
+    for picking, scoring in (("first", "second"), ("second", "first")):
+        step = picked(seeds, picking)
+        looks = [steps[step] for steps in seeds.values()]
+        directions.append([look[f"{name}_{scoring}"][look[f"ranking_{picking}"].argmax()] for look in looks])
+    scores: NDArray[np.float64] = np.mean(directions, axis=0)
+    return scores
+
+
+def tables(path: Path) -> Iterator[str]:
+    """What the cells say, as lines of Markdown."""
+    for groups in range(1, 8):
+        numbers = read(path, groups)
+        if numbers.get("dbat"):
+            yield from _tables(groups, numbers)
+
+
+def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
+    seeds = list(numbers["dbat"])
+    yield f"N = {groups}, {len(seeds)} seeds: ranking on unseen rooms, best member there / mean member, by steps."
+    yield ""
+    looks = [step for step in SHOWN if step in next(iter(numbers["dbat"].values()))]
+
+    def best_and_mean(method: str, step: int) -> str:
+        rankings = [looked[step]["ranking_unseen"] for looked in numbers[method].values()]
+        return " / ".join(f"{np.mean([of(members) for members in rankings]):.3f}" for of in (np.max, np.mean))
+
+    yield from table(
+        ["", *map(str, looks)], ([method, *(best_and_mean(method, step) for step in looks)] for method in numbers)
+    )
+    yield "Cross-fitted: length and member picked on half of the unseen rooms, scored on the other."
+    yield ""
+    yield from table(
+        [
+            "",
+            "steps",
+            "ranking",
+            "balanced accuracy at 0.5",
+            "D-BAT minus it, ranking",
+            "seeds in which D-BAT is above",
+        ],
+        (_cross_fitted(numbers, method) for method in numbers),
+    )
+    yield "All rooms, at the mean of both lengths: the best member there, the paper's way."
+    yield ""
+    yield from table(
+        ["", "balanced accuracy", "accuracy", "the authors' (three seeds)"],
+        (_all_rooms(groups, method, seeds) for method, seeds in numbers.items()),
+    )
+
+
+def _cross_fitted(numbers: Numbers, method: str) -> list[str]:
+    seeds = numbers[method]
+    own, dbat = crossed(seeds, "ranking"), crossed(numbers["dbat"], "ranking")
+    steps = f"{picked(seeds, 'first')}, {picked(seeds, 'second')}"
+    versus = ["-", "-"] if method == "dbat" else [interval(dbat - own), f"{above(dbat, own).sum()} of {len(own)}"]
+    return [method, steps, interval(own), interval(crossed(seeds, "balanced_accuracy")), *versus]
+
+
+def _all_rooms(groups: int, method: str, seeds: Seeds) -> list[str]:
+    best = []
+    for name in ("balanced_accuracy_all", "accuracy_all"):
+        of_half = [[steps[picked(seeds, half)][name].max() for steps in seeds.values()] for half in ("first", "second")]
+        best.append(interval(np.mean(of_half, axis=0)))
+    authors = AUTHORS.get(method, {}).get(groups)
+    return [method, *best, " ".join(f"{value:.3f}" for value in authors) if authors else "-"]
+
+
+def main() -> None:
+    """Run the cells that are not in the file yet."""
+    parser = parser_of(__doc__, "0-9")
+    parser.add_argument("--groups", type=parse_integers, default=[1], help="labelled ladder groups: 1 or 1-4")
+    parser.add_argument("--methods", default=",".join(METHODS), help="comma-separated; all by default")
+    parser.add_argument("--until", type=int, default=LOOKS[-1], help="steps to train for")
+    arguments = parser.parse_args()
+    if arguments.tables:
+        print("\n".join(tables(arguments.csv)))
+        return
+    looks = tuple(step for step in LOOKS if step <= arguments.until)
+    jobs: dict[tuple[str, ...], Callable[[], list[Row]]] = {
+        (str(groups), method, str(seed)): partial(run_cell, groups, method, seed, looks)
+        for groups in arguments.groups
+        for seed in arguments.seeds
+        for method in arguments.methods.split(",")
+    }
+    run_cells(arguments.csv, COLUMNS, KEYS[:3], jobs, lambda _: looks, arguments.workers)
+
+
+if __name__ == "__main__":
+    main()

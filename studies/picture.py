@@ -1,0 +1,86 @@
+"""The README's picture: what choosing and an ensemble are worth, point by point.
+
+python -m studies.picture docs/results.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+RESULTS = Path("docs/results")
+INK, PALE, GREY = "#0b5394", "#9fc5e8", "#8a8a8a"
+
+
+def solved(name: str, chooser: str = "agent", **wanted: str) -> list[float]:
+    """The share of episodes solved, of each row that fits."""
+    with (RESULTS / name).open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    wanted |= {"quantity": "success", "chooser": chooser}
+    return [float(row["value"]) for row in rows if all(row[key] == value for key, value in wanted.items())]
+
+
+def draw(axes: Axes, columns: Sequence[tuple[str, list[float], str]]) -> None:
+    """A column of points for each name, its mean as a line with the number beside it."""
+    rng = np.random.default_rng(0)
+    for place, (_name, values, colour) in enumerate(columns):
+        axes.plot(place + rng.uniform(-0.18, 0.18, len(values)), values, "o", ms=4.5, color=colour, alpha=0.75, mew=0)
+        mean = float(np.mean(values))
+        axes.plot([place - 0.3, place + 0.3], [mean, mean], color="black", lw=1.6)
+        axes.annotate(f"{mean:.2f}", (place + 0.33, mean), va="center", fontsize=9)
+    axes.set_xticks(range(len(columns)), [name for name, _, _ in columns], fontsize=9)
+    axes.set_xlim(-0.5, len(columns) - 0.2)
+    axes.set_ylim(-0.03, 1.05)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def main() -> None:
+    """Draw it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("out", type=Path, help="a .png file")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.5), sharey=True, layout="constrained")
+    settings = [f"which-feature-rooms{which}.csv" for which in ("-first", "-second", "")]
+    rooms = {
+        method: [value for name in settings for value in solved(name, method=f"{method}-truth-shape")]
+        for method in ("dbat", "none", "one")
+    }
+    draw(
+        left,
+        [
+            ("ensemble,\nD-BAT", rooms["dbat"], INK),
+            ("ensemble,\nno diversity", rooms["none"], PALE),
+            ("one\nclassifier", rooms["one"], PALE),
+        ],
+    )
+    left.axhline(0.2, color=GREY, lw=1, ls="--")
+    left.annotate("guessing", (-0.45, 0.215), fontsize=8, color="#5a5a5a")
+    left.set_title(
+        "The labels fit two features, the reward asks\nfor the harder one: the ensemble decides", fontsize=10
+    )
+    left.set_ylabel("episodes solved")
+    keys = "choosing-doorkey.csv"
+    pairs = [
+        (chooser, method, solved(keys, chooser, method=method, policy="learned"))
+        for method in ("dbat", "one")
+        for chooser in ("agent", "uniform")
+    ]
+    names = {"dbat": "D-BAT", "one": "one classifier"}
+    draw(
+        right,
+        [
+            (f"{'agent' if who == 'agent' else 'chance'},\n{names[method]}", values, INK if who == "agent" else PALE)
+            for who, method, values in pairs
+        ],
+    )
+    right.set_title("A wrong key ends the episode:\nchoosing decides, the ensemble does not", fontsize=10)
+    figure.savefig(parser.parse_args().out, dpi=150)
+
+
+if __name__ == "__main__":
+    main()
