@@ -113,7 +113,7 @@ def tables_of_two(path: Path) -> Iterator[str]:
     yield from _side_by_side("Test", boards)
 
 
-def _side_by_side(title: str, boards: Mapping[str, Sequence[Cell]]) -> Iterator[str]:
+def _side_by_side(title: str, boards: Mapping[str, Sequence[Scored]]) -> Iterator[str]:
     """Coverage (best) of each objective at its chosen weight, a column for each set of cells."""
     columns = {name: {_objective(line): line for line in summary(cells, HIGH, LOW)} for name, cells in boards.items()}
     objectives = [name for name in (*OBJECTIVES, *UNWEIGHTED) if any(name in lines for lines in columns.values())]
@@ -130,7 +130,7 @@ def _objective(line: Line) -> str:
 
 
 def _covered(line: Line | None) -> str:
-    return "-" if line is None else f"{told(line.coverage)} ({line.best.mean():.2f})"
+    return "-" if line is None else f"{with_interval(line.coverage)} ({line.best.mean():.2f})"
 
 
 def _weights(what: str, cells: Iterable[Scored], winners: Mapping[str, str]) -> Iterator[str]:

@@ -44,15 +44,19 @@ def own_classifier(name: str) -> Classifier:
         raise UserError("this is not a function", name, "Give one from observations (N, *obs) to probabilities (N,).")
 
     def classify(engine: Engine, ids: NDArray[np.int64]) -> NDArray[np.floating]:
-        told = []
+        log_odds = []
         for some in np.split(ids, range(CHUNK, len(ids), CHUNK)):
             with own_code.UsersCode(f"the classifier {name}", function) as code:
-                given = np.asarray(function(engine.images(some)), dtype=np.float64)
-                if given.shape != some.shape or not ((given >= 0) & (given <= 1)).all():
-                    gave = f"gave {given.shape}, {given.min():g} to {given.max():g}" if given.size else "gave nothing"
+                probabilities = np.asarray(function(engine.images(some)), dtype=np.float64)
+                if probabilities.shape != some.shape or not ((probabilities >= 0) & (probabilities <= 1)).all():
+                    gave = (
+                        f"gave {probabilities.shape}, {probabilities.min():g} to {probabilities.max():g}"
+                        if probabilities.size
+                        else "gave nothing"
+                    )
                     code.refuse(gave, f"Give probabilities, 0 to 1, float ({len(some)},).")
-            told.append(log_odds_of(given))
-        return np.concatenate(told)
+            log_odds.append(log_odds_of(probabilities))
+        return np.concatenate(log_odds)
 
     return classify
 
@@ -88,8 +92,8 @@ def findings(
     False yes are of one kind where the same sub-goals hold and, of engines that know positions, the cell is the same;
     of each of the most frequent kinds a film of the shortest execution is put into ``folder``, of pictures.
     """
-    engine, own, rows = loop.engine, table["option"] == option, list(loop.recorder.executions[option])
-    says_yes, near = table["reached"][own] > 0, table["near"][own] > 0
+    engine, of_policy, rows = loop.engine, table["option"] == option, list(loop.recorder.executions[option])
+    says_yes, near = table["reached"][of_policy] > 0, table["near"][of_policy] > 0
     fooled = [row for row, wrong in zip(rows, says_yes & ~near, strict=True) if wrong]
 
     def kind_of(row: Execution) -> tuple[tuple[str, ...], tuple[int, ...]]:
@@ -106,8 +110,8 @@ def findings(
         pictures = engine.observation_dtype == PICTURE
         if shown := pictures and len(kinds) < FILMS and bool(engine.remembers(path).all()):
             (folder / film).write_bytes(_film(loop, path, option))
-        about = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
-        kinds.append({"executions": len(alike), **about, "film": film if shown else None})
+        description = {"holds": holds, "position": dict(zip(engine.position_names, at, strict=True))}
+        kinds.append({"executions": len(alike), **description, "film": film if shown else None})
     ends = {"fooled": len(fooled), "there": int((says_yes & near).sum())}
     begun = {"yes_at_start": sum(row.inside_at_start for row in rows)}
     return option_numbers(table, option) | ends | begun | {"kinds": kinds}
@@ -117,18 +121,20 @@ def _film(loop: OptionLoop, path: NDArray[np.int64], option: int) -> bytes:
     """An execution that ended in a false yes, from where it began."""
     timeout = loop.config.option_timeout
     states = zip(loop.engine.images(path), loop.terminations.of(path)[:, option].tolist(), strict=True)
-    frames = [Frame(picture, step, option, yes, timeout - step, "") for step, (picture, yes) in enumerate(states)]
+    frames = [
+        Frame(picture, step, option, positive, timeout - step, "") for step, (picture, positive) in enumerate(states)
+    ]
     return episode_gif([*frames[:-1], replace(frames[-1], ended="fooled")], POLICIES, 1, timeout)
 
 
 def lines_of(report: Mapping[str, Any]) -> Iterator[str]:
     """What ``audit.json`` says, for a terminal of 80 columns."""
-    chance = report["random_play"]
-    yield f"random play: right in {chance['accuracy']:.1%} of {chance['states']} states"
+    random_play = report["random_play"]
+    yield f"random play: right in {random_play['accuracy']:.1%} of {random_play['states']} states"
     for name in POLICIES:
         if row := report[name]:
             ends = f"fooled in {row['fooled']} of {row['executions']} executions, there in {row['there']}"
             yield f"{name}, yes above {row['threshold']:.4g}: {ends}"
             for kind in row["kinds"][:FILMS]:
-                what = " and ".join(kind["holds"]) or "no sub-goal"
-                yield f"  {kind['film'] or '':12s} {kind['executions']:4d} x  while {what} holds"
+                sub_goals = " and ".join(kind["holds"]) or "no sub-goal"
+                yield f"  {kind['film'] or '':12s} {kind['executions']:4d} x  while {sub_goals} holds"

@@ -8,13 +8,14 @@ due is another matter. The control has the agent's own final options and picks o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
+from rich.table import Table as Printed
 from scipy.stats import rankdata
 
 from hypogoal.core.artefacts import Artefact
@@ -23,8 +24,9 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.curves import LEARNED, NEARLY, THOMPSON, base_name
-from hypogoal.evaluation.numbers import Metrics, Row, mean_of, over, rows_of
+from hypogoal.evaluation.numbers import Metrics, mean_of
 from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.table import Number, Row, Table, by_run, rows_of, select, tabulate
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
@@ -59,7 +61,7 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
     lost = plan.final & ~plan.solved
     distinct, counts = np.unique(states, return_counts=True)
     offered = ~loop.terminations.of(distinct)
-    found = np.full(len(goals), np.nan)
+    qualities = np.full(len(goals), np.nan)
     for option, goal in enumerate(goals.tolist()):
         steps = away[place[distinct], goal]
         begins = offered[:, option] & (steps > 0) & (steps <= loop.config.option_timeout)
@@ -75,15 +77,15 @@ def qualities(loop: OptionLoop, goals: NDArray[np.int64], states: NDArray[np.int
             if not len(going):
                 break
         rows = place[ids]
-        found[option] = np.average(truth[rows, goal] & ~lost[rows], weights=counts[begins])
-    return found
+        qualities[option] = np.average(truth[rows, goal] & ~lost[rows], weights=counts[begins])
+    return qualities
 
 
 def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     """Spearman's rank correlation of (n,) and (n,), ties sharing their mean rank; NaN where a side is constant."""
-    one, other = (ranks - ranks.mean() for ranks in (rankdata(first), rankdata(second)))
-    spread = np.sqrt((one**2).sum() * (other**2).sum())
-    return float((one * other).sum() / spread) if spread > 0 else math.nan
+    ranked, other = (ranks - ranks.mean() for ranks in (rankdata(first), rankdata(second)))
+    spread = np.sqrt((ranked**2).sum() * (other**2).sum())
+    return float((ranked * other).sum() / spread) if spread > 0 else math.nan
 
 
 def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[str, Any]:
@@ -106,14 +108,14 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
     preference = np.where(at_least(expected, LEAST), chosen / np.maximum(expected, 1e-12), np.nan)
     rhos, better, worse = [], 0, 0
     for goal in range(len(quality) // members):
-        own = slice(goal * members, (goal + 1) * members)
-        known = ~np.isnan(quality[own]) & ~np.isnan(preference[own])
-        if known.sum() > 1 and at_least(np.ptp(quality[own][known]), DIFFERENCE):
-            rhos.append(rank_correlation(quality[own][known], preference[own][known]))
-        for one, other in combinations(options[own].tolist(), 2):
-            if at_least(abs(quality[one] - quality[other]), DIFFERENCE):
-                good, bad = (one, other) if quality[one] > quality[other] else (other, one)
-                both = among[:, one] & among[:, other]
+        members_of_goal = slice(goal * members, (goal + 1) * members)
+        comparable = ~np.isnan(quality[members_of_goal]) & ~np.isnan(preference[members_of_goal])
+        if comparable.sum() > 1 and at_least(np.ptp(quality[members_of_goal][comparable]), DIFFERENCE):
+            rhos.append(rank_correlation(quality[members_of_goal][comparable], preference[members_of_goal][comparable]))
+        for option, other in combinations(options[members_of_goal].tolist(), 2):
+            if at_least(abs(quality[option] - quality[other]), DIFFERENCE):
+                good, bad = (option, other) if quality[option] > quality[other] else (other, option)
+                both = among[:, option] & among[:, other]
                 better, worse = better + int((taken[both] == good).sum()), worse + int((taken[both] == bad).sum())
     values = np.where(among & ~np.isnan(quality), quality, np.nan)
     rows = (~np.isnan(values)).sum(axis=1) > 1
@@ -129,24 +131,40 @@ def judge(choices: Choices, quality: NDArray[np.float64], members: int) -> dict[
     }
 
 
-def numbers(work: Work) -> dict[str, Any]:
-    """Every run of an agent that learned to choose among members' options, in a domain that knows what follows."""
-    artefacts = {work.contents.name(artefact): artefact for artefact in work.contents.agents}
-    metrics = []
-    for agent in work.metrics["agents"]:
-        rows = []
-        for run in agent["runs"]:
-            artefact = artefacts[run["path"]]
-            config = artefact.config
-            known = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
-            known = known and not config.get("layouts")  # whose states are too many to say what follows in each
-            if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not known:
-                continue
-            if (played := play_agent(artefact, run["seed"])) is not None:
-                rows.append({name: run[name] for name in ("path", "seed", "layout_seed")} | played)
-        if rows:
-            metrics.append({"name": agent["name"], "runs": rows, **_over_runs(agent["name"], rows)})
-    return {"choosing": metrics}
+def rows(work: Work) -> Iterator[Row]:
+    """Every run of an agent that learned to choose among members' options, in a domain that knows what follows.
+
+    The agent's numbers, those of uniform-random choice, and every member's.
+    """
+    for name, run in ((name, run) for name, runs in work.agents.items() for run in runs):
+        artefact = work.artefact(run.path)
+        config = artefact.config
+        playable = config.get("network") in MEMORYLESS and "options.safetensors" in artefact.manifest["files"]
+        playable = playable and not config.get("layouts")  # whose states are too many to say what follows in each
+        if base_name(artefact.kind, config) not in (LEARNED, THOMPSON) or not playable:
+            continue
+        if (played := play_agent(artefact, run.seed)) is None:
+            continue
+        place = {"scope": FROZEN, "layout": run.layout["layout_seed"], "seed": run.seed, "artefact": run.path}
+        for method, numbers in ((name, played), (UNIFORM, played["uniform"])):
+            yield from rows_of({key: numbers[key] for key in (*OF_PLAY, *OF_CHOICE)}, method=method, **place)
+        for member in played["members"]:
+            values = {key: member[key] for key in ("quality", "conditional_preference")}
+            where = {"sub_goal": member["sub_goal"], "member": member["member"]}
+            yield from rows_of(values, method=name, **where, **place)
+
+
+def view(work: Work) -> dict[str, Any]:
+    """Over runs each agent, and ``uniform``: uniform-random choice among its own options."""
+    rows = select(work.rows, scope=FROZEN)
+    agents = [row for row in rows if row.method != UNIFORM]
+    by_agent = replace(TABLE, by={"name": lambda row: work.agent_of(row.artefact)}, cell=lambda key: (*key, "uniform"))
+    uniform = {entry["name"]: entry for entry in tabulate(select(rows, method=UNIFORM), by_agent)}
+    table = tabulate(agents, TABLE)
+    for entry in table:
+        entry["uniform"] = uniform[entry["name"]]
+        entry["runs"] = by_run(select(agents, method=entry["name"]))
+    return {"choosing": table}
 
 
 def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
@@ -175,7 +193,7 @@ def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
         numbers.append(played | judge(episodes.choices, quality, members))
     preference = numbers[0].pop("preference")
     del numbers[1]["preference"]
-    rows = [
+    by_member = [
         {
             "sub_goal": config["sub_goals"][option // members],
             "member": option % members,
@@ -184,38 +202,15 @@ def play_agent(artefact: Artefact, seed: int) -> dict[str, Any] | None:
         }
         for option in range(len(quality))
     ]
-    return {**numbers[0], "members": rows, "uniform": numbers[1]}
+    return {**numbers[0], "members": by_member, "uniform": numbers[1]}
 
 
-def _over_runs(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    units = {"length": "steps", "within_rho": "Spearman's rho", "score": "ratio"}
-    layouts = [row["layout_seed"] for row in rows]
-    found: dict[str, Any] = {"uniform": {}}
-    for quantity in (*OF_PLAY, *OF_CHOICE):
-        unit = units.get(quantity, "fraction")
-        found[quantity] = over([row[quantity] for row in rows], unit, name, quantity, layouts=layouts)
-        values = [row["uniform"][quantity] for row in rows]
-        found["uniform"][quantity] = over(values, unit, name, "uniform", quantity, layouts=layouts)
-    return found
-
-
-def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
-    """Of every run the agent's, those of uniform-random choice, and every member's."""
-    for agent in metrics["choosing"]:
-        for run in agent["runs"]:
-            about = {"layout": run["layout_seed"], "seed": run["seed"], "artefact": run["path"]}
-            values = {name: run[name] for name in (*OF_PLAY, *OF_CHOICE)}
-            yield from rows_of(values, method=agent["name"], scope=FROZEN, **about)
-            uniform = {name: run["uniform"][name] for name in values}
-            yield from rows_of(uniform, method=UNIFORM, scope=FROZEN, **about)
-            for member in run["members"]:
-                place = {"sub_goal": member["sub_goal"], "member": member["member"]}
-                values = {name: member[name] for name in ("quality", "conditional_preference")}
-                yield from rows_of(values, method=agent["name"], scope=FROZEN, **place, **about)
-
-
+UNITS = {"length": "steps", "within_rho": "Spearman's rho", "score": "ratio"}
 FROZEN = "frozen"  # in numbers.csv: played after training
 UNIFORM = "uniform among its own options"
+TABLE = Table(
+    {"name": "method"}, {name: Number(name, FROZEN, UNITS.get(name, "fraction")) for name in (*OF_PLAY, *OF_CHOICE)}
+)
 COLUMNS = (
     page.label("chooser", "chooser"),
     page.number("solved", "success", page.spread, 2),
@@ -234,7 +229,7 @@ def _choosers(agents: list[Any]) -> list[dict[str, Any]]:
     return [chooser for pair in both for chooser in pair]
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Metrics) -> list[Printed]:
     """For a terminal, where there is anything to choose."""
     agents = metrics["choosing"]
     return [page.terminal(TITLE, (*COLUMNS[:2], COLUMNS[-1]), _choosers(agents))] if agents else []
@@ -257,4 +252,4 @@ def sections(material: Material) -> list[Block]:
     return [page.section("choosing", TITLE, [text], [table])]
 
 
-QUESTION = Question(numbers=numbers, rows=rows, summary=summary, sections=sections)
+QUESTION = Question(rows=rows, view=view, summary=summary, sections=sections)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any
 
@@ -13,6 +13,7 @@ from hypogoal.evaluation.numbers import Metrics, Rows, grouped
 from hypogoal.evaluation.page import Block, Column, Drawn, Entry, Material
 from hypogoal.evaluation.plots import PALETTE, STYLES
 from hypogoal.evaluation.provenance import domains_of
+from hypogoal.evaluation.table import Pairs, Row, compared, select
 
 Runs = Mapping[str, Metrics]  # a run's label -> its metrics
 Curves = Mapping[str, Mapping[str, NDArray[Any]]]  # a run's label -> the arrays of its learning curves
@@ -34,9 +35,7 @@ class Part:
     first: Sequence[Column]  # columns before that of the run; rows alike in them stand together, and show them once
     then: Sequence[Column]  # columns behind it
     caption: str  # of the table
-    name: str  # the key of measured entries that says of what agent or method they are
-    measured: Callable[[Metrics], Sequence[Entry]]  # what ``against`` takes
-    against: Callable[[Sequence[Entry]], Rows]  # pairs of runs, see ``numbers.pairs``
+    pairs: Pairs  # of runs
 
 
 def labels_of(paths: Sequence[str]) -> list[str]:
@@ -80,54 +79,63 @@ def shared(runs: Mapping[str, Metrics]) -> list[str]:
 def differences(runs: Mapping[str, Metrics]) -> list[dict[str, Any]]:
     """What was not the same: settings by the kind of artefact, seeds, layouts, data and versions.
 
-    Rows have ``of`` (an artefact's kind, ``data`` or ``versions``), ``setting`` and ``values``, one text per run.
+    Rows have ``kind`` (an artefact's kind, ``data`` or ``versions``), ``setting`` and ``values``, one text per run.
     """
-    told = {label: grouped(_settings(metrics), itemgetter(0)) for label, metrics in runs.items()}
+    settings_of = {label: grouped(_settings(metrics), itemgetter(0)) for label, metrics in runs.items()}
     rows = []
-    for of, name in sorted({key for settings in told.values() for key in settings}):
+    for kind, name in sorted({key for settings in settings_of.values() for key in settings}):
         values = {
-            label: ", ".join(sorted({text for _, text in settings.get((of, name), [((of, name), "–")])}))
-            for label, settings in told.items()
+            label: ", ".join(sorted({text for _, text in settings.get((kind, name), [((kind, name), "–")])}))
+            for label, settings in settings_of.items()
         }
         if len(set(values.values())) > 1:
-            rows.append({"of": of, "setting": name, "values": values})
+            rows.append({"of": kind, "setting": name, "values": values})
     return rows
 
 
 def _settings(metrics: Metrics) -> Iterator[tuple[tuple[str, str], str]]:
     """((kind, setting), value) for every value that the run's artefacts have."""
-    told: list[tuple[str, Mapping[str, Any]]] = []
+    kinds: list[tuple[str, Mapping[str, Any]]] = []
     for artefact in metrics["provenance"]["artefacts"]:
         # the domain's settings are the data's own, told below
         config = {name: value for name, value in artefact["config"].items() if name != "domain_config"}
-        told += [(artefact["kind"], {"seed": artefact["seed"]}), (artefact["kind"], config)]
-        told.append(("versions", artefact["versions"]))
-        told += [("data", {"sha256": of["sha256"][:10]}) for of in artefact["inputs"] if of["kind"] == "data"]
+        kinds += [(artefact["kind"], {"seed": artefact["seed"]}), (artefact["kind"], config)]
+        kinds.append(("versions", artefact["versions"]))
+        kinds += [("data", {"sha256": entry["sha256"][:10]}) for entry in artefact["inputs"] if entry["kind"] == "data"]
     for data in metrics["provenance"]["data"]:
-        told += [("data", {"seed": data["seed"]}), ("data", data["config"])]
-    for kind, settings in told:
+        kinds += [("data", {"seed": data["seed"]}), ("data", data["config"])]
+    for kind, settings in kinds:
         for name, value in settings.items():
             yield (kind, name), value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
-def compare_runs(runs: Runs) -> Rows:
+def compare_runs(rows: Mapping[str, Sequence[Row]]) -> Rows:
     """Spec F5: the first run against each other, agent by agent and method by method, over what they share.
 
-    Rows are those of ``numbers.pairs``, with the agent or the method in ``where``.
+    ``rows`` are each run's numbers by its label. Entries are those of ``numbers.pairs``, with the agent or the method
+    in ``where``.
     """
-    rows: Rows = []
+    entries: Rows = []
     for part in PARTS.values():
-        measured = {run: part.measured(metrics) for run, metrics in runs.items()}
-        for name in common_names(list(measured.values()), part.name):
-            alike = [{**of, part.name: run} for run, each in measured.items() for of in each if of[part.name] == name]
-            against = part.against(alike)
-            rows += [{**row, "where": ", ".join(filter(None, [name, row["where"]]))} for row in against]
-    return rows
+        wanted = {(number.quantity, number.scope) for number in part.pairs.numbers.values()}
+        names = [
+            dict.fromkeys(row.method for row in of_run if (row.quantity, row.scope) in wanted)
+            for of_run in rows.values()
+        ]
+        for name in (name for name in names[0] if all(name in others for others in names)):
+            alike = [
+                row._replace(method=run, artefact=f"{run}/{row.artefact}")
+                for run, of_run in rows.items()
+                for row in select(of_run, method=name)
+            ]
+            compared_pairs = compared(alike, replace(part.pairs, ranked=False))
+            entries += [{**entry, "where": ", ".join(filter(None, [name, entry["where"]]))} for entry in compared_pairs]
+    return entries
 
 
 def winners(comparisons: Rows) -> list[str]:
     """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
-    told = []
+    lines = []
     for row in (row for row in comparisons if row["n"]):
         (low, high), first, second = row["difference_interval"], row["first"], row["second"]
         clear = low is not None and (low > 0 or high < 0)
@@ -135,9 +143,9 @@ def winners(comparisons: Rows) -> list[str]:
         who = "{} beats {}".format(*order) if clear else f"no clear winner of {first} and {second}"
         between = f", 95 % [{low:.3g}, {high:.3g}], n = {row['units']}" if low is not None else ""
         won = f"{first} wins {row['wins']} of {row['n']}, {row['ties']} tied"
-        what = ": ".join(filter(None, [row["where"], row["quantity"].replace("_", " ")]))
-        told.append(f"{what}: {who} ({first} {row['difference']:+.3g}{between}; {won})")
-    return told or ["no pairs: no two runs share a seed of the same agent or method"]
+        subject = ": ".join(filter(None, [row["where"], row["quantity"].replace("_", " ")]))
+        lines.append(f"{subject}: {who} ({first} {row['difference']:+.3g}{between}; {won})")
+    return lines or ["no pairs: no two runs share a seed of the same agent or method"]
 
 
 def common_names(tables: Sequence[Sequence[Mapping[str, Any]]], key: str = "name") -> list[str]:
@@ -147,14 +155,15 @@ def common_names(tables: Sequence[Sequence[Mapping[str, Any]]], key: str = "name
     return [name for name in names if all(any(row[key] == name for row in table) for table in others)]
 
 
-def compared_sections(runs: Runs, arrays: Curves, about: Mapping[str, Any], material: Material) -> list[Block]:
+def compared_sections(runs: Runs, arrays: Curves, comparison: Mapping[str, Any], material: Material) -> list[Block]:
     """The page's sections; of results only those that every run has.
 
-    ``about`` holds the comparison's own numbers: ``runs``, ``shared``, ``differences``, ``comparisons``; figures are
-    added to the material.
+    ``comparison`` has ``runs``, ``shared``, ``differences`` and ``comparisons``; figures are added to the material.
     """
-    results = [_result(name, part, runs, arrays, material) for name, part in PARTS.items() if name in about["shared"]]
-    return [_runs(about), _differences(about), *results, _pairs(about)]
+    results = [
+        _result(name, part, runs, arrays, material) for name, part in PARTS.items() if name in comparison["shared"]
+    ]
+    return [_runs(comparison), _differences(comparison), *results, _pairs(comparison)]
 
 
 def _result(name: str, part: Part, runs: Runs, arrays: Curves, material: Material) -> Block:
@@ -171,7 +180,7 @@ def _result(name: str, part: Part, runs: Runs, arrays: Curves, material: Materia
     return page.section(name, part.title, [], [table, *drawn])
 
 
-def _runs(about: Entry) -> Block:
+def _runs(comparison: Entry) -> Block:
     columns = [
         page.label("run", "label"),
         page.label("folder", "path"),
@@ -179,18 +188,19 @@ def _runs(about: Entry) -> Block:
         page.label("seeds", lambda run: page.listed(run["seeds"])),
         page.label("layouts", lambda run: page.listed(run["layout_seeds"])),
     ]
+    labels = [run["label"] for run in comparison["runs"]]
     text = (
-        f"Evaluated runs of {page.listed(about['domains'])}: {page.listed([run['label'] for run in about['runs']])}. "
+        f"Evaluated runs of {page.listed(comparison['domains'])}: {page.listed(labels)}. "
         "The first is the one that the others are compared with. Each run's own report has everything else."
     )
-    runs = page.table(columns, about["runs"], wrap=True, main=lambda run: bool(run is about["runs"][0]))
+    runs = page.table(columns, comparison["runs"], wrap=True, main=lambda run: bool(run is comparison["runs"][0]))
     return page.section("summary", "What is compared", [text], [runs])
 
 
-def _differences(about: Entry) -> Block:
-    names = [run["label"] for run in about["runs"]]
+def _differences(comparison: Entry) -> Block:
+    names = [run["label"] for run in comparison["runs"]]
     values = [page.label(name, lambda line, name=name: line["values"][name]) for name in names]
-    lines = about["differences"]
+    lines = comparison["differences"]
     text = (
         "Settings, seeds, data and versions that are not the same in all runs; several values are of several artefacts "
         "in one run. What is not here is the same."
@@ -225,7 +235,7 @@ def _curve(
         values = curves.values_of(agents[place], arrays[run][f"curves/{place}/{quantity}"])
         look = PALETTE[index], STYLES[index % len(STYLES)]
         lines.append(curves.Line(called, arrays[run]["curves/grid"], values, *look))
-    about, axis = QUANTITIES[quantity]
+    heading, axis = QUANTITIES[quantity]
     bounds = curves.reward_bounds(lines) if quantity == "reward" else (0.0, None)
     played = ((run, page.pick(runs[run]["agents"], "name", agent)) for run, agent, _ in drawn)
     counts = "; ".join(f"{run}, {curves.runs_of(agent)}" for run, agent in played)
@@ -235,14 +245,14 @@ def _curve(
         f"{name}: {axis}, mean over the last 100 episodes known at each step. Lines: mean over layouts and seeds; "
         f"{curves.BANDS} over them ({counts}).{more}"
     )
-    title = f"{about}: {name}"
+    title = f"{heading}: {name}"
     return Drawn(identity, title, curves.learning_curves(lines, axis, (), bounds), caption, heading=title)
 
 
-def _pairs(about: Mapping[str, Any]) -> Block:
-    first = about["runs"][0]["label"]
+def _pairs(comparison: Mapping[str, Any]) -> Block:
+    first = comparison["runs"][0]["label"]
     digits = {"length": 0, "success": 2, "near": 2, "distance, best member": 1}
-    rows = about["comparisons"]
+    rows = comparison["comparisons"]
     blocks = page.comparison_tables(
         rows, "seed, and layout, sub-goal or ladder", "layouts (or seeds of ensembles or of one layout)", digits
     )
@@ -264,9 +274,7 @@ PARTS: Mapping[str, Part] = {
         f"runs of one layout. Within {curves.NEAR} shortest paths, in short near: the share of episodes that succeeded "
         "so soon. 95 % at: median number of environment steps at which 95 of the last 100 episodes succeeded, or how "
         "many runs got there.",
-        "name",
-        itemgetter("agents"),
-        curves.against,
+        curves.PAIRS,
     ),
     "hypotheses": Part(
         "Hypotheses",
@@ -275,9 +283,7 @@ PARTS: Mapping[str, Part] = {
         [*hypotheses.SCORES, hypotheses.DISAGREE, hypotheses.SEEDS],
         "Balanced accuracy on held-out layouts of the best, mean and worst member, and the share of held-out states on "
         "which two members disagree; mean over ensemble seeds ± standard error.",
-        "name",
-        lambda metrics: [ensemble for ensemble in metrics["ensembles"] if not rooms.of_rooms([ensemble])],
-        hypotheses.against,
+        hypotheses.PAIRS,
     ),
     "rooms": Part(
         "Hypotheses against labelled ladders",
@@ -286,9 +292,7 @@ PARTS: Mapping[str, Part] = {
         rooms.UNSEEN,
         "Balanced accuracy on unseen rooms of the best, the validated, the mean and the worst member; accuracy of the "
         "best member on all rooms (the paper's Figure 3). Mean over ensemble seeds ± standard deviation.",
-        "method",
-        lambda metrics: [ensemble for ensemble in metrics["ensembles"] if rooms.of_rooms([ensemble])],
-        rooms.against,
+        rooms.PAIRS,
     ),
     "distance": Part(
         "Options on ladders",
@@ -303,8 +307,6 @@ PARTS: Mapping[str, Part] = {
         "Distance (units of position, lower is better) from where options stop to the nearest true base, mean over the "
         "ladders named: of the best, the validated, the mean and the worst member; share of the best member's "
         "executions that got to one. Mean over seeds ± standard deviation. Runs with other ladders are not alike.",
-        "method",
-        lambda metrics: metrics["distance"]["options"],
-        distance.against,
+        distance.PAIRS,
     ),
 }

@@ -13,23 +13,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.table import Table
+from rich.table import Table as Printed
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import (
     BOOTSTRAP_FROM,
     Metrics,
-    Row,
-    Rows,
     by_layout,
     ensemble_name,
     grouped,
     mean_of,
     name_apart,
-    over,
-    pairs,
-    rows_of,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import (
@@ -46,6 +41,7 @@ from hypogoal.evaluation.plots import (
     styled,
 )
 from hypogoal.evaluation.run import WINDOW, Episodes, read_episodes, read_layout
+from hypogoal.evaluation.table import Number, Pairs, Row, Table, by_fields, rows_of, select, tabulate, wide
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Work
@@ -107,9 +103,9 @@ class Run:
     @property
     def budget(self) -> int:
         """Environment steps, those of earlier stages included."""
-        about = self.config  # practice may have ended before its limit
-        own = about["ended_at" if "ended_at" in about else "steps"]
-        return int(own) + int(about.get("options_ended_at", about.get("options_steps", 0)))
+        config = self.config  # practice may have ended before its limit
+        steps = config["ended_at" if "ended_at" in config else "steps"]
+        return int(steps) + int(config.get("options_ended_at", config.get("options_steps", 0)))
 
 
 def read_run(artefact: Artefact, path: str) -> Run:
@@ -139,8 +135,8 @@ def trailing_mean(
 def curves(episodes: Episodes, grid: NDArray[np.int64], window: int = WINDOW) -> dict[str, NDArray[np.float64]]:
     """Figure 6: reward, success and length over environment steps, each float64 (G,), see :func:`trailing_mean`."""
     values = {"reward": episodes.reward, "success": episodes.succeeded, "length": episodes.length}
-    floats = {name: of.astype(np.float64) for name, of in values.items()}
-    return {name: trailing_mean(episodes.step, of, grid, window, FIRST) for name, of in floats.items()}
+    floats = {name: numbers.astype(np.float64) for name, numbers in values.items()}
+    return {name: trailing_mean(episodes.step, numbers, grid, window, FIRST) for name, numbers in floats.items()}
 
 
 def steps_to_solve(episodes: Episodes, window: int = WINDOW) -> int | None:
@@ -205,40 +201,49 @@ def group_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {name: [run for *_, run in alike] for name, alike in grouped(ordered, itemgetter(1)).items()}
 
 
-def agent_metrics(name: str, runs: Sequence[Run]) -> dict[str, Any]:
-    """Spec F5: each run's numbers and, for each number, what is said of it over runs.
+OVER_RUNS = Table({"name": "method"}, {name: Number(name, "", unit) for name, unit in UNITS.items()})
+PAIRS = Pairs("agents", {name: Number(name, higher=higher) for name, higher in HIGHER.items()})
 
-    name, kind, runs (rows of numbers), one entry per key of ``UNITS`` (see ``numbers.over``), and ``steps_to_95``: how
-    many of the runs reached it, and the median over all runs, None where half did not.
+
+def rows_of_run(run: Run, name: str) -> Iterator[Row]:
+    """Spec F5: what is said of one trained agent at the end of its training."""
+    shortest = run.layout.get("shortest_path")
+    numbers = {"steps": run.budget, **run_numbers(run.episodes, shortest), "shortest_path": shortest}
+    return rows_of(numbers, **_place(run, name))
+
+
+def _place(run: Run, name: str) -> dict[str, Any]:
+    return {"method": name, "layout": run.layout["layout_seed"], "seed": run.seed, "artefact": run.path}
+
+
+def agents_table(rows: Sequence[Row], groups: Mapping[str, Sequence[Run]]) -> list[dict[str, Any]]:
+    """Spec F5: of every agent each run's numbers and, for each number, what is said of it over runs.
+
+    name, kind, runs, an entry per key of ``UNITS`` (see ``numbers.over``), and ``steps_to_95``: how many of the runs
+    reached it, and the median over all runs, None where half did not.
     """
-    rows = [
-        {
-            "path": run.path,
-            "seed": run.seed,
-            "layout_seed": run.layout["layout_seed"],
-            "shortest_path": run.layout.get("shortest_path"),
-            **{key: run.layout[key] for key in ("layouts",) if key in run.layout},
-            "steps": run.budget,
-            **run_numbers(run.episodes, run.layout.get("shortest_path")),
-        }
-        for run in runs
-    ]
-    layouts = [row["layout_seed"] for row in rows]
-    metrics: dict[str, Any] = {"name": name, "kind": runs[0].kind, "runs": rows}
-    for key, unit in UNITS.items():
-        metrics[key] = over([row[key] for row in rows], unit, name, key, layouts=layouts)
-    reached = [np.inf if row["steps_to_95"] is None else float(row["steps_to_95"]) for row in rows]
-    median = float(np.quantile(reached, 0.5, method="higher"))
-    count, unit = int(np.isfinite(reached).sum()), "environment steps"
-    about = {"reached": count, "median": median if np.isfinite(median) else None, "n": len(rows), "unit": unit}
-    return {**metrics, "steps_to_95": about}
+    rows = select(rows, method=tuple(groups), scope="", step="", member="")
+    by_agent = by_fields(rows, "method")
+    table = tabulate(rows, OVER_RUNS)
+    for entry in table:
+        runs = wide(by_agent[entry["name"],], path="artefact", seed="seed", layout_seed="layout")
+        for run, source in zip(runs, groups[entry["name"]], strict=True):
+            run |= {"layouts": source.layout["layouts"]} if "layouts" in source.layout else {}
+        reached = [math.inf if math.isnan(run["steps_to_95"]) else float(run["steps_to_95"]) for run in runs]
+        median = float(np.quantile(reached, 0.5, method="higher"))
+        count, unit = int(np.isfinite(reached).sum()), "environment steps"
+        solved_at = {"reached": count, "median": median if np.isfinite(median) else None, "n": len(runs), "unit": unit}
+        entry |= {"kind": groups[entry["name"]][0].kind, "runs": runs, "steps_to_95": solved_at}
+    return table
 
 
 def agent_curves(runs: Sequence[Run], grid: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
     """Figure 6: reward, success and length of every run on the common grid, each (R, G); NaN beyond a run's budget."""
-    found = [curves(run.episodes, grid) for run in runs]
+    drawn = [curves(run.episodes, grid) for run in runs]
     ends = np.array([run.budget for run in runs])[:, None]
-    return {key: np.where(grid <= ends, np.stack([of[key] for of in found]), np.nan) for key in found[0]}
+    return {
+        key: np.where(grid <= ends, np.stack([by_quantity[key] for by_quantity in drawn]), np.nan) for key in drawn[0]
+    }
 
 
 def common_grid(runs: Sequence[Run], points: int = 151) -> NDArray[np.int64]:
@@ -246,48 +251,40 @@ def common_grid(runs: Sequence[Run], points: int = 151) -> NDArray[np.int64]:
     return np.linspace(0, max(run.budget for run in runs), points).round().astype(np.int64)
 
 
-def numbers(work: Work) -> dict[str, Any]:
-    """Spec F5: every agent, and how hard its layouts are; Figure 6's curves go to the arrays.
+def rows(work: Work) -> Iterator[Row]:
+    """Every run at its end, and its curves; random play on each layout.
 
-    ``curves/grid`` and ``curves/<agent's index>/{reward,success,length}``, float (runs, grid).
+    Figure 6's curves go to the arrays, too: ``curves/grid`` and ``curves/<agent's index>/{reward,success,length}``,
+    float (runs, grid).
     """
-    runs = [read_run(artefact, work.contents.name(artefact)) for artefact in work.contents.agents]
-    groups = group_runs(runs)
-    if runs:
-        grid = work.arrays["curves/grid"] = common_grid(runs)
-        for index, same in enumerate(groups.values()):
-            for key, values in agent_curves(same, grid).items():
-                work.arrays[f"curves/{index}/{key}"] = values
-    layouts = {(run.layout["layout_seed"], run.layout.get("layouts", "")): dict(run.layout) for run in runs}
-    agents = [agent_metrics(name, same) for name, same in groups.items()]
-    return {"agents": agents, "layouts": [layouts[seed] for seed in sorted(layouts)]}
-
-
-def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
-    """Every run at its end, and its curves; random play on each layout."""
-    for index, agent in enumerate(metrics["agents"]):
-        for place, run in enumerate(agent["runs"]):
-            about = {"method": agent["name"], "layout": run["layout_seed"], "seed": run["seed"]}
-            about["artefact"] = run["path"]
-            numbers = {key: run[key] for key in run if key not in ("path", "seed", "layout_seed", "shortest_path")}
-            yield from rows_of({**numbers, "shortest_path": run["shortest_path"]}, **about)
-            for quantity in ("reward", "success", "length") if "curves/grid" in arrays else ():
-                values = arrays[f"curves/{index}/{quantity}"][place].tolist()
-                for step, value in zip(arrays["curves/grid"][()].tolist(), values, strict=True):
-                    yield from rows_of({quantity: value}, step=step, **about)
-    for layout in metrics["layouts"]:
+    every = [run for runs in work.agents.values() for run in runs]
+    grid = common_grid(every) if every else np.zeros(0, np.int64)
+    if every:
+        work.arrays["curves/grid"] = grid
+    for index, (name, runs) in enumerate(work.agents.items()):
+        drawn = agent_curves(runs, grid)
+        for quantity, values in drawn.items():
+            work.arrays[f"curves/{index}/{quantity}"] = values
+        for number, run in enumerate(runs):
+            yield from rows_of_run(run, name)
+            for quantity, values in drawn.items():
+                for step, value in zip(grid.tolist(), values[number].tolist(), strict=True):
+                    yield Row(quantity, value, **_place(run, name), step=step)
+    for layout in layouts_of(every):
         where = "" if "layouts" in layout else layout["layout_seed"]
         yield from rows_of({"random_success": layout["random_success"]}, layout=where)
 
 
-def against(agents: Sequence[Entry]) -> Rows:
-    """Spec F5: the first agent with each other over runs alike in layout and seed; units are layouts."""
-    runs = [(agent["name"], (layout_of(run), run["seed"]), run) for agent in agents for run in agent["runs"]]
-    rows: Rows = []
-    for quantity, higher in HIGHER.items():
-        measured = [(name, alike, run[quantity]) for name, alike, run in runs]
-        rows += pairs(measured, quantity, higher=higher, layouts=True)
-    return rows
+def layouts_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """The layouts that runs are of, and how hard they are, each once."""
+    layouts = {(run.layout["layout_seed"], run.layout.get("layouts", "")): dict(run.layout) for run in runs}
+    return [layouts[seed] for seed in sorted(layouts)]
+
+
+def view(work: Work) -> dict[str, Any]:
+    """Every agent, and how hard its layouts are."""
+    every = [run for runs in work.agents.values() for run in runs]
+    return {"agents": agents_table(work.rows, work.agents), "layouts": layouts_of(every)}
 
 
 def layout_of(facts: Entry) -> int | str:
@@ -339,7 +336,7 @@ INTERVALS = (
 )
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Metrics) -> list[Printed]:
     """Every agent's headline numbers, mean over runs; also where there is nothing at all."""
     if not metrics["agents"] and (metrics["rooms"] or metrics["hypotheses"] or metrics["distance"]["options"]):
         return []
@@ -357,7 +354,7 @@ def sections(material: Material) -> list[Block]:
 def summary_section(material: Material) -> Block:
     """What was asked, what came out."""
     metrics = material.metrics
-    asked = (
+    question = (
         "The question: each sub-goal is known from one context. Each member of an ensemble is a hypothesis about it "
         "and becomes an option. Does a policy over all these options solve layouts that no data came from, and does it "
         "choose the hypotheses that are true there?"
@@ -373,7 +370,7 @@ def summary_section(material: Material) -> Block:
         "the last 100 episodes succeeded, or how many runs got there; steps of train-options count.",
     )
     drawn = [page.shown(material, figure) for figure in figures(material)]
-    row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": asked}
+    row = {"kind": "row", "blocks": [*material.films, *drawn], "caption": question}
     blocks = [row, headline] if drawn else []
     return page.section("summary", "Summary", _answers(material), blocks, metrics["missing"])
 
@@ -393,7 +390,7 @@ def _answers(material: Material) -> list[str]:
         if len(shown) == 1:
             text += "".join(f" {_briefly(other)}" for other in material.metrics["agents"] if other is not agent)
         for entry in (entry for entry in material.metrics["choosing"] if entry["name"] == agent["name"]):
-            solved = [page.percent(one["success"]["mean"]) for one in (entry, entry["uniform"])]
+            solved = [page.percent(numbers["success"]["mean"]) for numbers in (entry, entry["uniform"])]
             form = " Without further training it solves {}; uniform-random choice among its options {}."
             text += form.format(*solved)
         if len(agent["runs"]) < SEVERAL and len(shown) == 1:
@@ -416,8 +413,8 @@ def _achieved(agent: Mapping[str, Any], name: str) -> str:
 def _briefly(agent: Entry) -> str:
     """The same of another agent."""
     success, steps = agent["success"]["mean"], page.fixed(agent["length"]["mean"], 0)
-    told = "no episode ended" if success is None else f"{page.percent(success)}, {steps} steps"
-    return f"{agent['name'][0].upper()}{agent['name'][1:]}: {told}."
+    outcome = "no episode ended" if success is None else f"{page.percent(success)}, {steps} steps"
+    return f"{agent['name'][0].upper()}{agent['name'][1:]}: {outcome}."
 
 
 def _episodes(agent: Mapping[str, Any]) -> str:
@@ -535,14 +532,14 @@ def values_of(agent: Entry, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _draw_curve(axes: Axes, line: Line) -> None:
-    steps, known = line.steps / 1000, np.ma.masked_invalid(line.values)
-    mean = known.mean(0).filled(np.nan)
+    steps, defined = line.steps / 1000, np.ma.masked_invalid(line.values)
+    mean = defined.mean(0).filled(np.nan)
     look: dict[str, Any] = {"color": line.colour, "linestyle": line.style}
     axes.plot(steps, mean, linewidth=1.6, label=line.name, **look)
-    if len(known) >= BOOTSTRAP_FROM:
-        error = known.std(0, ddof=1) / np.sqrt(known.count(0))
+    if len(defined) >= BOOTSTRAP_FROM:
+        error = defined.std(0, ddof=1) / np.sqrt(defined.count(0))
         axes.fill_between(steps, mean - error, mean + error, color=line.colour, alpha=0.18, linewidth=0)
-    elif len(known) > 1:
+    elif len(defined) > 1:
         axes.plot(steps, line.values.T, linewidth=0.6, alpha=0.5, **look)
 
 
@@ -558,10 +555,10 @@ def which(agent: Entry, entries: Sequence[Entry]) -> str:
 
 
 QUESTION = Question(
-    numbers=numbers,
-    missing=missing,
     rows=rows,
-    pairs=lambda metrics: {"agents": against(metrics["agents"])},
+    view=view,
+    missing=missing,
+    pairs=PAIRS,
     summary=summary,
     sections=sections,
     figures=figures,

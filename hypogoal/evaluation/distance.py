@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -12,17 +12,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from rich.table import Table
+from rich.table import Table as Printed
 
-from hypogoal.core.artefacts import Artefact, open_artefact
+from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.own_code import UsersCode, as_number
 from hypogoal.domains.base import Domain, installed_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.numbers import (
     ORACLE,
     Metrics,
-    Row,
-    Rows,
     by_groups,
     by_method,
     ensemble_name,
@@ -33,15 +31,25 @@ from hypogoal.evaluation.numbers import (
     methods_lacking,
     name_apart,
     over,
-    pairs_by_groups,
-    ranked,
-    rows_of_members,
 )
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, INK, METHOD_COLOURS, ORANGE, PURPLE, SKY, WIDTH, drawing, styled
-from hypogoal.evaluation.rooms import CELL, WHICH, group_name, of_rooms
+from hypogoal.evaluation.rooms import VALIDATION, group_name
 from hypogoal.evaluation.run import LAST, Executions, read_executions, read_terminations, takes, thresholds_of, within
+from hypogoal.evaluation.table import (
+    BEST,
+    VALIDATED,
+    WORST,
+    Number,
+    Pairs,
+    Row,
+    by_fields,
+    per_run,
+    rows_of,
+    select,
+    with_members,
+)
 from hypogoal.hypotheses.scores import most_and_least
 
 if TYPE_CHECKING:
@@ -51,7 +59,14 @@ INSIDE = 300  # the distance of an execution that begins inside its own terminat
 NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
 HIT, MISS, BEGAN_INSIDE = range(3)  # what became of an execution
 SHARES = {"reached_base": "at base", "inside_at_start": "inside", "timed_out": "timed out", "died": "died"}
-_NAMES = (*WHICH, "executions_deviation", *SHARES)
+PICKED = {"best": BEST, "validated": VALIDATED, "mean": "mean", "worst": WORST}
+NUMBERS = {
+    **{which: Number("distance", "", "units of position", member) for which, member in PICKED.items()},
+    "executions_deviation": Number("executions_deviation", "", "units of position", BEST),
+    **{share: Number(share, "", "share of executions", BEST) for share in SHARES},
+}
+OF_OPTIONS = ("executions", "distance", "executions_deviation", "duration", *SHARES, "threshold")
+QUANTITIES = (*OF_OPTIONS, BEST, WORST, VALIDATED)
 NOT_A_METHOD = frozenset({"start", "domain_config", "termination", "members"})  # settings said elsewhere
 ROOMS_SHOWN = 3
 GAP, TITLE = 0.08, 0.24  # inches, between pictures and above each
@@ -103,76 +118,86 @@ def option_numbers(executions: Executions, *, never_offered: bool = False) -> di
     }
 
 
-def ladder_numbers(
-    executions: Executions, sub_goals: Sequence[str], members: int, validated: Mapping[str, int | None], *, masked: bool
-) -> list[dict[str, Any]]:
+def rows_of_ladder(
+    executions: Executions,
+    sub_goals: Sequence[str],
+    members: int,
+    validated: Mapping[str, int | None],
+    *,
+    masked: bool,
+    thresholds: NDArray[np.float64] | None = None,
+    **place: Any,
+) -> Iterator[Row]:
     """Spec F3: one options artefact, which was trained from one start (a ladder), on G sub-goals with K members each.
 
-    Per sub-goal ``options`` (a row per member) and which member is ``best`` (the least mean distance), ``worst`` and
-    ``validated`` (the one that validation rooms pick); None where there is none. ``masked``: options that would begin
-    inside their own termination set were not offered (Spec D6).
+    Per sub-goal each member's numbers, with its threshold (of (G*K,)), and which member is the best (the least mean
+    distance), the worst, and the one that validation rooms pick. ``masked``: options that would begin inside their own
+    termination set were not offered (Spec D6).
     """
-    rows = []
     masked = masked and len(executions.step) > 0
     for index, sub_goal in enumerate(sub_goals):
-        options = [
-            {"member": member, "option": option, **option_numbers(executions.of(option), never_offered=masked)}
-            for member, option in enumerate(range(index * members, (index + 1) * members))
-        ]
-        worst, best = most_and_least(np.array([option["distance"] for option in options]))
-        picked = {"best": best, "worst": worst, "validated": validated.get(sub_goal)}
-        rows.append({"sub_goal": sub_goal, "options": options, **picked})
-    return rows
+        distances = []
+        for member, option in enumerate(range(index * members, (index + 1) * members)):
+            numbers = option_numbers(executions.of(option), never_offered=masked)
+            numbers |= {} if thresholds is None else {"threshold": thresholds[option].item()}
+            yield from rows_of(numbers, **place, sub_goal=sub_goal, member=member)
+            distances.append(numbers["distance"])
+        worst, best = most_and_least(np.array(distances))
+        picked = {BEST: best, WORST: worst, VALIDATED: validated.get(sub_goal)}
+        yield from rows_of(picked, **place, sub_goal=sub_goal)
 
 
-def distance_table(rows: Sequence[Mapping[str, Any]], ladders: Sequence[str]) -> list[dict[str, Any]]:
+def _of_options(rows: Iterable[Row]) -> list[Row]:
+    return [row for row in select(rows, scope="", quantity=QUANTITIES) if row.ladder]
+
+
+def options_of(rows: Iterable[Row]) -> list[dict[str, Any]]:
+    """Of each options artefact and sub-goal its ``options``, and which member is ``best``, ``worst``, ``validated``."""
+    names = {"method": "method", "groups": "N", "ladder": "ladder", "seed": "seed", "sub_goal": "sub_goal"}
+    entries = with_members(_of_options(rows), path="artefact", **names)
+    before: dict[str, int] = {}  # options of the artefact's earlier sub-goals
+    for entry in entries:
+        entry["options"] = entry.pop("members")
+        for option in entry["options"]:
+            option["option"] = before.get(entry["path"], 0) + option["member"]
+        before[entry["path"]] = before.get(entry["path"], 0) + len(entry["options"])
+        for name, quantity in {"best": BEST, "worst": WORST, "validated": VALIDATED}.items():
+            entry[name] = None if math.isnan(entry[quantity]) else int(entry[quantity])
+            del entry[quantity]
+    return entries
+
+
+def distance_table(rows: Sequence[Row], ladders: Sequence[str]) -> list[dict[str, Any]]:
     """Spec F3, Figure 4: per method and N distances over seeds, each seed's mean over the run's ladders first.
 
-    Of each artefact it takes method, groups, ladder, seed and a row of :func:`ladder_numbers`. Told are the distance of
-    the best, validated, mean and worst member and the best member's shares. A seed that lacks one of the ladders is
-    left out, so that nothing is compared over unlike ladders; ``each_seed`` has what the others came to, the best
-    member's. Artefacts alike in all of this count each for itself.
+    Entries have the distance of the best, validated, mean and worst member and the best member's shares. A seed that
+    lacks one of the ladders is left out, so that nothing is compared over unlike ladders; ``each_seed`` has what the
+    others came to, the best member's. Artefacts alike in all of this count each for itself.
     """
     table = []
-    cells = grouped(rows, itemgetter(*CELL))
+    cells = by_fields(_of_options(rows), "method", "N", "sub_goal")
     for key in sorted(cells, key=by_method):
-        numbers: dict[tuple[tuple[int, int], str], dict[str, float]] = {}
-        for row in cells[key]:  # of one seed there may be several ensembles' options
-            before = sum((seed, ladder) == (row["seed"], row["ladder"]) for (seed, _), ladder in numbers)
-            numbers[(row["seed"], before), row["ladder"]] = _numbers(row)
-        about, seeds = dict(zip(CELL, key, strict=True)), sorted({seed for seed, _ in numbers})
-        whole = [seed for seed in seeds if all((seed, ladder) in numbers for ladder in ladders)]
-        means = [
-            {name: float(np.mean([numbers[seed, ladder][name] for ladder in ladders])) for name in _NAMES}
-            for seed in whole
-        ]
-        incomplete = [seed[0] for seed in seeds if seed not in whole]
-        about |= {"ladders": list(ladders), "seeds": len(whole), "incomplete_seeds": incomplete}
-        about["each_seed"] = [mean["best"] for mean in means]
-        table.append({**about, **_over_seeds(means, *map(str, key))})
+        entry: dict[str, Any] = dict(zip(("method", "groups", "sub_goal"), key, strict=True))
+        numbers = {name: _of_ladders(cells[key], number) for name, number in NUMBERS.items()}
+        seeds = sorted({seed for seed, _ in numbers["best"]})
+        whole = [seed for seed in seeds if all((seed, ladder) in numbers["best"] for ladder in ladders)]
+        incomplete = [seed for seed, before in seeds if (seed, before) not in whole]
+        entry |= {"ladders": list(ladders), "seeds": len(whole), "incomplete_seeds": incomplete}
+        for name, number in NUMBERS.items():
+            means = [float(np.mean([numbers[name][seed, ladder] for ladder in ladders])) for seed in whole]
+            entry |= {"each_seed": means} if name == "best" else {}
+            entry[name] = over(means, number.unit, "distance", *map(str, key), name, deviation=True)
+        table.append(entry)
     return table
 
 
-def _numbers(row: Entry) -> dict[str, float]:
-    """One artefact's numbers by the names in ``_NAMES``: distances, and of the best member the rest."""
-    options = row["options"]
-    distances = [value for option in options if (value := option["distance"]) is not None and not np.isnan(value)]
-    best = {} if row["best"] is None else options[row["best"]]
-    return {
-        "best": best.get("distance", math.nan),
-        "validated": math.nan if row["validated"] is None else options[row["validated"]]["distance"],
-        "mean": mean_of(distances),
-        "worst": max(distances, default=math.nan),
-        **{name: best.get(name, math.nan) for name in ("executions_deviation", *SHARES)},
-    }
-
-
-def _over_seeds(rows: Sequence[Mapping[str, float]], *names: str) -> dict[str, Any]:
-    units = dict.fromkeys(_NAMES, "units of position") | dict.fromkeys(SHARES, "share of executions")
-    return {
-        name: over([row[name] for row in rows], units[name], "distance", *names, name, deviation=True)
-        for name in _NAMES
-    }
+def _of_ladders(rows: Sequence[Row], number: Number) -> dict[tuple[tuple[int, int], str], float]:
+    """A number by seed and ladder; several artefacts with the same seed and ladder are counted."""
+    values: dict[tuple[tuple[int, int], str], float] = {}
+    for row, value in per_run(rows, number):
+        before = sum((seed, ladder) == (row.seed, row.ladder) for (seed, _), ladder in values)
+        values[(int(row.seed), before), row.ladder] = value
+    return values
 
 
 def ladder_names(
@@ -180,10 +205,10 @@ def ladder_names(
 ) -> list[str]:
     """Names of n options artefacts by their ensemble's method; where their own settings differ at one N, with those."""
     names = list(methods)
-    told = [{key: value for key, value in config.items() if key not in NOT_A_METHOD} for config in configs]
-    for here in grouped(range(len(names)), lambda index: groups[index]).values():
-        apart = name_apart([methods[index] for index in here], [told[index] for index in here])
-        for index, name in zip(here, apart, strict=True):
+    settings = [{key: value for key, value in config.items() if key not in NOT_A_METHOD} for config in configs]
+    for alike in grouped(range(len(names)), lambda index: groups[index]).values():
+        apart = name_apart([methods[index] for index in alike], [settings[index] for index in alike])
+        for index, name in zip(alike, apart, strict=True):
             names[index] = name
     return names
 
@@ -197,59 +222,62 @@ def rooms_shown(where: Sequence[NDArray[np.int64]], of_ladder: Sequence[int] = (
     return [*of_ladder, *(int(room) for room in often if room not in of_ladder)][: max(ROOMS_SHOWN, len(of_ladder))]
 
 
-def numbers(work: Work) -> dict[str, Any]:
-    """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
-
-    ``options``: a row per artefact and sub-goal; ``over_ladders``: over seeds; ``shown``: what Figure 5 is drawn of,
-    for each ladder and N the best members of the first seed, whose stops are in the arrays.
-    """
-    found, executions, options = work.contents, {}, []
-    for artefact, (validated, about) in zip(found.ladders, _named(work), strict=True):
-        path = found.name(artefact)
-        executions[path] = read_executions(artefact.path / "executions.csv")
+def rows(work: Work) -> Iterator[Row]:
+    """Spec F3: every member's option on every ladder: where its executions stopped; overlays go to the arrays."""
+    for artefact, (validated, place) in zip(work.contents.ladders, _named(work), strict=True):
+        path, config = work.contents.name(artefact), artefact.config
+        executions = read_executions(artefact.path / "executions.csv")
         if "terminations.h5" in artefact.manifest["files"]:
             for option, states in read_terminations(artefact.path / "terminations.h5").items():
                 work.arrays.create_dataset(f"terminations/{path}/{option}", data=overlay(states), compression="gzip")
-        about = {"path": path, "ladder": artefact.config["start"], "seed": artefact.seed, **about}
-        learned, thresholds = rows_of_ladder(artefact, executions[path], validated), thresholds_of(artefact)
-        for option in (option for row in learned for option in row["options"]):
-            option["threshold"] = thresholds[option["option"]].item()
-        options += [{**about, **row} for row in learned]
+        more: dict[str, Any] = {"masked": config["mask_reached"], "thresholds": thresholds_of(artefact)}
+        more |= {**place, "ladder": config["start"], "seed": artefact.seed, "artefact": path}
+        yield from rows_of_ladder(executions, config["sub_goals"], config["members"], validated, **more)
         work.progress.advance()
-    names = {artefact.config["domain"] for artefact in found.ladders}
+
+
+def view(work: Work) -> dict[str, Any]:
+    """Spec F3, F4: where the options of each ladder stopped, and how near that is to a true base.
+
+    ``options``: an entry per artefact and sub-goal; ``over_ladders``: over seeds; ``shown``: what Figure 5 is drawn of,
+    for each ladder and N the best members of the first seed, whose stops are in the arrays.
+    """
+    contents = work.contents
+    artefacts = {contents.name(artefact): artefact for artefact in contents.ladders}
+    options = options_of(work.rows)
+    for entry in options:
+        artefact = artefacts[entry["path"]]
+        source = open_artefact(artefact.input("ensemble"), "ensemble") if takes(artefact) else None
+        entry["ensemble"] = source and within(contents, source)
+    names = {artefact.config["domain"] for artefact in contents.ladders}
     domain = installed_domain(names.pop()) if len(names) == 1 else None
-    used = {row["ladder"] for row in options}
+    used = {entry["ladder"] for entry in options}
     starts = [start for start in (domain.starts if domain else ()) if start in used]
     ladders = [*starts, *sorted(used - set(starts))]
+    executions = {path: read_executions(artefact.path / "executions.csv") for path, artefact in artefacts.items()}
     stops = show_stops(options, ladders, executions, domain, work.arrays)
-    return {"distance": {"options": options, "over_ladders": distance_table(options, ladders), "shown": stops}}
-
-
-def rows_of_ladder(
-    artefact: Artefact, executions: Executions, validated: Mapping[str, int | None]
-) -> list[dict[str, Any]]:
-    """:func:`ladder_numbers` of an options artefact."""
-    config = artefact.config
-    return ladder_numbers(executions, config["sub_goals"], config["members"], validated, masked=config["mask_reached"])
+    return {"distance": {"options": options, "over_ladders": distance_table(work.rows, ladders), "shown": stops}}
 
 
 def _named(work: Work) -> list[tuple[dict[str, int | None], dict[str, Any]]]:
     """Of each ladder's options the member that validation chooses, by sub-goal, and their ensemble's method and N."""
-    ensembles = {ensemble["path"]: ensemble for ensemble in work.ensembles}
+    picked = by_fields(select(work.rows, quantity=VALIDATED, scope=VALIDATION), "artefact")
+    methods = {row.artefact: row.method for row in select(work.rows, scope="unseen")}
     validated: list[dict[str, int | None]] = []
-    about: list[dict[str, Any]] = []
+    places: list[tuple[str, int | None]] = []
     for artefact in work.contents.ladders:
         source = open_artefact(artefact.input("ensemble"), "ensemble")
-        path = within(work.contents, source)
-        ensemble = ensembles.get(path or "", {})
-        method = ensemble.get("method", ensemble_name(source.config))
-        learned = {"method": method, "groups": groups_of(source.config), "ensemble": path}
-        goals = [goal for _, goal in of_rooms([{"sub_goals": (), **ensemble}])] if takes(artefact) else []
-        about.append(learned if takes(artefact) else {"method": ORACLE, "groups": None, "ensemble": None})
-        validated.append({goal["sub_goal"]: goal["rooms"]["validated"]["member"] for goal in goals})
+        path = within(work.contents, source) or ""
+        learned = takes(artefact)
+        method = methods.get(path, ensemble_name(source.config))
+        places.append((method, groups_of(source.config)) if learned else (ORACLE, None))
+        rows = picked.get((path,), []) if learned else []
+        validated.append({row.sub_goal: None if math.isnan(row.value) else int(row.value) for row in rows})
     configs = [artefact.config for artefact in work.contents.ladders]
-    names = ladder_names([of["method"] for of in about], [of["groups"] for of in about], configs)
-    return list(zip(validated, [{**of, "method": name} for of, name in zip(about, names, strict=True)], strict=True))
+    groups = [number for _, number in places]
+    names = ladder_names([method for method, _ in places], groups, configs)
+    named = [{"method": name, "N": number} for name, number in zip(names, groups, strict=True)]
+    return list(zip(validated, named, strict=True))
 
 
 def show_stops(
@@ -261,7 +289,7 @@ def show_stops(
 ) -> list[dict[str, Any]]:
     """Figure 5's material: for each ladder and N the best members' stops of the first seed, and pictures of the rooms.
 
-    Rows are those of :func:`ladder_numbers` with path (by which ``executions`` are), method, groups, ladder and seed.
+    Rows are those of :func:`options_of`; ``executions`` are by their paths.
     ``stops/<path>/<option>`` and ``pictures/<room>`` are written into ``arrays``. Per figure: ladder, groups, seed,
     rooms and columns; none where the domain has no pictures.
     """
@@ -271,9 +299,11 @@ def show_stops(
     numbers: list[int | None] = [groups for groups in by_groups(rows) if groups is not None] or [None]
     shown = []
     for ladder, groups in product(ladders, numbers):
-        here = [row for row in rows if row["ladder"] == ladder and row["seed"] == first and row["best"] is not None]
+        candidates = [
+            row for row in rows if row["ladder"] == ladder and row["seed"] == first and row["best"] is not None
+        ]
         columns, where = [], []
-        for row in sorted(here, key=lambda row: method_rank(row["method"])):
+        for row in sorted(candidates, key=lambda row: method_rank(row["method"])):
             if row["groups"] == groups or row["method"].startswith(ORACLE):
                 best = row["options"][row["best"]]
                 stops = executions[row["path"]].of(best["option"])
@@ -281,8 +311,8 @@ def show_stops(
                 columns.append({key: row[key] for key in ("path", "method", "sub_goal")} | best)
                 where.append(stops.room)
         if columns:
-            about: dict[str, Any] = {"ladder": ladder, "groups": groups, "seed": first}
-            shown.append({**about, "rooms": rooms_shown(where, _rooms_of(domain, ladder)), "columns": columns})
+            place: dict[str, Any] = {"ladder": ladder, "groups": groups, "seed": first}
+            shown.append({**place, "rooms": rooms_shown(where, _rooms_of(domain, ladder)), "columns": columns})
     for room in sorted({room for figure in shown for room in figure["rooms"]}):
         arrays[f"pictures/{room}"] = _picture(domain, room)
     return shown
@@ -316,13 +346,6 @@ def _write_stops(arrays: Any, path: str, option: int, executions: Executions, do
     group["fates"] = fates(executions)
 
 
-def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
-    """Every member's option on every ladder."""
-    for entry in metrics["distance"]["options"]:
-        about = {"method": entry["method"], "N": entry["groups"], "ladder": entry["ladder"], "seed": entry["seed"]}
-        yield from rows_of_members(entry["options"], **about, sub_goal=entry["sub_goal"], artefact=entry["path"])
-
-
 def missing(work: Work) -> list[str]:
     """Spec F3, F4: the options that are not there, of a run with ladders."""
     tells = "its domain tells no distance"
@@ -335,28 +358,24 @@ def missing(work: Work) -> list[str]:
     return lines if oracle else [*lines, "no options artefact with oracle terminations beside them"]
 
 
-def against(options: Sequence[Entry]) -> Rows:
-    """Spec F3: the first method against each other by how near options stop, at each N, paired by ladder and seed.
-
-    The best member is the best on the executions that are compared, of more members the better: beside it stand the one
-    that validation on the labelled rooms chooses, and the mean over members.
-
-    Options are rows of :func:`ladder_numbers` with path, method, groups, ladder and seed. Oracle terminations, which
-    have no N and no members to choose among, are left out.
-    """
-    learned = [row for row in options if not row["method"].startswith(ORACLE) and row["best"] is not None]
-
-    def distances(row: Entry) -> list[tuple[tuple[str, str, int], dict[str, float]]]:
-        return [((row["ladder"], row["sub_goal"], row["seed"]), _numbers(row))]
-
-    return pairs_by_groups(learned, distances, "distance", higher=False)
+PAIRS = Pairs(
+    "distance",
+    {
+        # The best member is the best on the executions that are compared, of more members the better.
+        f"distance, {which} member": Number("distance", member=member, higher=False)
+        for which, member in (("best", BEST), ("validated", VALIDATED), ("mean", "mean"))
+    },
+    # Oracle terminations have no N and no members to choose among.
+    lambda rows: [row for row in rows if not row.method.startswith(ORACLE)],
+    ranked=True,
+)
 
 
 def _group(entry: Entry) -> str:
     return "true sub-goal" if entry["groups"] is None else f"N={entry['groups']}"
 
 
-STOPPED = tuple(page.number(which, which, page.deviation, 1) for which in WHICH)
+STOPPED = tuple(page.number(which, which, page.deviation, 1) for which in PICKED)
 SHARED = tuple(page.number(title, f"{share}.mean", page.percent) for share, title in SHARES.items())
 SEEDS = page.number("seeds", "seeds")
 OVER_LADDERS = (
@@ -369,7 +388,7 @@ OVER_LADDERS = (
 )
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Metrics) -> list[Printed]:
     """Figure 4 by method and N."""
     rows = metrics["distance"]["over_ladders"] if metrics["distance"]["options"] else []
     title = "Distance from a true base where options stop, mean over ladders"
@@ -379,13 +398,13 @@ def summary(metrics: Metrics) -> list[Table]:
 
 def sections(material: Material) -> list[Block]:
     """Figures 4 and 5, of a run with ladders."""
-    there = material.metrics["distance"]["options"]
-    return [distance_section(material), stops_section(material)] if there else []
+    options = material.metrics["distance"]["options"]
+    return [distance_section(material), stops_section(material)] if options else []
 
 
 def distance_section(material: Material) -> Block:
     """Figure 4: how far from a true base options stop."""
-    found = material.metrics["distance"]
+    distance = material.metrics["distance"]
     drawn = page.shown(material, _bars(material))
     text = (
         "Each member's option is learned from the top of a ladder. Its distance is how far, on a way through the "
@@ -394,7 +413,7 @@ def distance_section(material: Material) -> Block:
         "with mean, worst and validated member beside it; then the mean over ladders. Oracle termination ends "
         "options at the true base: what is left to it is how well policies were learned."
     )
-    rows = found["over_ladders"]
+    rows = distance["over_ladders"]
     short = [f"{entry['method']}, {_group(entry)}" for entry in rows if entry["incomplete_seeds"]]
     left = f" Seeds that lack a ladder are left out: {'; '.join(short)}." if short else ""
     blocks = [
@@ -427,17 +446,17 @@ def figures(material: Material) -> list[Drawn]:
 
 
 def _bars(material: Material) -> Drawn:
-    found, name = material.metrics["distance"], "Figure 4: distance to the nearest true base"
-    rows = [entry for entry in _ordered(found["over_ladders"]) if entry["best"]["mean"] is not None]
-    name_of, bars = page.method_of(found["options"]), []
+    distance, name = material.metrics["distance"], "Figure 4: distance to the nearest true base"
+    rows = [entry for entry in _ordered(distance["over_ladders"]) if entry["best"]["mean"] is not None]
+    name_of, bars = page.method_of(distance["options"]), []
     for entry in rows:
         mean, wide = np.array([entry["best"][key] for key in ("mean", "standard_deviation")], float)
         each = [seed for seed in entry["each_seed"] if seed is not None]
         bars.append((name_of(entry), _group(entry), mean, wide, each))
     names = list(dict.fromkeys(name for name, *_ in bars if not name.startswith(ORACLE)))
     drawn = distance_bars(bars, names, INSIDE) if bars else None
-    seeds = sorted({row["seed"] for row in found["options"]})
-    ladders = found["over_ladders"][0]["ladders"]
+    seeds = sorted({row["seed"] for row in distance["options"]})
+    ladders = distance["over_ladders"][0]["ladders"]
     caption = (
         "Figure 4 of the paper: distance of the best member of each ladder, mean over the ladders "
         f"{page.listed(ladders)}; bars: mean over seeds ({page.listed(seeds)}), whiskers: ± one standard deviation "
@@ -462,11 +481,11 @@ def stops_section(material: Material) -> Block:
 
 
 def _stops(material: Material) -> list[Drawn]:
-    found = material.metrics["distance"]
-    if not found["shown"]:
+    distance = material.metrics["distance"]
+    if not distance["shown"]:
         nothing = "The domain has no pictures of its rooms."
         return [Drawn("figure5", "Figure 5: where executions stopped", None, missing=nothing)]
-    return [_scatter(material, figure, index) for index, figure in enumerate(found["shown"])]
+    return [_scatter(material, figure, index) for index, figure in enumerate(distance["shown"])]
 
 
 def _scatter(material: Material, figure: Entry, index: int) -> Drawn:
@@ -507,10 +526,10 @@ def distance_bars(
     with drawing(3.1, 2, handlelength=2.6) as (figure, axes):
         groups = grouped(bars, itemgetter(1))
         highest = max((mean + np.nan_to_num(deviation) for _, _, mean, deviation, _ in bars), default=1.0)
-        for place, here in enumerate(groups.values()):
-            width = min(0.26, 0.84 / len(here))
-            for index, (name, _, mean, deviation, seeds) in enumerate(here):
-                x = place + (index - (len(here) - 1) / 2) * width
+        for place, group in enumerate(groups.values()):
+            width = min(0.26, 0.84 / len(group))
+            for index, (name, _, mean, deviation, seeds) in enumerate(group):
+                x = place + (index - (len(group) - 1) / 2) * width
                 turn, method = divmod(names.index(name), len(METHOD_COLOURS)) if name in names else (0, -1)
                 colour = METHOD_COLOURS[method] if method >= 0 else GREY
                 hatch = HATCHES[turn % len(HATCHES)]
@@ -566,10 +585,10 @@ def stops_over_rooms(
 
 
 QUESTION = Question(
-    numbers=numbers,
-    missing=missing,
     rows=rows,
-    pairs=lambda metrics: {"distance": against(ranked(metrics["distance"]["options"]))},
+    view=view,
+    missing=missing,
+    pairs=PAIRS,
     summary=summary,
     sections=sections,
     figures=figures,

@@ -7,7 +7,7 @@ holds the states as data; ``templates/explorer.js`` shows those that its filters
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from hypogoal.evaluation.pictures import FULL, attribution_png, brightness, flat
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
+    from hypogoal.evaluation.table import Row
 
 MOST_STATES = 300  # over all sub-goals: the page of ten DoorKey agents has 1.2 MB, of the ladders 1.7 MB
 MOST_OF_ONE = 180  # of one sub-goal
@@ -31,10 +32,10 @@ PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 TITLE = "Explore the hypotheses"
 
 
-def look(work: Work, judgement: Judgement) -> None:
+def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     """Write one sub-goal's states to browse as ``explorer/<sub-goal>``; attributions of the first of them."""
     if judgement.number != work.browsed or judgement.split.observations.dtype != PICTURE:
-        return
+        return ()
     from hypogoal.hypotheses.deep_lift import DEEP_LIFT, attributed, method_of
 
     split, sub_goal, verdicts = judgement.split, judgement.case.sub_goal, judgement.judged.verdicts
@@ -57,6 +58,7 @@ def look(work: Work, judgement: Judgement) -> None:
     counts = {"states": len(split.labels), "shown": len(picked), "explained": len(seen)}
     reading = judgement.domain.reading if judgement.domain else ""
     work.looked["explorer"].append({"sub_goal": sub_goal, **counts, "reading": reading})
+    return ()
 
 
 def pick_to_browse(
@@ -85,26 +87,26 @@ def take_turns(order: NDArray[np.int64], groups: NDArray[np.int64]) -> NDArray[n
     groups = groups[order]
     turn = np.zeros(len(order), dtype=np.int64)
     for group in np.unique(groups):
-        here = groups == group
-        turn[here] = np.arange(here.sum())
+        inside = groups == group
+        turn[inside] = np.arange(inside.sum())
     return order[np.argsort(turn, kind="stable")]
 
 
 def explorer_section(material: Material) -> Block:
     """A browser of held-out states, with filters."""
-    found = material.metrics["explorer"]
-    source = page.pick(material.metrics["ensembles"], "path", found["ensemble"])
-    shown, states = (max(goal[key] for goal in found["sub_goals"]) for key in ("shown", "states"))
+    explored = material.metrics["explorer"]
+    source = page.pick(material.metrics["ensembles"], "path", explored["ensemble"])
+    shown, states = (max(goal[key] for goal in explored["sub_goals"]) for key in ("shown", "states"))
     text = (
-        f"Held-out states and what each member of {found['ensemble']} (seed {found['seed']}) says of them. Choose a "
-        "state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against it. Choose "
-        f"a member to see the options it became. {found['sub_goals'][0]['reading']}"
+        f"Held-out states and what each member of {explored['ensemble']} (seed {explored['seed']}) says of them. "
+        "Choose a state (arrow keys work) to see what each member goes by: orange speaks for 'reached', blue against "
+        f"it. Choose a member to see the options it became. {explored['sub_goals'][0]['reading']}"
     )
     sample = (
         f"{shown:,} of {states:,} states of a sub-goal, drawn so that every kind of outcome and every place comes up; "
         "how often one does means nothing. The page's address keeps the filters."
     )
-    goals = [_goal(material, source, goal["sub_goal"]) for goal in found["sub_goals"]]
+    goals = [_goal(material, source, goal["sub_goal"]) for goal in explored["sub_goals"]]
     places = list(dict.fromkeys(state["place"] for goal in goals for state in goal["states"] if state["place"]))
     kinds = list(dict.fromkeys(state["kind"] for goal in goals for state in goal["states"] if state["kind"]))
     errors = [("", "any"), ("none", "all right"), ("some", "some wrong"), ("all", "all wrong")]
@@ -136,7 +138,7 @@ def _goal(material: Material, source: Entry, sub_goal: str) -> dict[str, Any]:
             ],
             "options": _options(material, source["path"], sub_goal, member["member"]),
         }
-        for member in page.pick(source["sub_goals"], "sub_goal", sub_goal)["members"]
+        for member in page.pick(source["sub_goals"], "sub_goal", sub_goal)["heldout"]["members"]
     ]
     return {"name": sub_goal, "members": members, "states": _states(material, sub_goal)}
 
@@ -220,6 +222,6 @@ def _overlay(material: Material, path: str, option: int) -> str:
 
 QUESTION = Question(
     look=look,
-    numbers=lambda work: {"explorer": work.kept("explorer", work.browsed)},
+    view=lambda work: {"explorer": work.kept("explorer", work.browsed)},
     sections=lambda material: [explorer_section(material)] if material.metrics["explorer"] else [],
 )

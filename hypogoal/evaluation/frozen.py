@@ -51,8 +51,8 @@ def scores(
     ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
     """
     path = np.asarray(np.nan if shortest is None else shortest, dtype=np.float64)
-    known = np.where(np.isnan(path), np.nan, 1.0)
-    within = {name: known * (succeeded & (steps <= factor * path)) for name, factor in WITHIN.items()}
+    defined = np.where(np.isnan(path), np.nan, 1.0)
+    within = {name: defined * (succeeded & (steps <= factor * path)) for name, factor in WITHIN.items()}
     return {"success": succeeded * 1.0, **within}
 
 
@@ -75,6 +75,16 @@ class _Listener(Chooser):
         self.chooser.begin_anew()
 
 
+class Always(Chooser):
+    """Chooses one option, whatever is offered."""
+
+    def __init__(self, option: int):
+        self.option = option
+
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+        return np.full(len(ids), self.option)
+
+
 def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
     """So many episodes in each environment, begun anew; options are greedy and choices are drawn as in training.
 
@@ -83,6 +93,13 @@ def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
     episodes = episodes or max(EPISODES, STEPS // loop.engine.max_steps)
     listener = _Listener(chooser)
     begin_anew(loop, listener)
+    try:
+        return _first_episodes(loop, listener, episodes)
+    finally:
+        loop.chooser = chooser
+
+
+def _first_episodes(loop: OptionLoop, listener: _Listener, episodes: int) -> Play:
     environments = loop.engine.count
     ended = np.zeros(environments, dtype=np.int64)
     length, succeeded = np.zeros((2, environments, episodes), dtype=np.int64)
@@ -99,7 +116,6 @@ def play(loop: OptionLoop, chooser: Chooser, episodes: int = 0) -> Play:
                 length[place, ended[place]], succeeded[place, ended[place]] = steps, success
                 ended[place] += 1
         loop.recorder.episodes.clear()
-    loop.chooser = chooser
     choices = Choices(*(np.concatenate(column) for column in zip(*decisions, strict=True)))
     return Play(length, succeeded > 0, choices)
 

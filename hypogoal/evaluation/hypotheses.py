@@ -9,115 +9,80 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from rich.table import Table
+from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
-from hypogoal.evaluation.numbers import Metrics, Row, Rows, grouped, over, pairs, ranked, rows_of, rows_of_members
+from hypogoal.evaluation.numbers import Metrics, grouped
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, PALETTE, drawing
-from hypogoal.hypotheses.scores import (
-    best_mean_worst,
-    by_member,
-    mean_disagreement,
-    member_scores,
+from hypogoal.evaluation.table import (
+    Number,
+    Pairs,
+    Row,
+    Table,
+    by_fields,
+    rows_by_member,
+    rows_of,
+    select,
+    tabulate,
+    with_members,
 )
+from hypogoal.hypotheses.scores import mean_disagreement, member_scores
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
 
 WHICH = ("best", "mean", "worst")
-COMPARED = ("best", "mean")
 STATES = ("unlabelled", "heldout")
+TABLE = Table(
+    {"name": "method", "sub_goal": "sub_goal"},
+    {
+        **{which: Number("balanced_accuracy", "heldout", "balanced accuracy", which) for which in WHICH},
+        **{f"disagreement_{on}": Number("disagreement", on, "share of states", cell=(on,)) for on in STATES},
+    },
+    "ensembles",
+)
 
 
-def sub_goal_metrics(
-    sub_goal: str,
-    heldout: NDArray[np.bool_],
-    labels: NDArray[np.bool_],
-    layout_seeds: NDArray[np.int64] | None,
-    unlabelled: NDArray[np.bool_],
-    thresholds: NDArray[np.float32],
-) -> dict[str, Any]:
-    """Spec F1, F2: one sub-goal's K members by their verdicts on N held-out states and on M unlabelled ones.
-
-    Scores of every member, pooled over the layouts, which are told where they are known (N,), at its own threshold
-    (K,); best, mean and worst balanced accuracy; the mean disagreement of two members on either set of states.
-    """
-    scores, members = member_scores(heldout, labels), heldout.shape[1]
-    says_yes = unlabelled.mean(0) if len(unlabelled) else np.full(members, math.nan)
-    more = {"says_yes_unlabelled": says_yes, "threshold": thresholds.astype(np.float64)}
-    return {
-        "sub_goal": sub_goal,
-        "states": len(labels),
-        "positives": int(labels.sum()),
-        "members": [{"member": member, **row} for member, row in enumerate(by_member(scores | more))],
-        "balanced_accuracy": best_mean_worst(scores["balanced_accuracy"]),
-        "layouts": [] if layout_seeds is None else np.unique(layout_seeds).tolist(),
-        "disagreement": {"unlabelled": mean_disagreement(unlabelled), "heldout": mean_disagreement(heldout)},
-    }
+def look(work: Work, judgement: Judgement) -> Iterator[Row]:
+    """Spec F1, F2: each member on held-out states, pooled over layouts, and how much members disagree."""
+    split, judged, place = judgement.split, judgement.judged, work.place(judgement)
+    layouts = split.origins.get("layout_seed", np.zeros(0))
+    calls = judged.told.mean(0) if len(judged.told) else np.full(judged.told.shape[1], math.nan)
+    more = {"says_yes_unlabelled": calls, "threshold": judged.thresholds.astype(np.float64)}
+    yield from rows_by_member(member_scores(judged.verdicts, split.labels) | more, **place, scope="heldout")
+    counts = {"states": len(split.labels), "positives": int(split.labels.sum()), "layouts": len(np.unique(layouts))}
+    yield from rows_of(counts | {"disagreement": mean_disagreement(judged.verdicts)}, **place, scope="heldout")
+    yield from rows_of({"disagreement": mean_disagreement(judged.told)}, **place, scope="unlabelled")
 
 
-def look(work: Work, judgement: Judgement) -> None:
-    """Every member on held-out and unlabelled states."""
-    split, judged = judgement.split, judgement.judged
-    layouts, said = split.origins.get("layout_seed"), (judged.told, judged.thresholds)
-    judgement.row.update(sub_goal_metrics(judgement.case.sub_goal, judged.verdicts, split.labels, layouts, *said))
+def of_layouts(rows: Sequence[Row]) -> list[Row]:
+    """The rows of ensembles but those judged room by room, which ``rooms`` has."""
+    by_room = {row.artefact for row in rows if row.scope == "unseen"}
+    return [row for row in select(rows, scope=STATES) if row.artefact not in by_room]
 
 
-def of_layouts(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
-    """Every (ensemble, sub-goal) but those judged room by room, which ``rooms`` has."""
-    return [(ensemble, goal) for ensemble in ensembles for goal in ensemble["sub_goals"] if "rooms" not in goal]
+PAIRS = Pairs(
+    "hypotheses",
+    {f"balanced accuracy, {which} member": TABLE.numbers[which] for which in ("best", "mean")},
+    of_layouts,
+    ranked=True,
+)
 
 
-def hypotheses_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Spec F1: per kind of ensemble and sub-goal: best, mean and worst member's balanced accuracy, over seeds.
-
-    Ensembles have ``name`` and ``sub_goals`` (see :func:`sub_goal_metrics`). Those judged room by room are left out:
-    their table is ``rooms.rooms_table``.
-    """
-    table = []
-    cells = grouped(of_layouts(ensembles), lambda judged: (judged[0]["name"], judged[1]["sub_goal"]))
-    for (name, sub_goal), judged in cells.items():
-        entry: dict[str, Any] = {"name": name, "sub_goal": sub_goal, "ensembles": len(judged)}
-        for which in WHICH:
-            values = [goal["balanced_accuracy"][which] for _, goal in judged]
-            entry[which] = over(values, "balanced accuracy", name, sub_goal, which)
-        for states in STATES:
-            values = [goal["disagreement"][states] for _, goal in judged]
-            entry[f"disagreement_{states}"] = over(values, "share of states", name, sub_goal, states)
-        table.append(entry)
-    return table
-
-
-def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
-    """Every member on held-out states; on the ladders apart for rooms that no training set holds."""
-    for ensemble in metrics["ensembles"]:
-        about = {"method": ensemble.get("method", ensemble["name"]), "N": ensemble.get("groups")}
-        about |= {"seed": ensemble["seed"], "artefact": ensemble["path"]}
-        for goal in ensemble["sub_goals"]:
-            about["sub_goal"] = goal["sub_goal"]
-            scopes = {name: scope["members"] for name, scope in goal.get("rooms", {}).get("scopes", {}).items()}
-            for scope, members in {"heldout": goal["members"], **scopes}.items():
-                yield from rows_of_members(members, **about, scope=scope)
-            for states in reversed(STATES):
-                yield from rows_of({"disagreement": goal["disagreement"][states]}, **about, scope=states)
-
-
-def against(ensembles: Sequence[Entry]) -> Rows:
-    """Spec F1: the first kind of ensembles against each other by balanced accuracy on held-out layouts, paired by seed.
-
-    Rows are over all sub-goals that both have; units are seeds. Ensembles judged by room are left out.
-    """
-    found: Rows = []
-    for which in COMPARED:
-        measured = [
-            (ensemble["name"], (goal["sub_goal"], ensemble["seed"]), goal["balanced_accuracy"][which])
-            for ensemble, goal in of_layouts(ensembles)
+def view(work: Work) -> dict[str, Any]:
+    """Over seeds; and of every ensemble and sub-goal its members and other numbers, by scope."""
+    by_path = {work.contents.name(artefact): artefact for artefact in work.contents.ensembles}
+    judged = [row for row in work.rows if row.artefact in by_path]
+    names, ensembles = dict(zip(by_path, work.ensemble_names[0], strict=True)), []
+    for (path, method, groups, seed), rows in by_fields(judged, "artefact", "method", "N", "seed").items():
+        goals = [
+            {"sub_goal": sub_goal, **{entry.pop("scope"): entry for entry in with_members(of_goal, scope="scope")}}
+            for (sub_goal,), of_goal in by_fields(rows, "sub_goal").items()
         ]
-        quantity = f"balanced accuracy, {which} member"
-        found += pairs(measured, quantity)
-    return found
+        entry = {"path": path, "name": names[path], "seed": seed, "members": by_path[path].config["members"]}
+        ensembles.append(entry | {"method": method, "groups": groups, "sub_goals": goals})
+    return {"hypotheses": tabulate(of_layouts(work.rows), TABLE), "ensembles": ensembles}
 
 
 ENSEMBLE = page.label("ensemble", "name", once=True)
@@ -134,7 +99,7 @@ HYPOTHESES = (
 DISAGREE = page.number("disagree", "disagreement_heldout", page.spread, 3)
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Metrics) -> list[Printed]:
     """Balanced accuracy of the best, mean and worst member on held-out states."""
     columns = (ENSEMBLE._replace(title="method"), page.label("sub-goal", "sub_goal"), *SCORES, DISAGREE)
     title = "Balanced accuracy on held-out states: best, mean and worst member"
@@ -176,7 +141,7 @@ def hypotheses_section(material: Material) -> Block:
 
 def _has_layouts(metrics: Entry) -> bool:
     """Whether held-out states are of layouts, as collected ones are, and not only states, as imported ones."""
-    return any(goal["layouts"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
+    return any(goal["heldout"]["layouts"] for ensemble in metrics["ensembles"] for goal in ensemble["sub_goals"])
 
 
 def figures(material: Material) -> list[Drawn]:
@@ -197,7 +162,7 @@ def figures(material: Material) -> list[Drawn]:
 def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
     """Figure 3's quantity for one labelled layout: balanced accuracy on held-out layouts, by kind of ensemble.
 
-    Entries are of :func:`hypotheses_table`; where no mean in them is a number there is no figure.
+    Entries are those of ``TABLE``; there is no figure where none of their means is defined.
     """
     means = [entry[which]["mean"] for entry in entries for which in WHICH]
     lowest = min((mean for mean in means if mean is not None), default=None)
@@ -227,9 +192,8 @@ def best_mean_worst_members(entries: Sequence[Entry]) -> Figure | None:
 
 QUESTION = Question(
     look=look,
-    numbers=lambda work: {"hypotheses": hypotheses_table(work.ensembles)},
-    rows=rows,
-    pairs=lambda metrics: {"hypotheses": against(ranked(metrics["ensembles"]))},
+    view=view,
+    pairs=PAIRS,
     summary=summary,
     sections=sections,
     figures=figures,

@@ -6,9 +6,9 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,14 @@ from hypogoal.core.progress import Progress
 from hypogoal.core.workers import in_processes
 from hypogoal.dataset import Observations, States, open_dataset
 from hypogoal.domains.base import Domain, installed_domain
+from hypogoal.evaluation.numbers import ensemble_names, groups_of, method_names
 from hypogoal.evaluation.run import Contents
+from hypogoal.evaluation.table import Row
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble
 from hypogoal.hypotheses.views import positions_of
+
+if TYPE_CHECKING:
+    from hypogoal.evaluation.curves import Run
 
 # Bytes of states times members from which on more processes pay for their start (3 s): about 100 s of Montezuma's.
 SPREAD_FROM = 4e9
@@ -70,8 +75,6 @@ class Judgement:
     unlabelled: Unlabelled  # M states
     domain: Domain | None  # None where it is not installed here
     judged: Judged  # what K members say
-    # Filled by the questions: what is said of this sub-goal's members in ``ensembles``.
-    row: dict[str, Any] = field(default_factory=dict)
 
     @property
     def kinds(self) -> Sequence[str]:
@@ -126,17 +129,42 @@ class Work:
     browsed: int | None = None  # the ensemble whose states are browsed; None where there is none
     # What questions keep of the states that they were shown, by their own names.
     looked: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
-    # What is said of each; its ``sub_goals`` are the rows of ``Judgement``.
-    ensembles: list[dict[str, Any]] = field(default_factory=list)
-    metrics: dict[str, Any] = field(default_factory=dict)  # the numbers so far
+    agents: Mapping[str, Sequence[Run]] = field(default_factory=dict)  # trained ones, by name
+    rows: list[Row] = field(default_factory=list)  # the numbers so far
+    metrics: dict[str, Any] = field(default_factory=dict)  # their view so far, see ``Question.view``
+
+    def place(self, judgement: Judgement) -> dict[str, Any]:
+        """Where the numbers of a sub-goal's members stand in the table; all N are one method."""
+        artefact, by_room = self.contents.ensembles[judgement.number], "seen" in judgement.split.origins
+        names, groups = self.ensemble_names[by_room], groups_of(artefact.config) if by_room else None
+        place = {"method": names[judgement.number], "N": groups, "seed": artefact.seed}
+        return {**place, "artefact": self.contents.name(artefact), "sub_goal": judgement.case.sub_goal}
+
+    @cached_property
+    def ensemble_names(self) -> tuple[list[str], list[str]]:
+        """Names of the run's ensembles: as they are, and as methods."""
+        configs = [artefact.config for artefact in self.contents.ensembles]
+        return ensemble_names(configs), method_names(configs)
+
+    @cached_property
+    def _agent_names(self) -> dict[str, str]:
+        return {run.path: name for name, runs in self.agents.items() for run in runs}
+
+    def agent_of(self, path: str) -> str:
+        """The name of the agent whose artefact has this path."""
+        return self._agent_names[path]
+
+    def artefact(self, path: str) -> Artefact:
+        """The agent's artefact of this path in the run."""
+        return next(artefact for artefact in self.contents.agents if self.contents.name(artefact) == path)
 
     def kept(self, question: str, ensemble: int | None) -> dict[str, Any] | None:
         """What a question keeps of the one ensemble whose states it looked at; None where it looked at none."""
         if ensemble is None or not self.looked[question]:
             return None
-        source = self.ensembles[ensemble]
-        about = {"ensemble": source["path"], "seed": source["seed"], "baseline": BASELINE}
-        return {**about, "sub_goals": self.looked[question]}
+        source = self.contents.ensembles[ensemble]
+        source_facts = {"ensemble": self.contents.name(source), "seed": source.seed, "baseline": BASELINE}
+        return {**source_facts, "sub_goals": self.looked[question]}
 
 
 def cases_of(ensembles: Sequence[Artefact]) -> list[tuple[int, Case]]:
@@ -188,8 +216,8 @@ def judge(case: Case) -> Judged:
     ensemble = case.read()
     thresholds = ensemble.thresholds.numpy()
     probabilities = ensemble.predict(split.observations, positions_of(split.origins))
-    told = ensemble.predict(unlabelled.observations, unlabelled.positions)
-    return Judged(probabilities, probabilities > thresholds, told > thresholds, thresholds)
+    unlabelled_predictions = ensemble.predict(unlabelled.observations, unlabelled.positions)
+    return Judged(probabilities, probabilities > thresholds, unlabelled_predictions > thresholds, thresholds)
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,4 @@
-"""An evaluation's numbers: one table of rows, every mean, interval and comparison, and what each means (Spec F5).
+"""The statistics of an evaluation: means, intervals, pairs of runs, and the names of what is compared (Spec F5).
 
 Runs that were not made alike are never averaged: they have different names.
 """
@@ -9,7 +9,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,7 +28,6 @@ CONFIDENCE = 0.95
 # Values from which on there is a bootstrap: of 2 values it would hold in 49 % of cases, of 5 in 85 %.
 BOOTSTRAP_FROM = 8
 STUDENT = "Student's t of the mean"
-PICKED = ("best", "validated", "mean")  # members that methods are compared by
 # Settings that may differ between two runs that are averaged, or that follow from others.
 NOT_A_VARIANT = frozenset(
     {
@@ -41,37 +40,6 @@ NOT_A_VARIANT = frozenset(
 IDLE = {"single CNN": {"diversity", "diversity_weight", "schedule", "members"}, "no diversity": {"diversity_weight"}}
 METHODS = {"dbat": "D-BAT", "no diversity": "an ensemble without diversity", "single CNN": "a single CNN"}
 ORACLE = "oracle termination"
-
-
-class Row(NamedTuple):
-    """One number of ``numbers.csv`` and what it is of; empty where that is not said of it."""
-
-    quantity: str  # see ``quantities.toml``
-    value: float | int
-    method: str = ""  # the ensemble's, or the agent's name
-    sub_goal: str = ""
-    member: int | str = ""
-    scope: str = ""  # the states that it is over
-    N: int | None = None  # labelled ladder groups
-    ladder: str = ""
-    layout: int | str = ""
-    seed: int | str = ""  # of the training; ladder and layout too
-    step: int | str = ""  # environment steps after which it was so
-    artefact: str = ""  # its path within the run
-
-
-def rows_of(numbers: Mapping[str, Any], **place: Any) -> Iterable[Row]:
-    """A row for each finite number among them, all of one place."""
-    for name, value in numbers.items():
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            yield Row(name, value, **place)
-
-
-def rows_of_members(members: Iterable[Mapping[str, Any]], **place: Any) -> Iterable[Row]:
-    """A row for each number of each member, or of its option, all of one place."""
-    for member in members:
-        numbers = {name: value for name, value in member.items() if name not in ("member", "option")}
-        yield from rows_of(numbers, **place, member=member["member"])
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
@@ -114,9 +82,11 @@ def interquartile_mean(values: NDArray[np.float64], axis: int = -1) -> Any:
 
 def by_unit(values: ArrayLike, units: Sequence[Hashable]) -> NDArray[np.float64]:
     """The mean of each unit's values, (n, ...) to (U, ...), in the order in which units come; a NaN is left out."""
-    found, names = np.asarray(values, np.float64), list(dict.fromkeys(units))
-    of = np.array([[mark == unit for mark in units] for unit in names], np.float64).reshape(len(names), len(found))
-    counts, sums = np.tensordot(of, ~np.isnan(found), 1), np.tensordot(of, np.nan_to_num(found), 1)
+    numbers, names = np.asarray(values, np.float64), list(dict.fromkeys(units))
+    belongs = np.array([[mark == unit for mark in units] for unit in names], np.float64).reshape(
+        len(names), len(numbers)
+    )
+    counts, sums = np.tensordot(belongs, ~np.isnan(numbers), 1), np.tensordot(belongs, np.nan_to_num(numbers), 1)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
@@ -146,8 +116,8 @@ def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[flo
     if len(values) < BOOTSTRAP_FROM:
         return *student_interval(values), STUDENT if len(values) > 1 else "no interval"
     how: dict[str, Any] = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "method": "percentile"}
-    found = bootstrap([values], interquartile_mean, **how, vectorized=True, rng=rng).confidence_interval
-    return float(found.low), float(found.high), "bootstrap of the interquartile mean"
+    bounds = bootstrap([values], interquartile_mean, **how, vectorized=True, rng=rng).confidence_interval
+    return float(bounds.low), float(bounds.high), "bootstrap of the interquartile mean"
 
 
 def over(
@@ -161,21 +131,23 @@ def over(
     Figures 3 and 4.
     """
     defined = [index for index, value in enumerate(values) if not np.isnan(value)]
-    numbers, of = by_layout([values[index] for index in defined], [layouts[index] for index in defined if layouts])
+    numbers, unit_names = by_layout(
+        [values[index] for index in defined], [layouts[index] for index in defined if layouts]
+    )
     mean, error = mean_and_error(numbers)
     low, high, kind = interval(numbers, rng_for(0, "bootstrap", *cell))
-    found = {
+    statistics = {
         "mean": mean,
         "standard_error": error,
         "iqm": float(interquartile_mean(numbers)) if len(numbers) else math.nan,
         "interval": [low, high],
-        "interval_over": f"{of}: {kind}",
+        "interval_over": f"{unit_names}: {kind}",
         "n": len(defined),
         "unit": unit,
     }
     if deviation:
-        found["standard_deviation"] = float(numbers.std(ddof=1)) if len(numbers) > 1 else math.nan
-    return found
+        statistics["standard_deviation"] = float(numbers.std(ddof=1)) if len(numbers) > 1 else math.nan
+    return statistics
 
 
 def pairs(
@@ -184,7 +156,6 @@ def pairs(
     where: str = "",
     *,
     higher: bool = True,
-    layouts: bool = False,
 ) -> Rows:
     """Spec F5: the first method against each of the others, over what both share, seed by seed.
 
@@ -194,8 +165,7 @@ def pairs(
     ``measured`` are (method, key, value). A key is what pairs must share: layout, sub-goal or ladder, and last the
     seed. Values with the same key, such as options of one seed of several ensembles, are paired in order. Each method
     after the first that shares a pair with it gets a row, see :func:`compare_pairs`, that names the ``quantity``
-    compared, and ``where``. ``layouts``: keys begin with the layout; where there are several, they are the units, not
-    the seeds.
+    compared, and ``where``. Keys begin with the layout; where there are several, they are the units, not the seeds.
     """
     values: dict[str, dict[tuple[Hashable, ...], float]] = {}
     for method, key, value in measured:
@@ -206,35 +176,13 @@ def pairs(
     for second in others:
         shared = [key for key in values[first] if key in values[second]]
         if shared:
-            here, there = (np.array([values[name][key] for key in shared], np.float64) for name in (first, second))
-            several = layouts and len({key[0] for key in shared}) > 1
+            first_values, second_values = (
+                np.array([values[name][key] for key in shared], np.float64) for name in (first, second)
+            )
+            several = len({key[0] for key in shared}) > 1
             units = [key[:1] if several else key[-2:] for key in shared]
-            about = {"first": first, "second": second, "quantity": quantity, "where": where, "higher": higher}
-            rows.append({**about, **compare_pairs(here, there, units, higher=higher)})
-    return rows
-
-
-def pairs_by_groups(
-    entries: Sequence[Mapping[str, Any]],
-    measured: Callable[[Any], Iterable[tuple[tuple[Hashable, ...], Mapping[str, float]]]],
-    quantity: str,
-    *,
-    higher: bool = True,
-) -> Rows:
-    """The first method against each other at each N, by their best, their validated and their mean member.
-
-    Entries have ``method`` and ``groups``; of each ``measured`` gives what is alike and the numbers by member, see
-    :func:`pairs`.
-    """
-    rows: Rows = []
-    for groups in by_groups(entries):
-        here = [
-            (entry["method"], key, of) for entry in entries if entry["groups"] == groups for key, of in measured(entry)
-        ]
-        for which in PICKED:
-            values = [(method, key, of[which]) for method, key, of in here]
-            where = "" if groups is None else f"N={groups}"
-            rows += pairs(values, f"{quantity}, {which} member", where, higher=higher)
+            entry = {"first": first, "second": second, "quantity": quantity, "where": where, "higher": higher}
+            rows.append({**entry, **compare_pairs(first_values, second_values, units, higher=higher)})
     return rows
 
 
@@ -253,9 +201,9 @@ def compare_pairs(
         difference (mean of first - second) and difference_interval, sign_test (two-sided p, ties left out). NaN without
         pairs; intervals are NaN for one unit too.
     """
-    there = ~(np.isnan(first) | np.isnan(second))
-    marks = [mark for mark, both in zip(units, there, strict=True) if both]
-    difference = first[there] - second[there]
+    defined = ~(np.isnan(first) | np.isnan(second))
+    marks = [mark for mark, both in zip(units, defined, strict=True) if both]
+    difference = first[defined] - second[defined]
     better = np.sign((difference if higher else -difference).round(DIGITS))
     scores, differences = (by_unit(values, marks) for values in ((1 + better) / 2, difference))
     won, lost = int((scores > 0.5).sum()), int((scores < 0.5).sum())
@@ -283,13 +231,13 @@ def name_apart(bases: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> li
     names = []
     for base, config in zip(bases, flat, strict=True):
         alike = [other for other, name in zip(flat, bases, strict=True) if name == base]
-        told = []
+        differing = []
         for key in sorted({key for other in alike for key in other} - NOT_A_VARIANT):
             values = [_text(other.get(key)) for other in alike]
             usual, count = Counter(values).most_common(1)[0]
             if (text := _text(config.get(key))) != usual or 2 * count <= len(values):
-                told.append(f"{key}={text}")
-        names.append(", ".join([base, *told]))
+                differing.append(f"{key}={text}")
+        names.append(", ".join([base, *differing]))
     return names
 
 
@@ -306,18 +254,18 @@ def ensemble_name(config: Mapping[str, Any]) -> str:
     """
     objective = "no diversity" if config["diversity"] == "none" else config["diversity"]
     name = "single CNN" if config["members"] == 1 else f"{objective}, K={config['members']}"
-    told = config.get("view") == "agent-crop" and config.get("localiser") == "ram"
-    return f"{name}, position oracle" if told else name
+    oracle = config.get("view") == "agent-crop" and config.get("localiser") == "ram"
+    return f"{name}, position oracle" if oracle else name
 
 
 def ensemble_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of ensembles; those whose settings differ are kept apart, settings without effect left out."""
     bases = [ensemble_name(config) for config in configs]
-    told = [
+    settings = [
         {key: value for key, value in config.items() if key not in IDLE.get(base.partition(",")[0], set())}
         for base, config in zip(bases, configs, strict=True)
     ]
-    return name_apart(bases, told)
+    return name_apart(bases, settings)
 
 
 def method_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -331,26 +279,21 @@ def method_names(configs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def methods_lacking(entries: Iterable[Mapping[str, Any]], artefact: str, figures: str) -> list[str]:
     """A line for each of the paper's methods that no entry has an artefact of."""
-    there = [entry["method"] for entry in entries]
-    lacking = [name for start, name in METHODS.items() if not any(method.startswith(start) for method in there)]
+    methods = [entry["method"] for entry in entries]
+    lacking = [name for start, name in METHODS.items() if not any(method.startswith(start) for method in methods)]
     return [f"no {artefact} artefact of {name} ({figures})" for name in lacking]
 
 
 def groups_of(config: Mapping[str, Any]) -> int | None:
     """N, the number of labelled ladder groups that an ensemble's data have; None where its domain has no such thing."""
-    found = (config.get("domain_config") or {}).get("groups")
-    return found if isinstance(found, int) else None
+    groups = (config.get("domain_config") or {}).get("groups")
+    return groups if isinstance(groups, int) else None
 
 
 def method_rank(method: str) -> int:
     """The order of methods in tables and figures: the paper's method, its control, the single CNN, anything else."""
     starts = ("dbat", "divdis", "no diversity", "single CNN")
     return next((rank for rank, start in enumerate(starts) if method.startswith(start)), len(starts))
-
-
-def ranked(entries: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The entries in the order of their methods, so that others are compared with D-BAT where there is one."""
-    return sorted(entries, key=lambda entry: method_rank(entry.get("method") or entry["name"]))
 
 
 def by_groups(entries: Iterable[Mapping[str, Any]]) -> list[int | None]:

@@ -28,7 +28,7 @@ from hypogoal.evaluation.plots import COLOURS, slug, to_svg
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
-    from hypogoal.evaluation.numbers import Row, Rows
+    from hypogoal.evaluation.table import Pairs, Row
 
 Block = dict[str, Any]
 Entry = Mapping[str, Any]
@@ -61,14 +61,14 @@ class Material:
     drawings: dict[str, str] = field(default_factory=dict)  # the figures' SVG
     films: Sequence[Block] = ()  # of episodes, see :func:`film`
 
-    def comparisons(self, of: str) -> list[Entry]:
+    def comparisons(self, name: str) -> list[Entry]:
         """One method against the others."""
-        return list(self.metrics["comparisons"][of])
+        return list(self.metrics["comparisons"][name])
 
     def within(self, folder: str) -> dict[str, NDArray[Any]]:
         """The arrays of a folder, by their names in it."""
         start = f"{folder}/"
-        return {name.removeprefix(start): of for name, of in self.arrays.items() if name.startswith(start)}
+        return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
     def of_numbers(self) -> bool:
         """Whether observations are no pictures."""
@@ -116,14 +116,14 @@ def label(title: str, key: Any, *, once: Any = None) -> Column:
 
     A cell is left empty where ``once`` of the entry, or with True the cell itself, is what it was in the row above.
     """
-    of = key if callable(key) else partial(at, key=key)
-    return Column(title, of, once=of if once is True else once)
+    content = key if callable(key) else partial(at, key=key)
+    return Column(title, content, once=content if once is True else once)
 
 
 def number(title: str, key: Any, show: Callable[..., Any] = str, *more: Any) -> Column:
     """A column of numbers: ``show(what the entry has there, *more)``; key as of :func:`label`."""
-    of = label(title, key).of
-    return Column(title, lambda entry: show(of(entry), *more), True)
+    content = label(title, key).of
+    return Column(title, lambda entry: show(content(entry), *more), True)
 
 
 def at(entry: Any, key: str) -> Any:
@@ -171,17 +171,17 @@ def table(
 def terminal(title: str, columns: Sequence[Column], entries: Iterable[Any]) -> Table:
     """The same table for a terminal, 79 columns wide; a line between groups of rows."""
     drawn = table(columns, entries)
-    found = Table(title=title, title_justify="left", width=79)
+    printed = Table(title=title, title_justify="left", width=79)
     for column in columns:
         if column.number:
-            found.add_column(column.title, justify="right", no_wrap=True)
+            printed.add_column(column.title, justify="right", no_wrap=True)
         else:
-            found.add_column(column.title, ratio=1, overflow="fold")
+            printed.add_column(column.title, ratio=1, overflow="fold")
     for index, row in enumerate(drawn["rows"]):
         if index and row["mark"]:
-            found.add_section()
-        found.add_row(*(str(cell["text"] if isinstance(cell, dict) else cell) for cell in row["cells"]))
-    return found
+            printed.add_section()
+        printed.add_row(*(str(cell["text"] if isinstance(cell, dict) else cell) for cell in row["cells"]))
+    return printed
 
 
 def section(
@@ -213,8 +213,8 @@ def shown(material: Material, drawn: Drawn) -> Block:
         svg = re.sub(r"<style.*?</style>", "", svg, flags=re.S)  # the page allows its own alone, which says the same
         for colour, variable in COLOURS.items():
             svg = svg.replace(colour, f"var(--{variable})")
-    about = {"label": drawn.label, "caption": drawn.caption, "missing": drawn.missing, "folded": drawn.folded}
-    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, "heading": drawn.heading, **about}
+    texts = {"label": drawn.label, "caption": drawn.caption, "missing": drawn.missing, "folded": drawn.folded}
+    return {"kind": "figure", "id": f"figure-{name}", "svg": svg, "heading": drawn.heading, **texts}
 
 
 def pick(rows: Iterable[Entry], key: str, value: Any) -> Entry:
@@ -310,8 +310,8 @@ def interval(aggregated: Entry | None, digits: int, scale: float = 1.0) -> str:
 
 def verdict(probability: float, says: bool, truth: bool) -> dict[str, str]:
     """A member's answer on a card: marked where it is wrong."""
-    said = "yes" if says else "no"
-    return {"class": said if says == truth else "wrong", "text": f"{said} {probability:.2f}"}
+    answer = "yes" if says else "no"
+    return {"class": answer if says == truth else "wrong", "text": f"{answer} {probability:.2f}"}
 
 
 def comparison_tables(
@@ -322,16 +322,16 @@ def comparison_tables(
     Rows are what ``numbers.pairs`` found. ``shared`` is what pairs share, ``units`` what is independent of each other,
     ``digits`` the decimals of a quantity's difference, 3 where it is not named.
     """
-    found = [entry for entry in rows if entry["n"]]
-    if not found:
+    compared = [entry for entry in rows if entry["n"]]
+    if not compared:
         return []
-    firsts = {entry["first"] for entry in found}
+    firsts = {entry["first"] for entry in compared}
 
     def quantity(entry: Entry) -> str:
         return str(entry["quantity"]).replace("_", " ") + ("" if entry["higher"] else " (lower is better)")
 
     names: dict[str, Callable[[Entry], str]] = {"quantity": quantity}
-    names |= {"of": itemgetter("where")} if any(entry["where"] for entry in found) else {}
+    names |= {"of": itemgetter("where")} if any(entry["where"] for entry in compared) else {}
     names |= {"first": itemgetter("first")} if len(firsts) > 1 else {}
 
     def difference(entry: Entry) -> dict[str, str]:
@@ -341,7 +341,10 @@ def comparison_tables(
         return cell(signed, _between(entry["difference_interval"], places))
 
     columns = [
-        *(label(name, of, once=lambda entry: [named(entry) for named in names.values()]) for name, of in names.items()),
+        *(
+            label(name, show, once=lambda entry: [named(entry) for named in names.values()])
+            for name, show in names.items()
+        ),
         label("second", "second"),
         number("P(first better)", lambda e: cell(fixed(e["probability"], 2), _between(e["interval"], 2)), dict),
         number("won–lost–tied", lambda e: f"{e['wins']}–{e['n'] - e['wins'] - e['ties']}–{e['ties']}"),
@@ -350,7 +353,7 @@ def comparison_tables(
     ]
     caption = CAPTION.format(shared=shared, units=units)
     title = f"Seed by seed: {firsts.pop()} against the others" if len(firsts) == 1 else "Seed by seed"
-    return [table(columns, found, tight=True, heading=title, caption=caption)]
+    return [table(columns, compared, tight=True, heading=title, caption=caption)]
 
 
 def _between(bounds: Sequence[float | None], digits: int) -> str:
@@ -393,17 +396,15 @@ def _digest(text: str) -> str:
 
 @dataclass(frozen=True)
 class Question:
-    """One question of the paper, whole: its numbers, figures, sections. What one has not, it leaves as it is here."""
+    """One question of the paper, whole: its rows, and all that derives from them. Unused fields keep these defaults."""
 
-    # Is shown every ensemble on every sub-goal's states as it is judged; fills ``row`` and ``work.looked``.
-    look: Callable[[Work, Judgement], None] = lambda work, judgement: None
-    # By their key in ``metrics.json``; what was found before is in ``work.metrics``.
-    numbers: Callable[[Work], dict[str, Any]] = lambda work: {}
+    # The rows of one sub-goal's members, as each ensemble is judged.
+    look: Callable[[Work, Judgement], Iterable[Row]] = lambda work, judgement: ()
+    rows: Callable[[Work], Iterable[Row]] = lambda work: ()  # all others; earlier ones are in ``work.rows``
+    view: Callable[[Work], dict[str, Any]] = lambda work: {}  # its parts of ``metrics.json``, made from ``work.rows``
+    pairs: Pairs | None = None  # which methods are compared with each other
     missing: Callable[[Work], list[str]] = lambda work: []  # a line for everything that the run has no artefacts for
-    rows: Callable[[Entry, Mapping[str, Any]], Iterable[Row]] = lambda metrics, arrays: ()  # of ``numbers.csv``
-    # Methods against each other, by their key in ``comparisons``.
-    pairs: Callable[[Entry], dict[str, Rows]] = lambda metrics: {}
-    # Unit and meaning of its quantities, of a question of your own; others are in ``quantities.toml``.
+    # Unit and meaning of its quantities, if they are not in ``quantities.toml``.
     meanings: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     summary: Callable[[Entry], list[Table]] = lambda metrics: []  # tables for a terminal
     sections: Callable[[Material], list[Block]] = lambda material: []  # those that the run has anything for

@@ -126,13 +126,13 @@ def contact_sheets(split: States, kinds: Sequence[str] = ()) -> dict[str, NDArra
     sheets = {}
     for value in np.unique(places).tolist():
         for label, word in ((True, "positives"), (False, "negatives")):
-            here = np.flatnonzero((places == value) & (split.labels == label))
-            here = here[np.argsort(kind[here], kind="stable")]
-            if len(here):
-                here = here[np.linspace(0, len(here) - 1, min(len(here), MOST_STATES)).astype(np.int64)]
+            inside = np.flatnonzero((places == value) & (split.labels == label))
+            inside = inside[np.argsort(kind[inside], kind="stable")]
+            if len(inside):
+                inside = inside[np.linspace(0, len(inside) - 1, min(len(inside), MOST_STATES)).astype(np.int64)]
                 name = word if place is None else f"{place.replace('_', '-')}-{value:02d}-{word}"
-                captions = [_caption(split.origins, index, kinds) for index in here.tolist()]
-                sheets[name] = contact_sheet(split.observations[here], captions)
+                captions = [_caption(split.origins, index, kinds) for index in inside.tolist()]
+                sheets[name] = contact_sheet(split.observations[inside], captions)
     return sheets
 
 

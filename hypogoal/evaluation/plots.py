@@ -117,9 +117,9 @@ def label_lines(figure: Figure, axes: Axes, columns: int, **more: Any) -> None:
     low, high = axes.get_ylim()
     ends = []
     for line in lines:
-        known = np.asarray(line.get_ydata(), dtype=np.float64)
-        known = known[np.isfinite(known)]
-        ends.append((known[-1] - low) / (high - low) if len(known) else 0.0)
+        values = np.asarray(line.get_ydata(), dtype=np.float64)
+        values = values[np.isfinite(values)]
+        ends.append((values[-1] - low) / (high - low) if len(values) else 0.0)
     order, free, places = np.argsort(ends, kind="stable").tolist(), 0.0, np.zeros(len(lines))
     for index in order:  # from below, each pushed up as far as it must be; then down again what is above the plot
         half = APART * rows[index] / 2

@@ -66,39 +66,42 @@ ARTEFACTS = (
 
 def provenance_section(material: Material) -> Block:
     """Data, artefacts, settings, versions and the meaning of every number."""
-    about = material.metrics["provenance"]
+    provenance = material.metrics["provenance"]
     text = (
         "Every number above is in metrics.json of the evaluation. Each artefact's manifest holds its settings, the "
         "sha256 of its files and of its inputs' manifests."
     )
     lines = []
-    for place, data in enumerate(about["data"]):
+    for place, data in enumerate(provenance["data"]):
         counts = data["counts"]
         for sub_goal, labelled in counts["labelled"].items():
             sizes = {"labelled": labelled, "unlabelled": counts["unlabelled"], "heldout": counts["heldout"][sub_goal]}
             lines.append({"place": place, "path": data["path"], "sub_goal": sub_goal, **sizes})
     missing = "" if lines else "No data file was found: it is read through an ensemble artefact."
-    artefacts = about["artefacts"]
+    artefacts = provenance["artefacts"]
     versions = sorted({item for artefact in artefacts for item in artefact["versions"].items()})
     by_package = grouped(versions, itemgetter(0)).items()
     meanings = material.metrics["quantities"].items()
     blocks = [
         page.table(DATA, lines, heading="Collected states", caption=missing),
         page.table(ARTEFACTS, artefacts, folded=f"All {len(artefacts)} artefacts and their commands", wrap=True),
-        *_settings(about),
+        *_settings(provenance),
         page.facts("Versions", [(name, ", ".join(version for _, version in items)) for name, items in by_package]),
-        page.facts("What each number means", [(name, f"{of['meaning']} ({of['unit']})") for name, of in meanings]),
+        page.facts(
+            "What each number means",
+            [(name, f"{quantity['meaning']} ({quantity['unit']})") for name, quantity in meanings],
+        ),
     ]
     return page.section("provenance", "Data, settings, provenance", [text], blocks, folded=True)
 
 
-def _settings(about: Mapping[str, Any]) -> list[Block]:
+def _settings(provenance: Mapping[str, Any]) -> list[Block]:
     blocks = []
-    for index, data in enumerate(about["data"]):
+    for index, data in enumerate(provenance["data"]):
         name = f"Settings of {data['path']} ({data['domain']})"
         blocks.append(page.facts(name, _lines(data["config"]), heading="" if index else "Settings"))
     shown: set[str] = set()
-    for artefact in about["artefacts"]:
+    for artefact in provenance["artefacts"]:
         varying = {key: value for key, value in artefact["config"].items() if key not in SAID_ELSEWHERE}
         same = json.dumps([artefact["kind"], varying], sort_keys=True)
         if same not in shown:
@@ -114,7 +117,7 @@ def _lines(config: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def domains_of(metrics: Entry) -> list[str]:
     """The domains of a run's data and artefacts."""
-    about = metrics["provenance"]
-    named = [data["domain"] for data in about["data"]]
-    named += [artefact["config"]["domain"] for artefact in about["artefacts"] if "domain" in artefact["config"]]
+    provenance = metrics["provenance"]
+    named = [data["domain"] for data in provenance["data"]]
+    named += [artefact["config"]["domain"] for artefact in provenance["artefacts"] if "domain" in artefact["config"]]
     return sorted(set(named))

@@ -69,7 +69,7 @@ def paper_figures(material: Material) -> tuple[list[Drawn], list[str]]:
     """Figures 2 to 9 and those beside them that the run has artefacts for; a line for each of 2 to 9 that it lacks."""
     figures: Iterator[Drawn] = (figure for question in QUESTIONS for figure in question.figures(material))
     drawn = sorted((figure for figure in figures if figure.figure is not None), key=lambda figure: figure.stem)
-    needed = {name: what for question in QUESTIONS for name, what in question.needed.items()}
+    needed = {name: requirement for question in QUESTIONS for name, requirement in question.needed.items()}
     missing = [
         f"{name.replace('figure', 'Figure ')}: not drawn. It needs {needed[name]}."
         for name in sorted(needed)

@@ -3,36 +3,46 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.evaluation import page
-from hypogoal.evaluation.numbers import Metrics, Row, grouped, mean_of, method_rank, over, rows_of
-from hypogoal.evaluation.page import Block, Entry, Material, Question
-from hypogoal.hypotheses.scores import best_threshold, by_member, cross_fitted, halves, member_scores, ranking
+from hypogoal.evaluation.numbers import method_rank
+from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.table import Number, Row, Table, rows_by_member, rows_of, select, tabulate
+from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
 
 OF_MEMBERS = ("ranking", "at_best_threshold", "calibration_gap")
 CROSSED = {"ranking": "cross_fitted_ranking", "balanced_accuracy": "cross_fitted_accuracy"}
+HELDOUT = "heldout"
 TITLE = "Ranking, whatever the threshold"
 
 
-def known(
+TABLE = Table(
+    {"name": "method", "groups": "N", "sub_goal": "sub_goal"},
+    {name: Number(name, HELDOUT) for name in (*OF_MEMBERS, *CROSSED.values())},
+    "ensembles",
+    order=lambda key: (method_rank(key[0]), key[0], key[1] or 0),  # sub-goals stay in the order of the data
+)
+
+
+def knowledge(
     probabilities: NDArray[np.float32],
     verdicts: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     contexts: NDArray[np.int64] | None,
-) -> dict[str, Any]:
-    """What K members know of N states, by their probabilities and by their verdicts at their own thresholds, (N, K).
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
+    """What K members know of N states, by their probabilities and by their predictions, both (N, K).
 
-    ``contexts`` are the layouts or rooms that states are of, None where not known. ``members``: a row each, with
-    ``ranking``, ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that the member's own
-    threshold loses); of the best member as half of the contexts picks it for the other, ``cross_fitted_ranking`` and
+    ``contexts`` are the layouts or rooms of states, None where unknown. Returns of each member (K,) ``ranking``,
+    ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that its own threshold loses); and of
+    the best member, picked on half of the contexts and scored on the other, ``cross_fitted_ranking`` and
     ``cross_fitted_accuracy``, NaN for fewer than two contexts.
     """
 
@@ -41,66 +51,34 @@ def known(
         return {"ranking": ranking(probabilities[inside], labels[inside]), "balanced_accuracy": accuracy}
 
     best, every = best_threshold(probabilities, labels)[1], scores(np.ones(len(labels), dtype=np.bool_))
-    columns = {"ranking": every["ranking"], "at_best_threshold": best}
-    columns["calibration_gap"] = best - every["balanced_accuracy"]
+    gap = best - every["balanced_accuracy"]
+    columns = {"ranking": every["ranking"], "at_best_threshold": best, "calibration_gap": gap}
     first = None if contexts is None else halves(contexts)
-    parts = None if first is None else (scores(first), scores(~first))
-    return {
-        "members": [{"member": member, **row} for member, row in enumerate(by_member(columns))],
-        **{
-            name: math.nan if parts is None else cross_fitted(parts[0][score], parts[1][score])
-            for score, name in CROSSED.items()
-        },
-    }
+    if first is None:
+        return columns, dict.fromkeys(CROSSED.values(), math.nan)
+    parts = scores(first), scores(~first)
+    return columns, {name: cross_fitted(parts[0][score], parts[1][score]) for score, name in CROSSED.items()}
 
 
-def look(work: Work, judgement: Judgement) -> None:
+def look(work: Work, judgement: Judgement) -> Iterator[Row]:
     """Members on held-out states of contexts that training did not see."""
-    origins, judged = judgement.split.origins, judgement.judged
-    unseen = origins["seen"] == 0 if "seen" in origins else np.ones(len(judgement.split.labels), dtype=np.bool_)
+    origins, judged, place = judgement.split.origins, judgement.judged, work.place(judgement)
+    by_room = "seen" in origins
+    unseen = origins["seen"] == 0 if by_room else np.ones(len(judgement.split.labels), dtype=np.bool_)
     contexts = next((origins[name][unseen] for name in ("layout_seed", "room") if name in origins), None)
     labels = judgement.split.labels[unseen]
-    judgement.row["ranking"] = known(judged.probabilities[unseen], judged.verdicts[unseen], labels, contexts)
+    columns, crossed = knowledge(judged.probabilities[unseen], judged.verdicts[unseen], labels, contexts)
+    if by_room:  # ``rooms`` has their ranking
+        del columns["ranking"]
+    scope = "unseen" if by_room else HELDOUT
+    yield from rows_by_member(columns, **place, scope=scope)
+    yield from rows_of(crossed, **place, scope=scope)
 
 
-def numbers(work: Work) -> dict[str, Any]:
+def view(work: Work) -> dict[str, Any]:
     """Per kind of ensemble, N and sub-goal, over seeds: the mean member, and the cross-fitted best."""
-    judged = [(ensemble, goal) for ensemble in work.ensembles for goal in ensemble["sub_goals"]]
-    table = []
-    cells = grouped(judged, _cell).items()  # sub-goals stay in the order of the data
-    for key, alike in sorted(cells, key=lambda item: (method_rank(item[0][0]), item[0][0], item[0][1] or 0)):
-        entry: dict[str, Any] = dict(zip(("name", "groups", "sub_goal"), key, strict=True))
-        entry["ensembles"], cell = len(alike), [str(part) for part in key]
-        for name in OF_MEMBERS:
-            means = [
-                mean_of([v for row in goal["ranking"]["members"] if not math.isnan(v := row[name])])
-                for _, goal in alike
-            ]
-            entry[name] = over(means, "fraction", *cell, name)
-        for name in CROSSED.values():
-            entry[name] = over([goal["ranking"][name] for _, goal in alike], "fraction", *cell, name)
-        table.append(entry)
-    return {"ranking": table}
-
-
-def _cell(judged: tuple[Entry, Entry]) -> tuple[str, int | None, str]:
-    ensemble, goal = judged
-    return ensemble.get("method", ensemble["name"]), ensemble.get("groups"), goal["sub_goal"]
-
-
-def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
-    """Every member, and the cross-fitted best."""
-    for ensemble in metrics["ensembles"]:
-        about = {"method": ensemble.get("method", ensemble["name"]), "N": ensemble.get("groups")}
-        about |= {"seed": ensemble["seed"], "artefact": ensemble["path"]}
-        for goal in ensemble["sub_goals"]:
-            about["sub_goal"] = goal["sub_goal"]
-            apart = "rooms" in goal  # of which every score of the unseen ones is told, ranking among them
-            told, scope = (OF_MEMBERS[1:], "unseen") if apart else (OF_MEMBERS, "heldout")
-            for scores in goal["ranking"]["members"]:
-                values = {name: scores[name] for name in told}
-                yield from rows_of(values, **about, member=scores["member"], scope=scope)
-            yield from rows_of({name: goal["ranking"][name] for name in CROSSED.values()}, **about, scope=scope)
+    judged = select(work.rows, quantity=tuple(TABLE.numbers), scope=(HELDOUT, "unseen"))
+    return {"ranking": tabulate((row._replace(scope=HELDOUT) for row in judged), TABLE)}
 
 
 COLUMNS = (
@@ -134,4 +112,4 @@ def sections(material: Material) -> list[Block]:
     return [page.section("ranking", TITLE, [text], blocks, folded=True)]
 
 
-QUESTION = Question(look=look, numbers=numbers, rows=rows, sections=sections)
+QUESTION = Question(look=look, view=view, sections=sections)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -16,23 +17,25 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.table import Table
+from rich.table import Table as Printed
 
 from hypogoal.evaluation import page
 from hypogoal.evaluation.hypotheses import STATES
-from hypogoal.evaluation.numbers import (
-    Metrics,
-    Rows,
-    by_method,
-    grouped,
-    methods_lacking,
-    over,
-    pairs_by_groups,
-    ranked,
-)
+from hypogoal.evaluation.numbers import Metrics, by_method, grouped, methods_lacking
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.plots import GREY, MARKERS, METHOD_COLOURS, STYLES, WIDTH, legend_below, styled
-from hypogoal.hypotheses.scores import best_mean_worst, by_member, member_scores, ranking
+from hypogoal.evaluation.table import (
+    VALIDATED,
+    Number,
+    Pairs,
+    Row,
+    Table,
+    rows_by_member,
+    rows_of,
+    select,
+    tabulate,
+)
+from hypogoal.hypotheses.scores import member_scores, ranking
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
@@ -43,11 +46,10 @@ SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
 TABLED = ("unseen", "all")  # scopes of the tables and of Figure 3
 SCORED = ("balanced_accuracy", "accuracy", "ranking")  # of which best, mean, ... are told
-WHICH = ("best", "validated", "mean", "worst")
+WHICH = {"best": "best", "validated": VALIDATED, "mean": "mean", "worst": "worst"}  # the member of a ``Number``
 SHOWN = {"best": "best member", "validated": "validated member", "mean": "mean of members"}
 SHARE = "share of states"
 SPREAD = ("mean", "standard_deviation")  # of the figures
-CELL = ("method", "groups", "sub_goal")  # what rows are over seeds of
 PAPER = (
     "The paper: about 70 % for the best member at N=1 with both ensembles, the single CNN about 20 points lower, and a "
     "big step at N=2. Its test files include training rooms, as 'all rooms' does; how many of their states are "
@@ -56,37 +58,29 @@ PAPER = (
 BESIDE, MOST_BESIDE = 0.06, 0.6  # units of N between methods with one N, and at most from the first to the last
 
 
-def room_metrics(
+def rows_by_room(
     probabilities: NDArray[np.float32],
     verdicts: NDArray[np.bool_],
     labels: NDArray[np.bool_],
     origins: Mapping[str, NDArray[np.int64]],
-) -> dict[str, Any]:
+    **place: Any,
+) -> Iterator[Row]:
     """Spec F1: one ensemble's K members on N held-out states by whether training saw the room.
 
-    Their probabilities and verdicts are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
-    ``room``.
-
-    Returns:
-        ``scopes``: per scope its states, positives, rooms, every member's scores, and best, validated, mean and worst
-        of accuracy, balanced accuracy and ``ranking`` (area under the ROC curve); ``validated``: which member the rooms
-        of labelled groups pick. NaN where not defined.
+    Their probabilities and predictions are (N, K); origins (N,) are ``seen`` (see ``SCOPES``) and, where there is one,
+    ``room``. In each scope there are how many states, positives and rooms, and every member's scores; of the labelled
+    rooms, which member they pick, and its balanced accuracy there.
     """
-    seen, rooms = origins["seen"], origins.get("room")
-    validated = choose(verdicts, labels, seen)
-    scopes = {}
+    seen = origins["seen"]
     for name, values in SCOPES.items():
         inside = np.isin(seen, values)
         scores = member_scores(verdicts[inside], labels[inside])
         scores["ranking"] = ranking(probabilities[inside], labels[inside])
-        scopes[name] = {
-            "states": int(inside.sum()),
-            "positives": int(labels[inside].sum()),
-            "rooms": [] if rooms is None else np.unique(rooms[inside]).tolist(),
-            "members": [{"member": member, **row} for member, row in enumerate(by_member(scores))],
-            "scores": {score: with_validated(scores[score], validated["member"]) for score in SCORED},
-        }
-    return {"scopes": scopes, "validated": validated}
+        yield from rows_by_member(scores, **place, scope=name)
+        counts = {"states": int(inside.sum()), "positives": int(labels[inside].sum())}
+        counts |= {"rooms": len(np.unique(origins["room"][inside]))} if "room" in origins else {}
+        yield from rows_of(counts, **place, scope=name)
+    yield from rows_of(choose(verdicts, labels, seen), **place, scope=VALIDATION)
 
 
 def choose(
@@ -94,87 +88,81 @@ def choose(
 ) -> dict[str, int | float | None]:
     """Spec F1: the member with the highest balanced accuracy on held-out states in rooms of labelled groups.
 
-    Members' order is chance, so of several equally good ones the first is taken.
-    ``validation`` is its balanced accuracy there; ``member`` is None where those rooms lack a class.
+    Members' order is chance, so of several equally good ones the first is taken. ``validation`` is its balanced
+    accuracy there; there is no such member where those rooms lack a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
     scores = member_scores(verdicts[inside], labels[inside])["balanced_accuracy"]
     if np.isnan(scores).all():
-        return {"member": None, "validation": math.nan}
-    return {"member": int(np.nanargmax(scores)), "validation": float(np.nanmax(scores))}
+        return {VALIDATED: None, "validation": math.nan}
+    return {VALIDATED: int(np.nanargmax(scores)), "validation": float(np.nanmax(scores))}
 
 
-def with_validated(scores: NDArray[np.float64], validated: Any) -> dict[str, float]:
-    """Best, mean and worst of the members' scores (K,), and that of the member ``validated``; NaN where none is."""
-    return {**best_mean_worst(scores), "validated": math.nan if validated is None else float(scores[validated])}
+def _columns() -> Iterator[tuple[str, Number]]:
+    for scope, score, (which, member) in product(TABLED, SCORED, WHICH.items()):
+        yield f"scores.{scope}.{score}.{which}", Number(score, scope, score, member, cell=(score, scope, which))
+    for on in STATES:
+        yield f"disagreement_{on}", Number("disagreement", on, SHARE, cell=(SHARE, on))
 
 
-def of_rooms(ensembles: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
-    """Every (ensemble, sub-goal) of those judged room by room."""
-    return [(ensemble, goal) for ensemble in ensembles for goal in ensemble["sub_goals"] if "rooms" in goal]
+TABLE = Table(
+    {"method": "method", "groups": "N", "sub_goal": "sub_goal"},
+    dict(_columns()),
+    "ensembles",
+    order=by_method,
+    deviation=True,
+    cell=lambda key: (" ".join(map(str, key)),),
+)
+PAIRS = Pairs(
+    "rooms",
+    {
+        f"balanced accuracy on unseen rooms, {which} member": Number("balanced_accuracy", "unseen", "", WHICH[which])
+        for which in SHOWN
+    },
+    ranked=True,
+)
 
 
-def rooms_table(ensembles: Sequence[Entry]) -> list[dict[str, Any]]:
+def of_rooms(rows: Sequence[Row]) -> list[Row]:
+    """The rows of ensembles that are judged room by room."""
+    by_room = {row.artefact for row in rows if row.scope == "unseen"}
+    return [row for row in rows if row.artefact in by_room]
+
+
+def rooms_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Spec F1, F2: Figure 3: per method, N and sub-goal its members' scores and disagreement, over seeds.
 
-    Ensembles have ``method``, ``groups`` and ``sub_goals``, those with ``rooms``. Rows have ``scores``: scope -> score
-    -> best, validated, mean, worst (see ``numbers.over``); ``positives`` and ``always_no`` (the accuracy of never
-    saying yes) per scope; disagreement on unlabelled and held-out states.
+    Entries have ``scores``: scope -> score -> best, validated, mean, worst (see ``numbers.over``); disagreement on
+    unlabelled and held-out states; and by scope ``positives``, and ``always_no``, the accuracy of negative predictions
+    alone.
     """
-    table = []
-    cells = grouped(of_rooms(ensembles), lambda of: (of[0]["method"], of[0]["groups"], of[1]["sub_goal"]))
-    for key, judged in sorted(cells.items(), key=lambda item: by_method(item[0])):
-        cell, goals = " ".join(map(str, key)), [goal for _, goal in judged]
-        scopes = [goal["rooms"]["scopes"] for goal in goals]
-        entry: dict[str, Any] = dict(zip(CELL, key, strict=True))
-        entry["ensembles"] = len(goals)
-        counts = {scope: (scopes[0][scope]["positives"], scopes[0][scope]["states"]) for scope in TABLED}
-        entry["positives"] = {scope: yes for scope, (yes, _) in counts.items()}
-        entry["always_no"] = {scope: 1 - yes / of if of else math.nan for scope, (yes, of) in counts.items()}
-        entry["scores"] = {
-            scope: {
-                score: _by_which([each[scope]["scores"][score] for each in scopes], score, cell, score, scope)
-                for score in SCORED
-            }
-            for scope in TABLED
-        }
-        for states in STATES:
-            shares = [goal["disagreement"][states] for goal in goals]
-            entry[f"disagreement_{states}"] = over(shares, SHARE, cell, SHARE, states, deviation=True)
-        table.append(entry)
+    rows = of_rooms(rows)
+    counts = {
+        (row.method, row.N, row.sub_goal, row.scope, row.quantity): row.value
+        for row in reversed(select(rows, quantity=("states", "positives")))  # the first ensemble's
+    }
+    table = tabulate(rows, TABLE)
+    for entry in table:
+        cell = tuple(entry[name] for name in TABLE.by)
+        positives = {scope: counts[*cell, scope, "positives"] for scope in TABLED}
+        states = {scope: counts[*cell, scope, "states"] for scope in TABLED}
+        entry["positives"] = positives
+        entry["always_no"] = {on: 1 - positives[on] / states[on] if states[on] else math.nan for on in TABLED}
     return table
 
 
-def _by_which(seeds: Sequence[Entry], unit: str, *cell: str) -> dict[str, Any]:
-    """Over seeds the best, the validated, the mean and the worst member."""
-    return {which: over([of[which] for of in seeds], unit, *cell, which, deviation=True) for which in WHICH}
-
-
-def look(work: Work, judgement: Judgement) -> None:
+def look(work: Work, judgement: Judgement) -> Iterator[Row]:
     """Members room by room, where held-out states say which rooms training saw."""
     split, judged = judgement.split, judgement.judged
     if "seen" in split.origins:
-        judgement.row["rooms"] = room_metrics(judged.probabilities, judged.verdicts, split.labels, split.origins)
+        place = work.place(judgement)
+        yield from rows_by_room(judged.probabilities, judged.verdicts, split.labels, split.origins, **place)
 
 
 def missing(work: Work) -> list[str]:
     """Spec F1: the methods that are not there, of a run with ladders."""
     rooms = work.metrics["rooms"]
     return methods_lacking(rooms, "ensemble", "Figure 3") if rooms or work.contents.ladders else []
-
-
-def against(ensembles: Sequence[Entry]) -> Rows:
-    """Spec F1: the first method against each other by balanced accuracy on unseen rooms, at each N, paired by seed.
-
-    Ensembles not judged by room are left out.
-    """
-
-    def scores(ensemble: Entry) -> Iterator[tuple[tuple[str, int], Entry]]:
-        for _, goal in of_rooms([ensemble]):
-            yield (goal["sub_goal"], ensemble["seed"]), goal["rooms"]["scopes"]["unseen"]["scores"]["balanced_accuracy"]
-
-    judged = [ensemble for ensemble in ensembles if of_rooms([ensemble])]
-    return pairs_by_groups(judged, scores, "balanced accuracy on unseen rooms")
 
 
 METHOD = page.label("method", "method", once=True)
@@ -193,7 +181,7 @@ UNSEEN = (
 )
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Metrics) -> list[Printed]:
     """Figure 3 by method and N: on unseen rooms, and the paper's number."""
     rows = metrics["rooms"]
     method = page.label("method", page.method_of(rows))
@@ -210,14 +198,14 @@ def sections(material: Material) -> list[Block]:
 def ladders_section(material: Material) -> Block:
     """The question; the answers are in the tables below."""
     metrics = material.metrics
-    asked = (
+    question = (
         "A sub-goal, to be at the base of a ladder, is known from a few rooms only. An ensemble of classifiers holds "
         "several hypotheses about what the sub-goal is. Does one of them hold in rooms that training never saw, can it "
         "be found, and does an option that ends where it says so end at the base of a ladder?"
     )
     alone = not metrics["agents"]
     identity, title = ("summary", "Summary") if alone else ("ladders", "Summary of the ladders")
-    return page.section(identity, title, [asked], [], metrics["missing"] if alone else [])
+    return page.section(identity, title, [question], [], metrics["missing"] if alone else [])
 
 
 def rooms_section(material: Material) -> Block:
@@ -261,10 +249,10 @@ def _table(rows: Sequence[Entry]) -> Block:
 
 def _never(rows: Sequence[Mapping[str, Any]]) -> str:
     """What accuracy on all rooms is worth here: that of a member that never says yes, by N."""
-    found = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
-    every = sorted(found.items(), key=str)
-    told = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
-    return f"Never saying yes has accuracy {page.listed(told)}. " if told else ""
+    accuracies = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
+    every = sorted(accuracies.items(), key=str)
+    texts = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
+    return f"Never saying yes has accuracy {page.listed(texts)}. " if texts else ""
 
 
 def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -282,7 +270,9 @@ def figures(material: Material) -> Iterator[Drawn]:
     by_sub_goal = _by_sub_goal(material)
     for rows in by_sub_goal:
         methods = {entry["method"] for entry in rows}
-        seeds = sorted({of["seed"] for of in material.metrics["ensembles"] if of.get("method") in methods})
+        seeds = sorted(
+            {ensemble["seed"] for ensemble in material.metrics["ensembles"] if ensemble.get("method") in methods}
+        )
         panels = [("accuracy, all rooms: best member", "all", "accuracy", "best")]
         panels += [(f"balanced, unseen: {name}", "unseen", "balanced_accuracy", which) for which, name in SHOWN.items()]
         caption = (
@@ -327,7 +317,7 @@ def scores_over_groups(rows: Sequence[Entry], panels: Sequence[tuple[str, str, s
         for place, (title, scope, score, which) in zip(axes.flat, panels, strict=False):
             for name, entries in grouped(rows, itemgetter("method")).items():
                 scores = [entry["scores"][scope][score][which] for entry in entries]
-                mean, deviation = (np.array([of[key] for of in scores], float) for key in SPREAD)
+                mean, deviation = (np.array([aggregated[key] for aggregated in scores], float) for key in SPREAD)
                 groups = np.array([entry["groups"] for entry in entries], float)
                 _draw_method(place, name, groups, mean, deviation, names)
                 lowest = float(np.nanmin([lowest, *(mean - np.nan_to_num(deviation))]))
@@ -376,9 +366,9 @@ def _draw_method(
 
 QUESTION = Question(
     look=look,
-    numbers=lambda work: {"rooms": rooms_table(work.ensembles)},
+    view=lambda work: {"rooms": rooms_table(work.rows)},
     missing=missing,
-    pairs=lambda metrics: {"rooms": against(ranked(metrics["ensembles"]))},
+    pairs=PAIRS,
     summary=summary,
     sections=sections,
     figures=figures,

@@ -31,7 +31,8 @@ MOST = 2**53  # integers that a float holds
 MOST_OPTIONS = 2**16
 MAX_TABLE_BYTES = 2**30
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty, NaN
-PARTS = (  # of ``metrics.json``
+FORMAT = 2  # of ``metrics.json``: 1 until 0.15
+PARTS = (  # of it
     *("agents", "layouts", "rooms", "distance", "exploits", "hypotheses", "ranking", "explorer", "saliency"),
     *("selection", "choosing", "ensembles", "settings", "missing", "provenance", "quantities", "comparisons"),
 )
@@ -73,8 +74,8 @@ def find(run: Path) -> Contents:
     others: list[Artefact] = []
     for artefact in learned:
         if artefact not in continued:
-            told = "executions.csv" in artefact.manifest["files"]
-            (ladders if told else silent if artefact.config.get("start") else others).append(artefact)
+            has_table = "executions.csv" in artefact.manifest["files"]
+            (ladders if has_table else silent if artefact.config.get("start") else others).append(artefact)
     agents = [*metas, *others, *find_artefacts(run, "baseline")]
     contents = Contents(run, find_artefacts(run, "ensemble"), agents, ladders, silent, continued)
     if not contents.everything():
@@ -215,8 +216,8 @@ def read_layout(path: Path) -> dict[str, Any]:
     fits = isinstance(facts, dict) and all(isinstance(facts.get(key, ...), kind) for key, kind in wanted.items())
     if not fits or not 0 <= facts["layout_seed"] < MOST or type(facts.get("random_episodes")) is not int:
         raise UserError("the layout's file is damaged", path, AGAIN)
-    told = {"layouts": facts["layouts"]} if isinstance(facts.get("layouts"), str) else {}
-    return {key: facts[key] for key in (*wanted, "random_episodes")} | told
+    more = {"layouts": facts["layouts"]} if isinstance(facts.get("layouts"), str) else {}
+    return {key: facts[key] for key in (*wanted, "random_episodes")} | more
 
 
 def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
@@ -240,11 +241,14 @@ def read_table(
     text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
     try:
         reader = csv.DictReader(io.StringIO(text, newline=""))
-        there = list(reader.fieldnames or ())
-        columns = there if columns is None else [*columns, *(name for name in optional if name in there)]
-        if not set(columns) <= set(there):
+        header = list(reader.fieldnames or ())
+        columns = header if columns is None else [*columns, *(name for name in optional if name in header)]
+        if not set(columns) <= set(header):
             raise KeyError(path)
-        rows = [[math.nan if row[of] == "" and of in BLANK else float(row[of]) for of in columns] for row in reader]
+        rows = [
+            [math.nan if row[column] == "" and column in BLANK else float(row[column]) for column in columns]
+            for row in reader
+        ]
     except (ValueError, KeyError, TypeError, csv.Error):
         raise UserError("the table is damaged", path, AGAIN) from None
     values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
@@ -282,10 +286,10 @@ def read_evaluation(run: Path, start: str = "") -> Evaluated:
     Of the arrays only those whose names begin with ``start``. What was made since is among ``missing``. A run that was
     not evaluated, or a damaged evaluation, is a ``UserError``.
     """
-    found = find_artefacts(run, "evaluation")
-    if not found:
+    evaluations = find_artefacts(run, "evaluation")
+    if not evaluations:
         raise UserError("this run was not evaluated", run, advice("First run", "evaluate", run))
-    source = next((artefact for artefact in found if artefact.path == run / "evaluation"), found[0])
+    source = next((artefact for artefact in evaluations if artefact.path == run / "evaluation"), evaluations[0])
     source.whole()
     metrics = _metrics(source.path / "metrics.json")
     metrics["missing"] = [*metrics["missing"], *_since(run, source)]
@@ -310,7 +314,11 @@ def _since(run: Path, source: Artefact) -> list[str]:
         contents = find(run)
     except UserError:  # evaluations may lie where nothing else does
         return []
-    names = [contents.name(of) for of in contents.everything() if sha256_of(of.path / MANIFEST) not in evaluated]
+    names = [
+        contents.name(artefact)
+        for artefact in contents.everything()
+        if sha256_of(artefact.path / MANIFEST) not in evaluated
+    ]
     elsewhere = [] if source.path == run / "evaluation" else ["--out", source.path]
     do = advice("evaluate it again", "evaluate", run, *elsewhere, "--force") if names else ""
     return [f"{name}: made since this evaluation ({do})" for name in names]
@@ -320,9 +328,12 @@ def _metrics(path: Path) -> dict[str, Any]:
     metrics = read_json(path, "the evaluation is", AGAIN)
     if not isinstance(metrics, dict):
         raise UserError("the evaluation is damaged", path, AGAIN)
+    if (made_with := metrics.get("format", 1)) != FORMAT:
+        difference = f"another version of hypogoal evaluated this (format {made_with}, needed: {FORMAT})"
+        raise UserError(difference, path, "Evaluate the run again, with --force.")
     lacking = [part for part in PARTS if part not in metrics]
     if lacking:
-        raise UserError(f"an older hypogoal evaluated this (no {', '.join(lacking)})", path, AGAIN)
+        raise UserError(f"the evaluation is damaged (no {', '.join(lacking)})", path, AGAIN)
     for name in _sub_goals(metrics):
         if not plain_name(name):
             raise UserError(f"a sub-goal in the evaluation has an invalid name, {name!r}", path, AGAIN)

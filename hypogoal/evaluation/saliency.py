@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from hypogoal.evaluation.plots import BLUE, PALETTE, VERMILLION, drawing, grid_o
 
 if TYPE_CHECKING:
     from hypogoal.evaluation.judging import Judgement, Work
+    from hypogoal.evaluation.table import Row
 
 SPREAD = "spread"  # a state as any other
 KINDS = {"true positive": "a true positive", "disagree": "members disagree", "false positive": "a false positive"}
@@ -33,7 +34,7 @@ MOST_BARS = 15  # features
 KEY = 0.75  # inches below all pictures
 
 
-def look(work: Work, judgement: Judgement) -> None:
+def look(work: Work, judgement: Judgement) -> Iterable[Row]:
     """Attributions of the ensemble that is shown; on states of unseen rooms where positives are in them.
 
     ``saliency/<sub-goal>`` is written: the states and their ``attributions``, float32 (n, K, h, w, C), in log-odds, to
@@ -41,7 +42,7 @@ def look(work: Work, judgement: Judgement) -> None:
     over the held-out ones, each of ``features`` having a name.
     """
     if judgement.number != work.shown:
-        return
+        return ()
     split, sub_goal, judged = judgement.split, judgement.case.sub_goal, judgement.judged
     strange = split.origins.get("seen", np.zeros(len(split.labels), dtype=np.int64)) == 0
     among = np.flatnonzero(strange) if split.labels[strange].any() else np.arange(len(strange))
@@ -56,15 +57,16 @@ def look(work: Work, judgement: Judgement) -> None:
         from hypogoal.hypotheses.deep_lift import attributed, explanation
 
         ensemble, seen, baseline = judgement.see(among[[index for index, _ in explained]])
-        found = attributed(ensemble, seen, baseline)
+        explanation_of_states = attributed(ensemble, seen, baseline)
         group = work.arrays[f"saliency/{sub_goal}"]
-        values = found.values.astype(np.float32)
+        values = explanation_of_states.values.astype(np.float32)
         group.create_dataset("attributions", data=values, compression="gzip", compression_opts=1)
         group["seen"], group["baseline"] = seen, baseline
         if not pictures:
             group["features"] = fixed(json.dumps(open_dataset(judgement.case.data).features()))
-        states = explanation(found, explained)
+        states = explanation(explanation_of_states, explained)
     work.looked["saliency"].append({"sub_goal": sub_goal, "states": states})
+    return ()
 
 
 def pick_to_explain(
@@ -76,13 +78,13 @@ def pick_to_explain(
     members differ and their probabilities are the furthest apart; ``false positive``: where the most members err, and
     the surest. Fewer where there are none.
     """
-    yes, mean = verdicts.sum(1), probabilities.mean(1)
+    positive, mean = verdicts.sum(1), probabilities.mean(1)
     spread = probabilities.max(1) - probabilities.min(1)
     picked: list[tuple[int, str]] = []
     for kind, mask, order in (
-        ("true positive", labels & (yes > 0), -(yes + mean)),
-        ("disagree", (yes > 0) & (yes < verdicts.shape[1]), -spread),
-        ("false positive", ~labels & (yes > 0), -(yes + mean)),
+        ("true positive", labels & (positive > 0), -(positive + mean)),
+        ("disagree", (positive > 0) & (positive < verdicts.shape[1]), -spread),
+        ("false positive", ~labels & (positive > 0), -(positive + mean)),
     ):
         free = mask.copy()
         free[[index for index, _ in picked]] = False
@@ -109,25 +111,25 @@ def _state_card(
 
 def saliency_section(material: Material) -> Block:
     """Attributions of every member of one ensemble on a few held-out states."""
-    found = material.metrics["saliency"]
+    saliency = material.metrics["saliency"]
     title = "What members look at"
-    if found is None:
+    if saliency is None:
         lacking = ["Attributions: they need an ensemble artefact: train-ensemble."]
         return page.section("saliency", title, [], [], lacking, folded=True)
-    states = [state for goal in found["sub_goals"] for state in goal["states"]]
+    states = [state for goal in saliency["sub_goals"] for state in goal["states"]]
     errors = [member["completeness_error"] for state in states for member in state["members"]]
     method = states[0].get("method", "DeepLift") if states else "DeepLift"  # evaluations of earlier versions do not say
     text = (
-        f"Attributions by {method} (Figures 2 and 9 of the paper) of each member of {found['ensemble']} (seed "
-        f"{found['seed']}) on a few held-out states, against {found['baseline']}: what a state shares with that mean "
-        "gets no attribution. Orange speaks for 'reached', blue against it, each picture on its own scale; the state "
-        "shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. A member "
-        "that goes by what other contexts lack cannot transfer."
+        f"Attributions by {method} (Figures 2 and 9 of the paper) of each member of {saliency['ensemble']} (seed "
+        f"{saliency['seed']}) on a few held-out states, against {saliency['baseline']}: what a state shares with "
+        "that mean gets no attribution. Orange speaks for 'reached', blue against it, each picture on its own scale; "
+        "the state shows through in grey. Of a stack of frames the last is drawn, with its share of all attribution. "
+        "A member that goes by what other contexts lack cannot transfer."
     )
     if bars := [page.shown(material, drawn) for drawn in feature_figures(material)]:
         text = (
-            f"Attributions by {method} of each member of {found['ensemble']} (seed {found['seed']}), against "
-            f"{found['baseline']}. A member that goes by what means something else elsewhere cannot transfer."
+            f"Attributions by {method} of each member of {saliency['ensemble']} (seed {saliency['seed']}), against "
+            f"{saliency['baseline']}. A member that goes by what means something else elsewhere cannot transfer."
         )
     check = (
         f"Completeness: attributions must add up to the state's log-odds less the baseline's; the largest error is "
@@ -135,7 +137,7 @@ def saliency_section(material: Material) -> Block:
     )
     blocks = bars or [
         _cards(material, goal["sub_goal"], index, state)
-        for goal in found["sub_goals"]
+        for goal in saliency["sub_goals"]
         for index, state in enumerate(goal["states"])
     ]
     missing = [] if blocks else ["No member calls any held-out state reached: there is nothing to attribute."]
@@ -149,21 +151,21 @@ def _cards(material: Material, sub_goal: str, index: int, state: Entry) -> Block
     cards = [_state_card(observation, sub_goal, truth, f"truth: {'yes' if truth else 'no'}", place)]
     for member in state["members"]:
         number = member["member"]
-        said = page.verdict(arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth)
-        lines = [said]
+        answer = page.verdict(arrays["probabilities"][index, number], bool(arrays["verdicts"][index, number]), truth)
+        lines = [answer]
         if observation.shape[-1] != 3 and member["last_frame"] is not None:
             lines.append({"class": "no", "text": f"last frame: {100 * member['last_frame']:.0f} %"})
         values = flat(arrays["attributions"][index, number])
         drawn = attribution_png(values, brightness(arrays["seen"][index]) / 255)
-        alt = f"Attributions of member {number}, which says {said['text']}."
+        alt = f"Attributions of member {number}, which says {answer['text']}."
         cards.append({"png": page.encoded(drawn), "alt": alt, "title": f"member {number}", "lines": lines})
     return {"kind": "cards", "heading": f"{sub_goal}: {KINDS[state['kind']]}", "cards": cards, "small": True}
 
 
 def feature_figures(material: Material) -> Iterator[Drawn]:
     """Of observations that are no pictures: which features each member goes by, a plot for each sub-goal."""
-    found = material.metrics["saliency"]
-    for goal in (goal["sub_goal"] for goal in (found["sub_goals"] if found and material.of_numbers() else ())):
+    saliency = material.metrics["saliency"]
+    for goal in (goal["sub_goal"] for goal in (saliency["sub_goals"] if saliency and material.of_numbers() else ())):
         arrays = material.within(f"saliency/{goal}")
         caption = f"Mean absolute attribution on held-out states of {goal}, the {MOST_BARS} largest at most."
         values = np.abs(arrays["attributions"]).mean(0)
@@ -190,27 +192,28 @@ def figures(material: Material) -> Iterator[Drawn]:
     if material.of_numbers():
         yield from feature_figures(material)
         return
-    found = material.metrics["saliency"]
-    goals = [goal for goal in (found["sub_goals"] if found else ()) if goal["states"]]
+    saliency = material.metrics["saliency"]
+    goals = [goal for goal in (saliency["sub_goals"] if saliency else ()) if goal["states"]]
     for goal in goals:
         arrays = material.within(f"saliency/{goal['sub_goal']}")
         state = {name: arrays[name][0] for name in EXPLAINED}
         suffix = f"-{goal['sub_goal']}" if len(goals) > 1 else ""
         place = page.texts(arrays["places"])[0]
         error = max(member["completeness_error"] for member in goal["states"][0]["members"])
-        about = (
-            f"Attributions by {goal['states'][0].get('method', 'DeepLift')} of each member of {found['ensemble']} "
-            f"(seed {found['seed']}) on a held-out state of {goal['sub_goal']}{f' ({place})' if place else ''}: "
+        description = (
+            f"Attributions by {goal['states'][0].get('method', 'DeepLift')} of each member of {saliency['ensemble']} "
+            f"(seed {saliency['seed']}) on a held-out state of {goal['sub_goal']}{f' ({place})' if place else ''}: "
             f"{KINDS[goal['states'][0]['kind']]}. Against "
-            f"{found['baseline']}. Orange speaks for 'reached', blue against it; each picture has a scale of its own. "
+            f"{saliency['baseline']}. Orange speaks for 'reached', blue against it; each picture has its own "
+            f"scale. "
             f"They add up to the difference in log-odds within {error:.0e}."
         )
         colours = state["seen"].shape[-1] == 3
         every = "Colour by colour." if colours else "Every frame that members see."
         last = "" if colours else " Of the stack of frames the last."
         members, frames = attributions_of_members(state), attributions_of_every_frame(state)
-        yield Drawn(f"figure2{suffix}", "Figure 2", members, f"Figure 2 of the paper. {about}{last}")
-        yield Drawn(f"figure9{suffix}", "Figure 9", frames, f"Figure 9 of the paper. {about} {every}")
+        yield Drawn(f"figure2{suffix}", "Figure 2", members, f"Figure 2 of the paper. {description}{last}")
+        yield Drawn(f"figure9{suffix}", "Figure 9", frames, f"Figure 9 of the paper. {description} {every}")
 
 
 def _said(state: Mapping[str, NDArray[Any]], member: int) -> str:
@@ -244,8 +247,8 @@ def attributions_of_every_frame(state: Mapping[str, NDArray[Any]]) -> Figure:
         frame = state["seen"][..., channel]
         show_picture(places[channel], frame, name)
         for member, values in enumerate(state["attributions"]):
-            image, said = attribution_image(values[..., channel], frame / 255), _said(state, member)
-            show_picture(places[(member + 1) * channels + channel], image, "" if channel else said)
+            image, answer = attribution_image(values[..., channel], frame / 255), _said(state, member)
+            show_picture(places[(member + 1) * channels + channel], image, "" if channel else answer)
     _key(figure, places)
     return figure
 
@@ -261,7 +264,7 @@ def _key(figure: Figure, places: Sequence[Axes]) -> None:
 
 QUESTION = Question(
     look=look,
-    numbers=lambda work: {"saliency": work.kept("saliency", work.shown)},
+    view=lambda work: {"saliency": work.kept("saliency", work.shown)},
     sections=sections,
     figures=figures,
     needed={"figure2": NEEDED, "figure9": NEEDED},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,11 +19,12 @@ from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import BUILT_IN, Engine, Layouts, load_domain, step_of
 from hypogoal.evaluation import choosing, page
 from hypogoal.evaluation.curves import LEARNED, PRETRAINING, RANDOM, THOMPSON, base_name, variants, which
-from hypogoal.evaluation.numbers import Metrics, Row, rows_of_members
+from hypogoal.evaluation.numbers import Metrics
 from hypogoal.evaluation.page import Block, Drawn, Entry, Material, Question
 from hypogoal.evaluation.pictures import overlay
 from hypogoal.evaluation.plots import GREY, PICTURE_TITLE, grid_of_pictures, show_picture
 from hypogoal.evaluation.run import Choices, read_choices, thresholds_of, within
+from hypogoal.evaluation.table import Row, by_fields, by_run, rows_by_member, select
 from hypogoal.hypotheses.scores import member_scores, most_and_least
 from hypogoal.meta.config import layout_seeds
 
@@ -49,61 +50,71 @@ def preference(chosen: NDArray[Any], expected: NDArray[np.float64]) -> NDArray[n
     return np.where(expected > 0, chosen / safe, np.nan)
 
 
-def selection_of_run(
-    choices: Choices, match: NDArray[np.float64], sub_goals: Sequence[str], members: int
-) -> list[dict[str, Any]]:
-    """Spec F6: how often each of K members of G sub-goals was offered and chosen, beside its ``match``, float (G*K,).
+def rows_of_choices(
+    choices: Choices, sub_goals: Sequence[str], members: int, more: Mapping[str, NDArray[Any]], **place: Any
+) -> Iterator[Row]:
+    """Spec F6: how often each of K members of G sub-goals was offered and chosen, and ``more`` of each, (G*K,).
 
-    A row per sub-goal: the most and the least preferred of its ``members``, of each of which there are option, offered,
-    chosen, reached, expected, mean duration in steps, match and preference. NaN where not defined.
+    Of each member there are offered, chosen, reached, expected, mean duration in steps, and preference.
     """
     options = len(sub_goals) * members
     totals = {name: choices.total(name, options) for name in ("offered", "chosen", "expected", "reached", "duration")}
-    duration = np.divide(totals["duration"], totals["chosen"], out=np.full(options, np.nan), where=totals["chosen"] > 0)
-    counts = {name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")}
-    columns = {**counts, "expected": totals["expected"], "duration": duration, "match": match}
-    columns["preference"] = preference(totals["chosen"], totals["expected"])
-    by_goal = []
+    chosen = totals["chosen"]
+    duration = np.divide(totals["duration"], chosen, out=np.full(options, np.nan), where=chosen > 0)
+    columns: dict[str, NDArray[Any]] = {
+        name: totals[name].astype(np.int64) for name in ("offered", "chosen", "reached")
+    }
+    columns |= {"expected": totals["expected"], "duration": duration, **more}
+    columns["preference"] = preference(chosen, totals["expected"])
     for index, sub_goal in enumerate(sub_goals):
-        start = index * members
-        most, least = most_and_least(columns["preference"][start : start + members])
-        rows = [
-            {"member": option - start, "option": option, **{name: of[option].item() for name, of in columns.items()}}
-            for option in range(start, start + members)
-        ]
-        by_goal.append({"sub_goal": sub_goal, "members": rows, "most": most, "least": least})
-    return by_goal
+        part = slice(index * members, (index + 1) * members)
+        of_goal = {name: values[part] for name, values in columns.items()}
+        yield from rows_by_member(of_goal, **place, sub_goal=sub_goal, scope=SCOPE)
 
 
-def numbers(work: Work) -> dict[str, Any]:
-    """Spec F6: the choices of every run of each agent whose options are members."""
-    found, metrics = work.contents, []
-    artefacts = {found.name(artefact): artefact for artefact in found.agents}
+def rows(work: Work) -> Iterator[Row]:
+    """Spec F6: the choices of every run of each agent whose options are members, and how well these match the truth."""
     judged = cache(on_layout)
-    for agent in work.metrics["agents"]:
-        rows = []
-        for about in agent["runs"]:
-            work.progress.advance()
-            artefact = artefacts[about["path"]]
-            config, folder = artefact.config, artefact.path
-            if base_name(artefact.kind, config) not in SELECTED:
-                continue
-            ensemble = artefact.input("ensemble")
-            seeds = layout_seeds(config.get("layouts", ""), about["layout_seed"])[:LOOKED_AT]
-            choices, members = read_choices(folder / "choices.csv"), judged(ensemble, tuple(seeds))
-            for option, (picture, count) in members.sets.items():
-                place = f"terminations/{about['path']}/{option}"
-                work.arrays[place] = picture
-                work.arrays[place].attrs["states"] = count
-            of = {name: about[name] for name in ("path", "seed", "layout_seed")}
-            chosen = selection_of_run(choices, members.match, config["sub_goals"], config["members"])
-            thresholds = thresholds_of(artefact)
-            for member in (member for goal in chosen for member in goal["members"]):
-                member["threshold"] = thresholds[member["option"]].item()
-            rows.append({**of, "ensemble": within(found, open_artefact(ensemble, "ensemble")), "sub_goals": chosen})
-        if rows:
-            metrics.append({"name": agent["name"], "runs": rows})
-    return {"selection": metrics}
+    for name, run in ((name, run) for name, runs in work.agents.items() for run in runs):
+        work.progress.advance()
+        artefact = work.artefact(run.path)
+        config = artefact.config
+        if base_name(artefact.kind, config) not in SELECTED:
+            continue
+        layout = run.layout["layout_seed"]
+        seeds = layout_seeds(config.get("layouts", ""), layout)[:LOOKED_AT]
+        choices, members = read_choices(artefact.path / "choices.csv"), judged(artefact.input("ensemble"), tuple(seeds))
+        for option, (picture, count) in members.sets.items():
+            dataset = f"terminations/{run.path}/{option}"
+            work.arrays[dataset] = picture
+            work.arrays[dataset].attrs["states"] = count
+        more = {"match": members.match, "threshold": thresholds_of(artefact)}
+        place = {"method": name, "layout": layout, "seed": run.seed, "artefact": run.path}
+        yield from rows_of_choices(choices, config["sub_goals"], config["members"], more, **place)
+
+
+def view(work: Work) -> dict[str, Any]:
+    """Of each run its sub-goals' members, see :func:`selection_of`, and which ensemble they are of."""
+    selection = selection_of(work.rows)
+    for run in (run for agent in selection for run in agent["runs"]):
+        source = open_artefact(work.artefact(run["path"]).input("ensemble"), "ensemble")
+        run["ensemble"] = within(work.contents, source)
+    return {"selection": selection}
+
+
+def selection_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """By agent and run: of each sub-goal its members, each with its option, and the most and the least preferred."""
+    selection: list[dict[str, Any]] = []
+    for (name,), rows_of_agent in by_fields(select(rows, scope=SCOPE), "method").items():
+        runs = by_run(rows_of_agent)
+        for goals in (run["sub_goals"] for run in runs):
+            for option, member in enumerate(member for goal in goals for member in goal["members"]):
+                member["option"] = option
+            for goal in goals:
+                preferences = np.array([member["preference"] for member in goal["members"]])
+                goal["most"], goal["least"] = most_and_least(preferences)
+        selection.append({"name": name, "runs": runs})
+    return selection
 
 
 class OnLayout(NamedTuple):
@@ -156,15 +167,6 @@ def states_met(engine: Engine, steps: int, rng: np.random.Generator) -> NDArray[
     return np.unique(np.concatenate(met))
 
 
-def rows(metrics: Metrics, arrays: Any) -> Iterator[Row]:
-    """Every member as an option of every run."""
-    for agent in metrics["selection"]:
-        for run in agent["runs"]:
-            about = {"method": agent["name"], "layout": run["layout_seed"], "seed": run["seed"], "scope": SCOPE}
-            for goal in run["sub_goals"]:
-                yield from rows_of_members(goal["members"], **about, sub_goal=goal["sub_goal"], artefact=run["path"])
-
-
 def missing(work: Work) -> list[str]:
     """Sub-goals of which the domain does not know where they are reached, and where to say it."""
     domains = {work.contents.name(artefact): artefact.config.get("domain", "") for artefact in work.contents.agents}
@@ -177,11 +179,11 @@ def missing(work: Work) -> list[str]:
     }
     lines = []
     for name, domain in unknown:
-        found = load_domain(domain)
-        do = f"add {name} to {found.labels_stand_in}"
+        loaded = load_domain(domain)
+        do = f"add {name} to {loaded.labels_stand_in}"
         do = "import them under one of these names, if it is one of them" if domain in BUILT_IN else do
         lines.append(
-            f"no truth of {name} to match members with: {domain} has {page.listed(found.sub_goals)}; {do}, then "
+            f"no truth of {name} to match members with: {domain} has {page.listed(loaded.sub_goals)}; {do}, then "
             "evaluate again"
         )
     return lines
@@ -314,9 +316,9 @@ def termination_states(sides: Sequence[tuple[str, NDArray[np.uint8] | None]]) ->
 
 
 QUESTION = Question(
-    numbers=numbers,
-    missing=missing,
     rows=rows,
+    view=view,
+    missing=missing,
     summary=summary,
     sections=sections,
     figures=figures,

@@ -5,14 +5,14 @@ What limits an agent, its options tell: they stop where their members are wrong 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
+from rich.table import Table as Printed
 
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
@@ -20,8 +20,9 @@ from hypogoal.domains.base import Engine, load_domain
 from hypogoal.evaluation import page
 from hypogoal.evaluation.choosing import UNIFORM
 from hypogoal.evaluation.curves import NEAR
-from hypogoal.evaluation.numbers import Metrics, Row, grouped, over, rows_of
+from hypogoal.evaluation.numbers import Metrics, grouped
 from hypogoal.evaluation.page import Block, Material, Question
+from hypogoal.evaluation.table import Number, Row, Table, rows_of, select, tabulate
 from hypogoal.meta.config import layout_seeds
 
 if TYPE_CHECKING:
@@ -57,99 +58,108 @@ def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
     """
-    from hypogoal.evaluation.frozen import begin_anew, scores
-    from hypogoal.options.choosers import Chooser
+    from hypogoal.evaluation.frozen import Always, begin_anew, scores
 
-    class Always(Chooser):
-        def choose(self, environments: Any, ids: NDArray[np.int64], offered: Any) -> NDArray[np.int64]:
-            return np.full(len(ids), option)
-
-    begin_anew(loop, Always())
+    begin_anew(loop, Always(option))
     engine, steps = loop.engine, np.zeros(loop.engine.count, dtype=np.int64)
-    holds, (yes, there) = engine.labels(engine.ids)[:, goal], np.zeros((2, engine.count), dtype=np.bool_)
-    going = ~yes
+    holds, (positive, reached) = engine.labels(engine.ids)[:, goal], np.zeros((2, engine.count), dtype=np.bool_)
+    going = ~positive
     for _ in range(PATIENCE * loop.config.option_timeout):
         moved = loop.advance(learning=False)
         steps[going] += 1
         ends = going & moved.reached
-        yes[ends], there[ends] = True, engine.labels(moved.next_ids[ends])[:, goal]
+        positive[ends], reached[ends] = True, engine.labels(moved.next_ids[ends])[:, goal]
         going &= ~moved.reached & (engine.elapsed > 0)  # nor did the episode end
         if not going.any():
             break
-    scored = scores(there, steps, shortest) | {"wrong_yes": (yes & ~there) * 1.0}
-    return {name: np.where(holds, np.nan, of) for name, of in scored.items()}
+    scored = scores(reached, steps, shortest) | {"wrong_yes": (positive & ~reached) * 1.0}
+    return {name: np.where(holds, np.nan, values) for name, values in scored.items()}
 
 
 def played(artefact: Artefact, layouts: tuple[int, ...]) -> dict[tuple[str, ...], Played]:
-    """What an agent does, ``("agent",)``, chance among its options, and each option, (sub-goal, member)."""
+    """What an agent does, ``("agent",)``, random choice among its options, and each option, (sub-goal, member)."""
     from hypogoal.evaluation.frozen import play
     from hypogoal.meta.episodes import agent_of
     from hypogoal.options.choosers import RandomChooser
 
-    config, known = artefact.config, load_domain(artefact.config["domain"]).sub_goals
+    config, sub_goals = artefact.config, load_domain(artefact.config["domain"]).sub_goals
     loop = agent_of(artefact, artefact.seed, len(layouts), layouts)
     loop.config = replace(loop.config, restart_options=False)
     ways = shortest_ways(loop.engine)
-    found: dict[tuple[str, ...], Played] = {}
+    scores_by_player: dict[tuple[str, ...], Played] = {}
     if artefact.kind == "meta":
         choosers = {"agent": loop.chooser, UNIFORM: RandomChooser(rng_for(artefact.seed, "uniform-choice"))}
         for name, chooser in choosers.items():
             episodes = play(loop, chooser, EPISODES)
             scores = episodes.scores(ways[:, -1:]) | {"length": episodes.length}
-            found[name,] = {quantity: values.mean(1) for quantity, values in scores.items()}
+            scores_by_player[name,] = {quantity: values.mean(1) for quantity, values in scores.items()}
     loop.config, loop.initiation = replace(loop.config, mask_reached=False), None
     for index, sub_goal in enumerate(config["sub_goals"]):
-        if sub_goal in known:  # else the user's own labels said it: its truth here is not known
-            goal, first = known.index(sub_goal), index * config["members"]
-            members = [alone(loop, first + of, goal, ways[:, goal]) for of in range(config["members"])]
-            found[sub_goal, MEAN] = {name: np.mean([of[name] for of in members], axis=0) for name in OF_OPTIONS}
-            found |= {(sub_goal, str(of)): scores for of, scores in enumerate(members)}
-    return found
+        if sub_goal in sub_goals:  # else the user's own labels said it: its truth here is not known
+            goal, first = sub_goals.index(sub_goal), index * config["members"]
+            members = [alone(loop, first + numbers, goal, ways[:, goal]) for numbers in range(config["members"])]
+            scores_by_player |= {(sub_goal, str(numbers)): scores for numbers, scores in enumerate(members)}
+    return scores_by_player
 
 
-def numbers(work: Work) -> dict[str, Any]:
-    """Of every agent and option; nothing where no layouts were given."""
-    if not work.layouts:
-        return {}
-    names = {run["path"]: agent["name"] for agent in work.metrics["agents"] for run in agent["runs"]}
-    found: list[tuple[tuple[str, ...], dict[str, Any]]] = []
-    for artefact in work.contents.agents:
+def rows(work: Work) -> Iterator[Row]:
+    """Every agent, uniform-random choice among its options, and each option on every layout; none without layouts."""
+    for artefact in work.contents.agents if work.layouts else ():
         if "options.safetensors" not in artefact.manifest["files"]:
             work.progress.advance(len(work.layouts))
             continue
-        path, config = work.contents.name(artefact), artefact.config
+        path = work.contents.name(artefact)
+        place = {"scope": SCOPE, "seed": artefact.seed, "artefact": path}
         parts = []
         for first in range(0, len(work.layouts), AT_ONCE):
             layouts = work.layouts[first : first + AT_ONCE]
             parts.append(played(artefact, layouts))
             work.progress.advance(len(layouts))
-        own = {*layout_seeds(config.get("layouts", ""), config["layout_seed"])}
-        about = {"path": path, "seed": artefact.seed, "trained_on": len(own.intersection(work.layouts))}
         for key in parts[0]:
             joined = {name: np.concatenate([part[key][name] for part in parts]).tolist() for name in parts[0][key]}
-            found.append(((names[path], *key), about | joined))
-    told: dict[str, Any] = {"layouts": list(work.layouts), "agents": [], "options": []}
-    for (agent, *key), alike in grouped(found, itemgetter(0)).items():
-        runs = [run for _, run in alike]
-        entry: dict[str, Any] = {"agent": agent, "name": key[0] if key[0] == UNIFORM else agent, "runs": runs}
-        if options := len(key) > 1:
-            entry |= {"sub_goal": key[0], "member": key[1]}
-        for name in OF_OPTIONS if options else OF_AGENTS:
-            values, unit = [value for run in runs for value in run[name]], "steps" if name == "length" else "fraction"
-            entry[name] = over(values, unit, SCOPE, agent, *key, name, layouts=work.layouts * len(runs))
-        told["options" if options else "agents"].append(entry)
-    return {"zero_shot": told}
+            of_option = len(key) > 1
+            where = {"sub_goal": key[0], "member": int(key[1])} if of_option else {}
+            method = UNIFORM if key[0] == UNIFORM else work.agent_of(path)
+            for index, layout in enumerate(work.layouts):
+                numbers = {name: joined[name][index] for name in (OF_OPTIONS if of_option else OF_AGENTS)}
+                yield from rows_of(numbers, method=method, **where, layout=layout, **place)
 
 
-def rows(metrics: Metrics, arrays: Mapping[str, Any]) -> Iterator[Row]:
-    """Every agent and option on every layout."""
-    told = metrics.get("zero_shot", {"layouts": [], "agents": [], "options": []})
-    for names, entry in [(OF_AGENTS, of) for of in told["agents"]] + [(OF_OPTIONS, of) for of in told["options"]]:
-        place = {"scope": SCOPE} | {key: entry[key] for key in ("sub_goal", "member") if key in entry}
-        for run in entry["runs"] if place.get("member") != MEAN else ():
-            place |= {"method": entry["name"], "seed": run["seed"], "artefact": run["path"]}
-            for index, layout in enumerate(told["layouts"]):
-                yield from rows_of({name: run[name][index] for name in names}, **place, layout=layout)
+def _columns(names: Sequence[str]) -> dict[str, Number]:
+    return {name: Number(name, SCOPE, "steps" if name == "length" else "fraction") for name in names}
+
+
+def view(work: Work) -> dict[str, Any]:
+    """Over layouts: ``agents``, each with uniform-random choice among its options below it, and ``options`` alone."""
+    if not work.layouts:
+        return {}
+
+    def agent(row: Row) -> str:
+        return work.agent_of(row.artefact)
+
+    rows = select(work.rows, scope=SCOPE)
+    of_options = [row for row in rows if row.sub_goal]
+    by_chooser = Table(
+        {"agent": agent, "name": "method"},
+        _columns(OF_AGENTS),
+        cell=lambda key: (SCOPE, key[0], UNIFORM if key[1] == UNIFORM else "agent"),
+    )
+    by_sub_goal = Table(
+        {"agent": agent, "sub_goal": "sub_goal"}, _columns(OF_OPTIONS), cell=lambda key: (SCOPE, *key, MEAN)
+    )
+    by_member = Table(
+        {**by_sub_goal.by, "member": "member"}, by_sub_goal.numbers, cell=lambda key: (SCOPE, *map(str, key))
+    )
+    agents = tabulate((row for row in rows if not row.sub_goal), by_chooser)
+    for entry in agents:
+        configs = [run.config for run in work.agents[entry["agent"]]]
+        trained = [layout_seeds(config.get("layouts", ""), config["layout_seed"]) for config in configs]
+        entry["trained_on"] = max(len({*seeds}.intersection(work.layouts)) for seeds in trained)
+    members = grouped(tabulate(of_options, by_member), itemgetter("agent", "sub_goal"))
+    options = []
+    for mean in tabulate(of_options, by_sub_goal):
+        options += [mean | {"member": MEAN}, *members[mean["agent"], mean["sub_goal"]]]
+    return {"zero_shot": {"layouts": list(work.layouts), "agents": agents, "options": options}}
 
 
 SCORES = (
@@ -161,8 +171,8 @@ AGENTS = (
     page.label("agent", "name"),
     *SCORES,
     page.number("steps", "length", page.interval, 0),
-    page.number("trained on", lambda entry: max(run["trained_on"] for run in entry["runs"])),
-    page.number("runs", lambda entry: len(entry["runs"])),
+    page.number("trained on", "trained_on"),
+    page.number("runs", "runs"),
 )
 OPTIONS = (
     page.label("options of", "agent", once=True),
@@ -173,19 +183,23 @@ OPTIONS = (
 )
 
 
-def summary(metrics: Metrics) -> list[Table]:
+def summary(metrics: Metrics) -> list[Printed]:
     """For a terminal: agents, and the mean member of each sub-goal."""
-    if not (told := metrics.get("zero_shot")):
+    if not (zero_shot := metrics.get("zero_shot")):
         return []
-    means = [of | {"name": f"{of['sub_goal']}, mean member"} for of in told["options"] if of["member"] == MEAN]
-    return [page.terminal(TITLE, (AGENTS[0], SCORES[0], SCORES[2]), [*told["agents"], *means])]
+    means = [
+        entry | {"name": f"{entry['sub_goal']}, mean member"}
+        for entry in zero_shot["options"]
+        if entry["member"] == MEAN
+    ]
+    return [page.terminal(TITLE, (AGENTS[0], SCORES[0], SCORES[2]), [*zero_shot["agents"], *means])]
 
 
 def sections(material: Material) -> list[Block]:
     """A table of agents and one of options; none where no layouts were given."""
-    if not (told := material.metrics.get("zero_shot")):
+    if not (zero_shot := material.metrics.get("zero_shot")):
         return []
-    layouts = told["layouts"]
+    layouts = zero_shot["layouts"]
     text = (
         f"Trained agents play {len(layouts)} layouts ({layouts[0]} to {layouts[-1]}), {EPISODES} episodes each, and "
         "nothing is learned: options are greedy, choices drawn as in training; so does chance among the same options. "
@@ -194,14 +208,14 @@ def sections(material: Material) -> list[Block]:
         "it was a wrong yes, and what is left of 100 % never got a yes."
     )
     caption = f"Over layouts. Trained on: how many of these layouts its training drew from, too. {page.INTERVALS}"
-    tables = [page.table(AGENTS, told["agents"], caption=caption.format(units="layouts"))]
-    tables.append(page.table(OPTIONS, told["options"], tight=True, heading="Each option alone"))
-    return [page.section("zero-shot", TITLE, [text], [of for of in tables if of["rows"]])]
+    tables = [page.table(AGENTS, zero_shot["agents"], caption=caption.format(units="layouts"))]
+    tables.append(page.table(OPTIONS, zero_shot["options"], tight=True, heading="Each option alone"))
+    return [page.section("zero-shot", TITLE, [text], [block for block in tables if block["rows"]])]
 
 
 QUESTION = Question(
-    numbers=numbers,
     rows=rows,
+    view=view,
     summary=summary,
     sections=sections,
     meanings={

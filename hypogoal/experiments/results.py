@@ -5,21 +5,25 @@ differs between two runs of the same commands: no time, no machine, no path.
 """
 
 from collections.abc import Iterator, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core.artefacts import Artefact, open_artefact
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import json_lines, read_json, read_text, write_table
-from hypogoal.core.manifests import AGAIN, LOG
+from hypogoal.core.files import json_lines, read_text, write_table
+from hypogoal.core.manifests import AGAIN, LOG, NUMBERS_CSV
 from hypogoal.dataset import open_dataset
-from hypogoal.evaluation import curves, distance, hypotheses
-from hypogoal.evaluation.numbers import Row, rows_of
+from hypogoal.evaluation import curves, distance
+from hypogoal.evaluation.numbers import grouped
 from hypogoal.evaluation.run import read_episodes, read_executions, read_layout
+from hypogoal.evaluation.table import Row, defined, read_rows, rows_of, select
 from hypogoal.experiments.cells import COLUMNS, Cell, Plan
 from hypogoal.experiments.records import RESULTS
 from hypogoal.experiments.status import done_of
+
+SCOPES = ("", "labelled", "unlabelled", "heldout", "unseen", "all")  # of what is listed
 
 
 def write_results(plan: Plan, run: Path) -> Path:
@@ -40,12 +44,12 @@ def _lines(plan: Plan, run: Path, names: Sequence[str]) -> Iterator[list[Any]]:
     evaluated: dict[str, list[Row]] = {}
     for cell in done:
         if cell.stage == "evaluate":
-            for row in _of_metrics(read_json(cell.out / "metrics.json", "the evaluation's numbers are", AGAIN)):
-                evaluated.setdefault(row.artefact, []).append(row)
+            listed = select(read_rows(cell.out / NUMBERS_CSV), step="", scope=SCOPES)
+            evaluated = grouped(listed, attrgetter("artefact"))
     for cell in done:
         axes = dict(cell.axes)
         place = [cell.name, cell.stage, *(axes.get(name, "") for name in names)]
-        for row in _of_cell(cell, evaluated.get(cell.out.relative_to(run).as_posix(), [])):
+        for row in defined(_of_cell(cell, evaluated.get(cell.out.relative_to(run).as_posix(), []))):
             yield [*place, row.sub_goal, row.member, row.scope, row.quantity, row.value]
 
 
@@ -65,23 +69,16 @@ def _of_cell(cell: Cell, evaluated: Sequence[Row]) -> Iterator[Row]:
     yield from evaluated
     if "executions.csv" in files:
         if not evaluated:
-            axes = {"method": "", "groups": None, "ladder": "", "seed": artefact.seed, "path": ""}
-            rows = distance.rows_of_ladder(artefact, read_executions(artefact.path / "executions.csv"), {})
-            yield from _of_metrics({"distance": {"options": [{**axes, **row} for row in rows]}})
+            config, executions = artefact.config, read_executions(artefact.path / "executions.csv")
+            more = {"masked": config["mask_reached"], "seed": artefact.seed}
+            yield from distance.rows_of_ladder(executions, config["sub_goals"], config["members"], {}, **more)
     elif "episodes.csv" in files:
         layout = read_layout(artefact.path / "layout.json")
         if not evaluated:
             episodes = read_episodes(artefact.path / "episodes.csv")
             run = curves.Run(artefact.kind, "", artefact.seed, artefact.config, episodes, layout)
-            yield from _of_metrics({"agents": [curves.agent_metrics("", [run])]})
+            yield from curves.rows_of_run(run, "")
         yield from rows_of({"random_success": layout["random_success"]})
-
-
-def _of_metrics(metrics: dict[str, Any]) -> Iterator[Row]:
-    """The numbers of each artefact in ``metrics.json``: members, options, runs."""
-    metrics = {"ensembles": [], "agents": [], "layouts": [], "distance": {"options": []}, **metrics}
-    for rows in (hypotheses.rows, distance.rows, curves.rows):
-        yield from rows(metrics, {})
 
 
 def _states(path: Path) -> Iterator[Row]:

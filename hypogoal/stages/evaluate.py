@@ -14,13 +14,14 @@ from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.preflight import free_memory, preflight
 from hypogoal.core.progress import Progress
 from hypogoal.core.workers import cores
-from hypogoal.evaluation.curves import SOLVED
+from hypogoal.evaluation.curves import SOLVED, group_runs, read_run
 from hypogoal.evaluation.distance import INSIDE, NEAR
 from hypogoal.evaluation.judging import Case, Work, cases_of, judgements, processes_for
-from hypogoal.evaluation.numbers import Row, ensemble_names, groups_of, method_names, plain
+from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.provenance import provenance
 from hypogoal.evaluation.questions import QUESTIONS, agents_last, meanings
-from hypogoal.evaluation.run import LAST, WINDOW, find, most_used
+from hypogoal.evaluation.run import FORMAT, LAST, WINDOW, find, most_used
+from hypogoal.evaluation.table import Row, compared, defined
 from hypogoal.experiments.cells import DERIVED
 from hypogoal.experiments.records import PLAN, read_plan
 from hypogoal.experiments.status import stamp_of
@@ -59,25 +60,26 @@ def evaluate(
         parts = 2 * len(cases) + len(contents.ladders) + len(contents.agents) * (1 + len(seeds))
         steps = Progress("evaluate", total=parts, quiet=quiet)
         with create_hdf5(folder / "arrays.h5") as arrays, steps as progress:
-            work = Work(contents, arrays, progress, seeds)
+            agents = group_runs([read_run(artefact, contents.name(artefact)) for artefact in contents.agents])
+            work = Work(contents, arrays, progress, seeds, agents=agents)
             judge_ensembles(work, cases, workers)
             for question in QUESTIONS:
-                work.metrics |= question.numbers(work)
+                work.rows += question.rows(work)
+                work.metrics |= question.view(work)
+            pairs = [question.pairs for question in QUESTIONS if question.pairs]
             metrics = plain(
                 {
+                    "format": FORMAT,
                     "run": contents.run.resolve().name,
                     "settings": {**settings, **(LADDERS if contents.ladders else {})},
                     "missing": missing(work),
-                    "ensembles": work.ensembles,
                     **work.metrics,
+                    "comparisons": {by.name: compared(work.rows, by) for by in pairs},
                     "provenance": provenance(contents, data),
                     "quantities": meanings(),
                 }
             )
-            rows = [row for question in QUESTIONS for row in question.rows(metrics, arrays)]
-        pairs = [question.pairs({"ensembles": work.ensembles, **work.metrics}) for question in QUESTIONS]
-        metrics["comparisons"] = plain({name: rows for by_name in pairs for name, rows in by_name.items()})
-        write_table(folder / "numbers.csv", Row._fields, rows)
+        write_table(folder / "numbers.csv", Row._fields, defined(work.rows))
         text = json.dumps(metrics, indent=1, allow_nan=False)
         (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
     return metrics
@@ -89,24 +91,15 @@ def judge_ensembles(work: Work, cases: Sequence[tuple[int, Case]], workers: int)
     Of one ensemble, the first of those with the most members, example states and attributions are kept too; of one,
     the one with the most members whose options were learned most often, states to browse.
     """
-    artefacts = work.contents.ensembles
-    configs = [artefact.config for artefact in artefacts]
+    configs = [artefact.config for artefact in work.contents.ensembles]
     work.shown = max(range(len(configs)), key=lambda index: configs[index]["members"], default=None)
     work.browsed = most_used(work.contents)
-    rows: list[list[dict[str, Any]]] = [[] for _ in configs]
-
+    rows: list[list[Row]] = [[] for _ in configs]
     for judgement in judgements(cases, workers, work.progress.advance):
         for question in QUESTIONS:
-            question.look(work, judgement)
-        rows[judgement.number].append(judgement.row)
+            rows[judgement.number] += question.look(work, judgement)
         work.progress.advance()
-    names = zip(artefacts, ensemble_names(configs), method_names(configs), rows, strict=True)
-    for artefact, name, method, goals in names:
-        about: dict[str, Any] = {"path": work.contents.name(artefact), "name": name, "seed": artefact.seed}
-        about["members"] = artefact.config["members"]
-        if any("rooms" in goal for goal in goals):
-            about |= {"method": method, "groups": groups_of(artefact.config)}
-        work.ensembles.append({**about, "sub_goals": goals})
+    work.rows += [row for of_ensemble in rows for row in of_ensemble]
 
 
 def missing(work: Work) -> list[str]:

@@ -30,25 +30,25 @@ def report(run: Path, *, videos: int | None = None, force: bool = False, resume:
     from hypogoal.evaluation.questions import render
 
     out = run / "report"
-    found = read_evaluation(run)
+    evaluation = read_evaluation(run)
     claim(out, kind="report", force=force, resume=resume)
     films, missing = _films(run, videos)
-    inputs = [found.source.path, *dict.fromkeys(one.agent.path for one in films)]
-    about: dict[str, Any] = {"kind": "report", "config": {"videos": len(films)}, "seed": 0, "inputs": inputs}
-    with create_artefact(out, **about, force=force, resume=resume) as folder:
-        metrics = {**found.metrics, "missing": [*found.metrics["missing"], *missing]}
-        shown = [film(one.gif, one.caption) for one in films[:1] if len(one.gif) <= MOST_BYTES]
-        material = Material(metrics, found.arrays, films=shown)
-        with fitting(found.source.path):
+    inputs = [evaluation.source.path, *dict.fromkeys(episode.agent.path for episode in films)]
+    card: dict[str, Any] = {"kind": "report", "config": {"videos": len(films)}, "seed": 0, "inputs": inputs}
+    with create_artefact(out, **card, force=force, resume=resume) as folder:
+        metrics = {**evaluation.metrics, "missing": [*evaluation.metrics["missing"], *missing]}
+        shown = [film(episode.gif, episode.caption) for episode in films[:1] if len(episode.gif) <= MOST_BYTES]
+        material = Material(metrics, evaluation.arrays, films=shown)
+        with fitting(evaluation.source.path):
             page = render(material, versions().get("hypogoal", "unknown"))
         (folder / "index.html").write_text(page, encoding="utf-8")
         (folder / "figures").mkdir()
         for name, figure in material.figures.items():
             (folder / "figures" / f"{name}.svg").write_text(material.drawings[name], encoding="utf-8")
             (folder / "figures" / f"{name}.png").write_bytes(to_png(figure))
-        for one in films:
+        for episode in films:
             (folder / "videos").mkdir(exist_ok=True)
-            (folder / "videos" / one.name).write_bytes(one.gif)
+            (folder / "videos" / episode.name).write_bytes(episode.gif)
     return out / "index.html"
 
 
@@ -75,15 +75,15 @@ def _films(run: Path, videos: int | None) -> tuple[list[Film], list[str]]:
 
 def agents_of(run: Path) -> list[Artefact]:
     """The run's agents that learned to choose among members' options; a ``UserError`` where there is none."""
-    found = [
+    agents = [
         artefact
         for artefact in find_artefacts(run, "meta")
         if artefact.config["chooser"] != "random" and artefact.config["termination"] != "oracle"
     ]
-    if not found:
+    if not agents:
         needed = "Videos need a meta artefact with learned terminations: train-meta."
         raise NoAgent("no agent to make videos of", run, needed)
-    return found
+    return agents
 
 
 class NoAgent(UserError):

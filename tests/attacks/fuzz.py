@@ -203,7 +203,7 @@ def read_run(case: Path, kind: str, often: bool) -> list[Callable[[], object]]:
             for entry in artefact.manifest["inputs"]:
                 artefact.input(entry["kind"])
         for artefact in found.agents:
-            curves.agent_metrics("agent", [curves.read_run(artefact, "agent")])
+            list(curves.rows_of_run(curves.read_run(artefact, "agent"), "agent"))
 
     def check() -> None:
         faults = faults_of(path)

@@ -6,10 +6,10 @@ import pytest
 from hypogoal.evaluation.curves import (
     Run,
     agent_curves,
-    agent_metrics,
+    agents_table,
     common_grid,
     group_runs,
-    rows,
+    rows_of_run,
     runs_section,
     summary_section,
 )
@@ -18,7 +18,7 @@ from hypogoal.evaluation.numbers import plain
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import meanings, paper_figures
 from hypogoal.evaluation.run import Choices, Episodes
-from hypogoal.evaluation.selection import sections, selection_of_run
+from hypogoal.evaluation.selection import rows_of_choices, sections, selection_of
 
 SUB_GOALS = ["open-red-door"]
 
@@ -40,9 +40,11 @@ def material_of(*runs):
     arrays = {"curves/grid": grid}
     for index, same in enumerate(groups.values()):
         arrays |= {f"curves/{index}/{key}": values for key, values in agent_curves(same, grid).items()}
-    agents = [agent_metrics(name, same) for name, same in groups.items()]
+    agents = agents_table(
+        [row for name, same in groups.items() for run in same for row in rows_of_run(run, name)], groups
+    )
     metrics = {"agents": agents, "layouts": [runs[0].layout], "settings": {"window": 100}, "missing": []}
-    metrics["selection"] = [chosen(name, same, arrays) for name, same in groups.items()]
+    metrics["selection"] = chosen(groups)
     nothing = {
         "hypotheses": [],
         "ensembles": [],
@@ -55,16 +57,19 @@ def material_of(*runs):
     return Material(plain({**metrics, **nothing}), arrays)
 
 
-def chosen(name, runs, arrays):
+def chosen(groups):
     """Two members of one sub-goal: the second is chosen more often, and an ensemble for each name of one."""
     columns = ([100, 100], [0, 1], [50, 50], [10, 40], [25.0, 25.0], [5, 30], [50, 60])
     choices = Choices(*(np.array(column) for column in columns))
+    runs = {run.path: (name, run) for name, same in groups.items() for run in same}
     rows = []
-    for run in runs:
-        found = selection_of_run(choices, np.array([0.6, 0.9]), SUB_GOALS, 2)
-        about = {"path": run.path, "seed": run.seed, "layout_seed": 200, "ensemble": run.config.get("ensemble")}
-        rows.append({**about, "sub_goals": found})
-    return {"name": name, "runs": rows}
+    for path, (name, run) in runs.items():
+        place = {"method": name, "layout": 200, "seed": run.seed, "artefact": path}
+        rows += rows_of_choices(choices, SUB_GOALS, 2, {"match": np.array([0.6, 0.9])}, **place)
+    selection = selection_of(rows)
+    for entry in (entry for agent in selection for entry in agent["runs"]):
+        entry["ensemble"] = runs[entry["path"]][1].config.get("ensemble")
+    return selection
 
 
 def answer(*runs):
@@ -119,13 +124,12 @@ def test_every_table_of_agents_says_how_many_came_near_the_shortest_path():
     spread, interval = tables_of(material)
     assert (spread["text"], spread["small"]) == ("0.50", "± 0.29")
     assert interval.startswith("0.50 [")
-    near = [row.value for row in rows(material.metrics, {}) if row.quantity == "near"]
-    assert near == [1, 0, 1, 0]
+    assert [run["near"] for run in material.metrics["agents"][0]["runs"]] == [1, 0, 1, 0]
     assert "1.5 times the layout's shortest path" in meanings()["near"]["meaning"]
     unknown = material_of(*(made(seed, shortest=None) for seed in range(4)))
     spread, interval = tables_of(unknown)
     assert [spread["text"], interval] == ["–"] * 2
-    assert not [row for row in rows(unknown.metrics, {}) if row.quantity == "near"]
+    assert {run["near"] for run in unknown.metrics["agents"][0]["runs"]} == {None}
 
 
 @pytest.mark.parametrize(

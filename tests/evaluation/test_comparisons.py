@@ -6,6 +6,7 @@ import pytest
 from hypogoal.evaluation import curves, distance, hypotheses, rooms
 from hypogoal.evaluation.numbers import compare_pairs
 from hypogoal.evaluation.page import comparison_tables
+from hypogoal.evaluation.table import BEST, VALIDATED, Row, compared, rows_of
 
 
 def pairs(first, second, units=None, **more):
@@ -64,17 +65,20 @@ def test_pairs_without_a_number_are_left_out():
     assert np.isnan(pairs([1, 2], [1, 2])["sign_test"])
 
 
-def run(layout, seed, length):
-    numbers = {"success": 1.0, "length": length, "near": float(length <= 15)}
-    return {"layout_seed": layout, "seed": seed, **numbers}
+def agent(name, *runs):
+    """Rows of runs, each (layout, seed, length)."""
+    for number, (layout, seed, length) in enumerate(runs):
+        numbers = {"success": 1.0, "length": length, "near": float(length <= 15)}
+        place = {"layout": layout, "seed": seed, "artefact": f"{name}-{number}"}
+        yield from rows_of(numbers, method=name, **place)
 
 
 def test_agents_are_paired_by_layout_and_seed():
     """Spec F5: runs without a partner count nothing; a shorter episode is the better one."""
-    own = {"name": "options", "runs": [run(100, 0, 12), run(100, 1, 14), run(101, 0, 20), run(102, 0, 5)]}
-    other = {"name": "random", "runs": [run(101, 0, 30), run(100, 0, 24), run(100, 1, 13)]}
-    alone = {"name": "elsewhere", "runs": [run(500, 0, 1)]}
-    rows = curves.against([own, other, alone])
+    own = list(agent("options", (100, 0, 12), (100, 1, 14), (101, 0, 20), (102, 0, 5)))
+    other = list(agent("random", (101, 0, 30), (100, 0, 24), (100, 1, 13)))
+    alone = list(agent("elsewhere", (500, 0, 1)))
+    rows = compared([*own, *other, *alone], curves.PAIRS)
     assert [(row["first"], row["second"], row["quantity"]) for row in rows] == [
         ("options", "random", quantity) for quantity in ("success", "length", "near")
     ]
@@ -84,25 +88,31 @@ def test_agents_are_paired_by_layout_and_seed():
     assert (near["n"], near["wins"], near["ties"]) == (3, 1, 2)
     assert length["units"] == 2
     assert length["difference"] == pytest.approx(((-12 + 1) / 2 - 10) / 2)  # each layout once
-    assert curves.against([]) == curves.against([own]) == []
-    unknown = [{**agent, "runs": [{**of, "near": None} for of in agent["runs"]]} for agent in (own, other)]
-    assert [row["n"] for row in curves.against(unknown)] == [3, 3, 0]
+    assert compared([], curves.PAIRS) == compared(own, curves.PAIRS) == []
+    unknown = [row._replace(value=np.nan) if row.quantity == "near" else row for row in (*own, *other)]
+    assert [row["n"] for row in compared(unknown, curves.PAIRS)] == [3, 3, 0]
+
+
+def members(values, quantity, **place):
+    """A row per member."""
+    return [Row(quantity, value, member=member, **place) for member, value in enumerate(values)]
 
 
 def ensemble(name, seed, **best):
-    goals = [{"sub_goal": goal, "balanced_accuracy": {"best": value, "mean": 0.5}} for goal, value in best.items()]
-    return {"name": name, "seed": seed, "sub_goals": goals}
+    place = {"method": name, "seed": seed, "artefact": f"{name}-{seed}", "scope": "heldout"}
+    goals = best.items()
+    return [row for goal, value in goals for row in members([value], "balanced_accuracy", **place, sub_goal=goal)]
 
 
 def test_ensembles_are_paired_by_seed_and_sub_goal():
     """Spec F1: D-BAT first, whatever comes first on disk; over all sub-goals."""
     ensembles = [
-        ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
-        ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
-        ensemble("dbat, K=2", 0, red=0.8, door=0.8),
-        ensemble("dbat, K=2", 1, red=0.9, door=1.0),
+        *ensemble("no diversity, K=2", 0, red=0.6, door=0.9),
+        *ensemble("no diversity, K=2", 1, red=0.7, door=0.9),
+        *ensemble("dbat, K=2", 0, red=0.8, door=0.8),
+        *ensemble("dbat, K=2", 1, red=0.9, door=1.0),
     ]
-    rows = hypotheses.QUESTION.pairs({"ensembles": ensembles})["hypotheses"]
+    rows = compared(ensembles, hypotheses.PAIRS)
     (best,) = (row for row in rows if "best" in row["quantity"])
     assert (best["first"], best["where"], best["units"]) == ("dbat, K=2", "", 2)
     assert (best["n"], best["wins"]) == (4, 3)
@@ -110,37 +120,36 @@ def test_ensembles_are_paired_by_seed_and_sub_goal():
 
 
 def judged(method, groups, seed, best):
-    score = {"balanced_accuracy": {"best": best, "validated": float("nan"), "mean": best}}
-    rooms = {"scopes": {"unseen": {"scores": score}}}
-    return {"method": method, "groups": groups, "seed": seed, "sub_goals": [{"sub_goal": "down", "rooms": rooms}]}
+    place = {"method": method, "N": groups, "seed": seed, "artefact": f"{method}-{groups}-{seed}", "sub_goal": "down"}
+    return members([best], "balanced_accuracy", **place, scope="unseen")
 
 
 def test_methods_on_ladders_are_paired_at_each_number_of_groups():
     """Spec F1: N=1 with N=1; where nothing could be validated there is no pair."""
     bests = {"none": 0.5, "dbat": 0.6}
-    ensembles = [judged(method, groups, 0, bests[method]) for method in bests for groups in (1, 2)]
-    rows = rooms.QUESTION.pairs({"ensembles": ensembles})["rooms"]
+    ensembles = [row for method in bests for groups in (1, 2) for row in judged(method, groups, 0, bests[method])]
+    rows = compared(ensembles, rooms.PAIRS)
     found = {(row["where"], row["quantity"].split(", ")[1]): row for row in rows}
     assert found["N=2", "best member"]["difference"] == pytest.approx(0.1)
     assert found["N=1", "best member"]["n"] == 1
     assert found["N=1", "validated member"]["n"] == 0
 
 
-def stopped(method, ladder, seed, distance):
-    option = {"distance": distance}
-    about = {"method": method, "groups": None if method.startswith("oracle") else 2, "ladder": ladder, "seed": seed}
-    return {**about, "sub_goal": "down", "best": 0, "validated": None, "options": [option]}
+def stopped(method, ladder, seed, *distances, validated=None):
+    place = {"method": method, "N": None if method.startswith("oracle") else 2, "ladder": ladder, "seed": seed}
+    place |= {"sub_goal": "down", "artefact": f"{method}-{ladder}-{seed}"}
+    return [*members(distances, "distance", **place), *rows_of({BEST: 0, VALIDATED: validated}, **place)]
 
 
 def test_options_are_paired_by_ladder_and_seed():
     """Spec F3: the nearer is the better; oracle terminations are not a method."""
     options = (
         [
-            stopped("none", "1L", 0, 40), stopped("none", "1R", 0, 10), stopped("dbat", "1L", 0, 10),
-            stopped("dbat", "1R", 0, 20), stopped("oracle termination", "1L", 0, 0),
+            *stopped("none", "1L", 0, 40), *stopped("none", "1R", 0, 10), *stopped("dbat", "1L", 0, 10),
+            *stopped("dbat", "1R", 0, 20), *stopped("oracle termination", "1L", 0, 0),
         ]
     )  # fmt: skip
-    rows = distance.QUESTION.pairs({"distance": {"options": options}})["distance"]
+    rows = compared(options, distance.PAIRS)
     row, _, mean = rows
     assert (row["first"], row["second"], row["wins"], row["n"], row["where"]) == ("dbat", "none", 1, 2, "N=2")
     assert (row["units"], row["difference"]) == (1, -10)
@@ -149,28 +158,26 @@ def test_options_are_paired_by_ladder_and_seed():
 
 def test_the_mean_member_does_not_gain_by_being_one_of_many():
     """Spec F3: of many alike the nearest is near; their mean is not."""
-    many, one = stopped("dbat", "1L", 0, 10), stopped("cnn", "1L", 0, 50)
-    many["options"] = [{"distance": value} for value in (10, 50, 90, float("nan"))]
-    found = {row["quantity"]: row["difference"] for row in distance.against([many, one])}
+    many, one = stopped("dbat", "1L", 0, 10, 50, 90, float("nan")), stopped("single CNN", "1L", 0, 50)
+    found = {row["quantity"]: row["difference"] for row in compared([*many, *one], distance.PAIRS)}
     assert found["distance, best member"] == -40
     assert found["distance, mean member"] == 0
     assert np.isnan(found["distance, validated member"])
 
 
 def test_a_member_that_was_never_executed_has_no_distance():
-    """Spec F3, F7: as metrics.json has it, null: runs with such a member are compared by the others."""
-    many, one = stopped("dbat", "1L", 0, 10), stopped("cnn", "1L", 0, 50)
-    many["options"] = [{"distance": value} for value in (10, None)]
-    many["validated"] = one["validated"] = 0
-    found = {row["quantity"]: row["difference"] for row in distance.against([many, one])}
+    """Spec F3, F7: runs with such a member are compared by the others."""
+    many = stopped("dbat", "1L", 0, 10, float("nan"), validated=0)
+    rows = [*many, *stopped("single CNN", "1L", 0, 50, validated=0)]
+    found = {row["quantity"]: row["difference"] for row in compared(rows, distance.PAIRS)}
     assert found == dict.fromkeys((f"distance, {which} member" for which in ("best", "validated", "mean")), -40)
 
 
 def test_what_is_alike_in_all_counts_each_for_itself():
     """Spec F5: options of three ensembles, all with the same seed: three pairs, not the last one read."""
-    runs = [run(5, 0, length) for length in (10, 20, 30)]
-    others = [run(5, 0, length) for length in (11, 22, 33)]
-    rows = curves.against([{"name": "a", "runs": runs}, {"name": "b", "runs": others}])
+    runs = agent("a", *((5, 0, length) for length in (10, 20, 30)))
+    others = agent("b", *((5, 0, length) for length in (11, 22, 33)))
+    rows = compared([*runs, *others], curves.PAIRS)
     length = next(row for row in rows if row["quantity"] == "length")
     assert (length["n"], length["wins"], length["units"]) == (3, 3, 3)
     assert length["difference"] == pytest.approx(-2)
@@ -178,9 +185,7 @@ def test_what_is_alike_in_all_counts_each_for_itself():
 
 def test_the_table_says_each_method_once():
     """Spec F7: with digits and signs; where nothing is told apart by N or sub-goal that column is not there."""
-    rows = curves.against(
-        [{"name": "a", "runs": [run(1, 0, 10)]}, *({"name": name, "runs": [run(1, 0, 12)]} for name in "bc")]
-    )
+    rows = compared([*agent("a", (1, 0, 10)), *agent("b", (1, 0, 12)), *agent("c", (1, 0, 12))], curves.PAIRS)
     rows = [{**row, "interval": [None, None], "difference_interval": [None, None]} for row in rows]
     (table,) = comparison_tables(rows, "seed", "layouts", {"length": 0})
     assert [column["name"] for column in table["columns"]][:2] == ["quantity", "second"]

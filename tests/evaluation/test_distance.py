@@ -13,10 +13,12 @@ from hypogoal.evaluation.distance import (
     counted,
     distance_table,
     fates,
-    ladder_numbers,
     option_numbers,
+    options_of,
+    rows_of_ladder,
 )
 from hypogoal.evaluation.run import read_executions
+from hypogoal.evaluation.table import BEST, VALIDATED, WORST, rows_of
 from hypogoal.options.recording import EXECUTION_COLUMNS, write_table
 
 
@@ -68,19 +70,24 @@ def test_the_last_hundred_of_each_option_count(read):
     assert np.isnan(one["executions_deviation"])
 
 
+def learned(*arguments, **more):
+    """What is said of the options of one ladder, by sub-goal."""
+    return options_of(rows_of_ladder(*arguments, **more, ladder="1L", artefact="options"))
+
+
 def test_best_worst_and_validated_member(read):
     """Spec F3: the best is the nearest; an option that was never offered, since it always began inside, counts 300."""
     rows = executions(0, [30, 50]) + executions(1, [10, 20]) + executions(2, [100], inside=1)
-    (found,) = ladder_numbers(read(rows), ("down",), 4, {"down": 0}, masked=False)
+    (found,) = learned(read(rows), ("down",), 4, {"down": 0}, masked=False)
     distances = [option["distance"] for option in found["options"]]
     assert distances[:3] == [40, 15, 300]
     assert np.isnan(distances[3])
     assert (found["best"], found["worst"], found["validated"]) == (1, 2, 0)
-    (masked,) = ladder_numbers(read(rows), ("down",), 4, {}, masked=True)
+    (masked,) = learned(read(rows), ("down",), 4, {}, masked=True)
     assert (masked["options"][3]["distance"], masked["options"][3]["executions"]) == (300, 0)
     assert [option["distance"] for option in masked["options"][:3]] == distances[:3]
     assert masked["validated"] is None
-    (nothing,) = ladder_numbers(read([]), ("down",), 2, {}, masked=True)
+    (nothing,) = learned(read([]), ("down",), 2, {}, masked=True)
     assert (nothing["best"], nothing["worst"]) == (None, None)
     assert np.isnan(nothing["options"][0]["distance"])
 
@@ -88,27 +95,29 @@ def test_best_worst_and_validated_member(read):
 def test_two_sub_goals_have_their_own_members(read):
     """Spec D1: option g*K + k is member k of sub-goal g."""
     rows = executions(1, [3]) + executions(2, [8]) + executions(3, [5])
-    first, second = ladder_numbers(read(rows), ("down", "up"), 2, {}, masked=False)
+    first, second = learned(read(rows), ("down", "up"), 2, {}, masked=False)
     assert (first["sub_goal"], first["best"]) == ("down", 1)
     assert [option["option"] for option in second["options"]] == [2, 3]
     assert (second["best"], second["worst"]) == (1, 0)
 
 
-def row(ladder, seed, distances, method="dbat", groups=2, validated=0):
-    options = [
-        {"distance": float(distance), "executions_deviation": 2.0, "reached_base": 0.5, "inside_at_start": 0.0,
-         "timed_out": 0.25, "died": 0.0}
-        for distance in distances
-    ]  # fmt: skip
-    best, worst = int(np.argmin(distances)), int(np.argmax(distances))
-    about = {"method": method, "groups": groups, "sub_goal": "down", "ladder": ladder, "seed": seed}
-    return {**about, "options": options, "best": best, "worst": worst, "validated": validated}
+def stopped(ladder, seed, distances, method="dbat", groups=2, validated=0, number=0):
+    """Rows of one artefact's options."""
+    place = {"method": method, "N": groups, "sub_goal": "down", "ladder": ladder, "seed": seed}
+    place["artefact"] = f"{method}-{ladder}-{seed}-{number}"
+    shares = {"reached_base": 0.5, "inside_at_start": 0.0, "timed_out": 0.25, "died": 0.0}
+    for member, distance in enumerate(distances):
+        numbers = {"distance": float(distance), "executions_deviation": 2.0, **shares}
+        yield from rows_of(numbers, **place, member=member)
+    picked = {BEST: int(np.argmin(distances)), WORST: int(np.argmax(distances)), VALIDATED: validated}
+    yield from rows_of(picked, **place)
 
 
 def test_mean_over_ladders_then_over_seeds():
     """Spec F3, Figure 4: another member may be the best on each ladder; then mean and spread over seeds."""
-    rows = [row("1L", 0, [10, 30]), row("2-6", 0, [60, 20]), row("1L", 1, [14, 30]), row("2-6", 1, [40, 36])]
-    rows.append(row("1L", 0, [2], "oracle termination", None, None))
+    rows = [*stopped("1L", 0, [10, 30]), *stopped("2-6", 0, [60, 20])]
+    rows += [*stopped("1L", 1, [14, 30]), *stopped("2-6", 1, [40, 36])]
+    rows += stopped("1L", 0, [2], "oracle termination", None, None)
     over, oracle = distance_table(rows, ["1L", "2-6"])
     assert over["best"]["mean"] == pytest.approx((15 + 25) / 2)
     assert over["best"]["standard_deviation"] == pytest.approx(np.sqrt(50))
@@ -124,14 +133,14 @@ def test_mean_over_ladders_then_over_seeds():
 
 def test_options_of_several_ensembles_with_one_seed_all_count():
     """Spec F3: three artefacts alike in seed and ladder are three, not the last one read."""
-    rows = [row("1L", 0, [distance]) for distance in (10, 200, 90)]
+    rows = [row for away in (10, 200, 90) for row in stopped("1L", 0, [away], number=away)]
     (found,) = distance_table(rows, ("1L",))
     assert (found["seeds"], found["best"]["mean"]) == (3, 100)
 
 
 def test_unlike_ladders_are_not_averaged():
     """Spec F3: a seed that lacks one of the ladders is left out of the mean over ladders, and told."""
-    rows = [row("1L", 0, [10]), row("2-6", 0, [30]), row("1L", 1, [1])]
+    rows = [*stopped("1L", 0, [10]), *stopped("2-6", 0, [30]), *stopped("1L", 1, [1])]
     (over,) = distance_table(rows, ["1L", "2-6"])
     assert (over["best"]["mean"], over["best"]["n"], over["incomplete_seeds"]) == (20, 1, [1])
 

@@ -27,23 +27,25 @@ def test_a_figure_with_its_number_is_one_file_and_one_line(tmp_path, monkeypatch
     QUESTIONS.append(importlib.import_module("durations").QUESTION)
     try:
         run = tmp_path / "run"
-        write_run(run, numbers=(2,), seeds=(0,), methods=("cnn",), ladders=("1L",))
+        write_run(run, numbers=(2,), seeds=(0,), methods=("cnn", "none"), ladders=("1L",))
         metrics = evaluate(run, run / "evaluation", quiet=True)
         page = report(run).read_text(encoding="utf-8")
         drawn, _ = draw_figures(run, tmp_path / "figures")
     finally:
         del QUESTIONS[-1]
-    assert {entry["method"]: entry["steps"]["mean"] for entry in metrics["durations"]} == {
-        "single CNN": 7,
-        "oracle termination": 7,
+    assert len(code.splitlines()) < 80
+    assert {entry["method"]: entry["seconds"]["mean"] for entry in metrics["durations"]} == {
+        "single CNN": pytest.approx(7 / 15),
+        "no diversity, K=2": pytest.approx(7 / 15),
+        "oracle termination": pytest.approx(7 / 15),
     }
-    assert metrics["quantities"]["mean_duration"]["unit"] == "steps"
+    (pair,) = metrics["comparisons"]["durations"]
+    assert (pair["n"], pair["ties"], pair["where"]) == (1, 1, "N=2")
+    assert metrics["quantities"]["seconds"]["unit"] == "seconds"
     with (run / "evaluation/numbers.csv").open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["quantity"] == "mean_duration"]
-    assert [(row["method"], float(row["value"])) for row in rows] == [
-        ("single CNN", pytest.approx(7)),
-        ("oracle termination", pytest.approx(7)),
-    ]
+        rows = [row for row in csv.DictReader(file) if row["quantity"] == "seconds"]
+    assert len(rows) == 1 + 2 + 1
+    assert {float(row["value"]) for row in rows} == {7 / 15}
     assert "<h2>How long options take</h2>" in page
     assert 'id="figure-durations"' in page
     assert (run / "report/figures/durations.png").is_file()

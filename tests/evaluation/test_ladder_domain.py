@@ -6,7 +6,7 @@ import pytest
 from ladder_run import COLUMNS
 
 from hypogoal.domains.base import load_domain
-from hypogoal.evaluation.distance import at_base, distance_table, fates, ladder_numbers, show_stops
+from hypogoal.evaluation.distance import at_base, distance_table, fates, options_of, rows_of_ladder, show_stops
 from hypogoal.evaluation.run import read_executions
 from hypogoal.options.recording import write_table
 
@@ -23,12 +23,12 @@ def test_the_real_rooms_are_drawn_with_the_real_distances(tmp_path):
     assert own.distance[1] == 0
     assert own.distance[0] > own.distance[2] > 4
     assert at_base(own).tolist() == [False, True, False, True, False]
-    (numbers,) = ladder_numbers(own, domain.sub_goals, 1, {}, masked=False)
-    row = {"path": "options", "method": "single CNN", "groups": 2, "ladder": "2-6", "seed": 0, **numbers}
-    (over,) = distance_table([row], ["2-6"])
+    place = {"method": "single CNN", "N": 2, "ladder": "2-6", "seed": 0, "artefact": "options"}
+    rows = list(rows_of_ladder(own, domain.sub_goals, 1, {}, masked=False, **place))
+    (over,) = distance_table(rows, ["2-6"])
     assert over["best"]["mean"] == pytest.approx(away.mean())
     with h5py.File(tmp_path / "arrays.h5", "w") as arrays:
-        (shown,) = show_stops([row], ["2-6"], {"options": own}, domain, arrays)
+        (shown,) = show_stops(options_of(rows), ["2-6"], {"options": own}, domain, arrays)
         assert shown["rooms"] == [2, 6]
         assert arrays["stops/options/0/fates"][()].tolist() == fates(own).tolist()
         pictures = [arrays[f"pictures/{room}"][()] for room in shown["rooms"]]

@@ -10,15 +10,16 @@ from hypogoal.evaluation.curves import (
     RANDOM,
     Run,
     agent_curves,
-    agent_metrics,
+    agents_table,
     base_name,
     common_grid,
     group_runs,
     missing,
+    rows_of_run,
 )
 from hypogoal.evaluation.numbers import ensemble_names, name_apart
 from hypogoal.evaluation.run import Choices, Episodes
-from hypogoal.evaluation.selection import selection_of_run
+from hypogoal.evaluation.selection import rows_of_choices, selection_of
 
 META = {"termination": "learned", "chooser": "ppo", "steps": 1_000, "options_steps": 200, "option_gamma": 0.95}
 
@@ -63,15 +64,21 @@ def test_a_setting_that_differs_splits_an_agent():
     ]
 
 
+def table_of(runs):
+    """The agent's entry."""
+    (entry,) = agents_table([row for run in runs for row in rows_of_run(run, "agent")], {"agent": runs})
+    return entry
+
+
 def test_numbers_over_runs():
     """Spec F5: mean over layouts, each once; how many got to 95 %, and the median that counts those that did not."""
     runs = [made(), made(seed=1), made(layout_seed=101, success=0, shortest=20)]
-    metrics = agent_metrics("agent", runs)
+    metrics = table_of(runs)
     assert metrics["success"]["mean"] == pytest.approx((1 + 0) / 2)
     assert metrics["length_over_shortest"]["mean"] == pytest.approx((2 + 1) / 2)
     assert metrics["steps_to_95"] == {"reached": 2, "median": 1_000.0, "n": 3, "unit": "environment steps"}
     assert metrics["runs"][0]["steps"] == 1_200
-    never = agent_metrics("agent", runs[2:])["steps_to_95"]
+    never = table_of(runs[2:])["steps_to_95"]
     assert (never["reached"], never["median"]) == (0, None)
 
 
@@ -113,7 +120,9 @@ def test_selection_of_a_run_by_hand():
         (200, 3, 10, 10, 5.0, 9, 20),
     ]  # fmt: skip
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    first, second = selection_of_run(Choices(*columns), np.array([0.6, 0.9, 0.5, 1.0]), ("a", "b"), 2)
+    match = {"match": np.array([0.6, 0.9, 0.5, 1.0])}
+    (agent,) = selection_of(list(rows_of_choices(Choices(*columns), ("a", "b"), 2, match)))
+    first, second = agent["runs"][0]["sub_goals"]
     assert [member["preference"] for member in first["members"]] == pytest.approx([10 / 30, 50 / 20])
     assert [member["match"] for member in first["members"]] == [0.6, 0.9]
     assert [member["option"] for member in second["members"]] == [2, 3]

@@ -17,13 +17,13 @@ VERDICTS = PROBABILITIES > 0.5
 
 def test_members_rows_are_their_scores() -> None:
     """Ranking, the best threshold, and what the own one loses."""
-    found = question.known(PROBABILITIES, VERDICTS, LABELS, CONTEXTS)
+    found, _ = question.knowledge(PROBABILITIES, VERDICTS, LABELS, CONTEXTS)
     accuracy = member_scores(VERDICTS, LABELS)["balanced_accuracy"]
     best = best_threshold(PROBABILITIES, LABELS)[1]
-    assert [row["ranking"] for row in found["members"]] == ranking(PROBABILITIES, LABELS).tolist()
-    assert [row["at_best_threshold"] for row in found["members"]] == best.tolist()
-    assert [row["calibration_gap"] for row in found["members"]] == (best - accuracy).tolist()
-    assert min(row["calibration_gap"] for row in found["members"]) >= 0
+    assert found["ranking"].tolist() == ranking(PROBABILITIES, LABELS).tolist()
+    assert found["at_best_threshold"].tolist() == best.tolist()
+    assert found["calibration_gap"].tolist() == (best - accuracy).tolist()
+    assert min(found["calibration_gap"]) >= 0
 
 
 def test_the_best_is_picked_where_it_is_not_scored() -> None:
@@ -31,7 +31,7 @@ def test_the_best_is_picked_where_it_is_not_scored() -> None:
     first = CONTEXTS % 2 == 0
     ranked = [ranking(PROBABILITIES[half], LABELS[half]) for half in (first, ~first)]
     expected = (ranked[1][ranked[0].argmax()] + ranked[0][ranked[1].argmax()]) / 2
-    found = question.known(PROBABILITIES, VERDICTS, LABELS, CONTEXTS)
+    _, found = question.knowledge(PROBABILITIES, VERDICTS, LABELS, CONTEXTS)
     assert found["cross_fitted_ranking"] == pytest.approx(expected)
     for contexts in (None, CONTEXTS * 0):
-        assert math.isnan(question.known(PROBABILITIES, VERDICTS, LABELS, contexts)["cross_fitted_ranking"])
+        assert math.isnan(question.knowledge(PROBABILITIES, VERDICTS, LABELS, contexts)[1]["cross_fitted_ranking"])

@@ -7,7 +7,8 @@ from works import methods, work_of
 from hypogoal.evaluation import distance
 from hypogoal.evaluation.distance import ladder_names, rooms_shown
 from hypogoal.evaluation.numbers import groups_of, method_names
-from hypogoal.evaluation.rooms import SCORED, choose, missing, room_metrics, rooms_table, with_validated
+from hypogoal.evaluation.rooms import SCORED, choose, missing, rooms_table, rows_by_room
+from hypogoal.evaluation.table import VALIDATED, Number, per_run, rows_by_member, rows_of, with_members
 
 YES, NO = True, False
 # Rooms 1 (labelled), 9 (unlabelled), 6 (unseen): two positives and two negatives each; 20 (unseen): two negatives.
@@ -26,13 +27,28 @@ VERDICTS = np.array(
 )
 
 
+def judged(seen=SEEN):
+    """The rows of these members."""
+    return list(rows_by_room(VERDICTS.astype(np.float32), VERDICTS, LABELS, {**ORIGINS, "seen": seen}))
+
+
+def scopes_of(rows):
+    return {entry["scope"]: entry for entry in with_members(rows, scope="scope")}
+
+
+def score(rows, quantity, member):
+    """A score on unseen rooms of one of the members."""
+    ((_, value),) = per_run(rows, Number(quantity, "unseen", member=member))
+    return value
+
+
 def test_each_scope_by_hand():
     """Spec F1: the member that knows the training room by heart is the best where that room counts least."""
-    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS)
-    unseen, everything, labelled = (found["scopes"][name] for name in ("unseen", "all", "labelled"))
-    assert (unseen["states"], unseen["positives"], unseen["rooms"]) == (6, 2, [6, 20])
-    assert (everything["states"], everything["positives"], everything["rooms"]) == (14, 6, [1, 6, 9, 20])
-    assert (labelled["states"], labelled["positives"], labelled["rooms"]) == (4, 2, [1])
+    scopes = scopes_of(judged())
+    unseen, everything, labelled = (scopes[name] for name in ("unseen", "all", "labelled"))
+    assert (unseen["states"], unseen["positives"], unseen["rooms"]) == (6, 2, 2)
+    assert (everything["states"], everything["positives"], everything["rooms"]) == (14, 6, 4)
+    assert (labelled["states"], labelled["positives"], labelled["rooms"]) == (4, 2, 1)
 
     def of(scope, score):
         return [member[score] for member in scope["members"]]
@@ -47,55 +63,58 @@ def test_each_scope_by_hand():
 
 def test_validation_picks_by_the_labelled_rooms_only():
     """Spec F1: the member chosen there may be the worst elsewhere; its score on unseen rooms is what it is."""
-    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, ORIGINS)
-    assert found["validated"] == {"member": 0, "validation": 1.0}
-    scores = found["scopes"]["unseen"]["scores"]["balanced_accuracy"]
-    assert scores == pytest.approx(
-        {"best": 7 / 8, "validated": 1 / 4, "mean": (1 / 4 + 7 / 8 + 1 / 2) / 3, "worst": 1 / 4}
-    )
-    assert found["scopes"]["unseen"]["scores"]["accuracy"]["validated"] == pytest.approx(2 / 6)
+    rows = judged()
+    labelled = scopes_of(rows)["labelled"]
+    assert (labelled[VALIDATED], labelled["validation"]) == (0, 1.0)
+    scores = [score(rows, "balanced_accuracy", member) for member in ("best", VALIDATED, "mean", "worst")]
+    assert scores == pytest.approx([7 / 8, 1 / 4, (1 / 4 + 7 / 8 + 1 / 2) / 3, 1 / 4])
+    assert score(rows, "accuracy", VALIDATED) == pytest.approx(2 / 6)
 
 
 def test_validation_says_when_it_cannot_choose():
     """Spec F1: of members that are equally good the first; none without both classes."""
     same = np.repeat(VERDICTS[:, :1], 3, axis=1)
-    assert choose(same, LABELS, SEEN) == {"member": 0, "validation": 1.0}
+    assert choose(same, LABELS, SEEN) == {VALIDATED: 0, "validation": 1.0}
     nothing = choose(VERDICTS, LABELS, np.zeros_like(SEEN))
-    assert nothing["member"] is None
+    assert nothing[VALIDATED] is None
     assert np.isnan(nothing["validation"])
-    assert np.isnan(with_validated(np.array([0.5, 0.7]), None)["validated"])
+    assert np.isnan(score(judged(np.zeros_like(SEEN)), "balanced_accuracy", VALIDATED))
 
 
 def test_no_positive_in_unseen_rooms_is_said():
     """Spec F1: with every ladder labelled balanced accuracy on unseen rooms is not a number, accuracy is."""
     seen = np.where(ROOMS == 20, 0, 2)
-    found = room_metrics(VERDICTS.astype(np.float32), VERDICTS, LABELS, {**ORIGINS, "seen": seen})
-    unseen = found["scopes"]["unseen"]
-    assert unseen["positives"] == 0
-    assert np.isnan(list(unseen["scores"]["balanced_accuracy"].values())).all()
-    assert unseen["scores"]["accuracy"]["best"] == 1
-    assert found["validated"]["member"] == 1
+    rows = judged(seen)
+    scopes = scopes_of(rows)
+    assert scopes["unseen"]["positives"] == 0
+    picks = ("best", VALIDATED, "mean", "worst")
+    assert np.isnan([score(rows, "balanced_accuracy", member) for member in picks]).all()
+    assert score(rows, "accuracy", "best") == 1
+    assert scopes["labelled"][VALIDATED] == 1
 
 
-def ensemble(groups, seed, best, method="dbat, K=2", sub_goal="down"):
-    scores = {"best": best, "validated": best - 0.2, "mean": best - 0.1, "worst": best - 0.3}
-    scope = {"states": 12, "positives": 3, "scores": dict.fromkeys(SCORED, scores)}
-    rooms = {"scopes": {"unseen": scope, "all": scope}}
-    disagreement = {"unlabelled": 0.1 * seed, "heldout": 0.2}
-    row = {"sub_goal": sub_goal, "rooms": rooms, "disagreement": disagreement}
-    return {"method": method, "groups": groups, "seed": seed, "sub_goals": [row]}
+def ensemble(groups, seed, best, method="dbat, K=2"):
+    """Rows of five members, whose mean is best - 0.1; validation picks the second."""
+    place = {"method": method, "N": groups, "seed": seed, "artefact": f"{method} {groups} {seed}", "sub_goal": "down"}
+    scores = best - np.array([0, 0.2, 0.3, 0, 0])
+    for scope in ("unseen", "all"):
+        yield from rows_by_member(dict.fromkeys(SCORED, scores), **place, scope=scope)
+        yield from rows_of({"states": 12, "positives": 3}, **place, scope=scope)
+    yield from rows_of({VALIDATED: 1}, **place, scope="labelled")
+    yield from rows_of({"disagreement": 0.1 * seed}, **place, scope="unlabelled")
+    yield from rows_of({"disagreement": 0.2}, **place, scope="heldout")
 
 
 def test_the_table_over_seeds():
     """Spec F1: Figure 3: mean and deviation over seeds, by method and N in their order; F2's numbers beside."""
     rows = rooms_table(
         [
-            ensemble(2, 0, 0.9),
-            ensemble(1, 0, 0.6),
-            ensemble(1, 1, 0.8),
-            ensemble(1, 2, float("nan")),
-            ensemble(1, 0, 0.5, "single CNN"),
-            ensemble(1, 0, 0.7, "no diversity, K=2"),
+            *ensemble(2, 0, 0.9),
+            *ensemble(1, 0, 0.6),
+            *ensemble(1, 1, 0.8),
+            *ensemble(1, 2, float("nan")),
+            *ensemble(1, 0, 0.5, "single CNN"),
+            *ensemble(1, 0, 0.7, "no diversity, K=2"),
         ]
     )
     assert [(row["method"], row["groups"]) for row in rows] == [
@@ -111,7 +130,7 @@ def test_the_table_over_seeds():
     assert rows[0]["disagreement_unlabelled"]["mean"] == pytest.approx(0.1)
     alone = rows[3]["scores"]["unseen"]["balanced_accuracy"]["best"]
     assert np.isnan(alone["standard_deviation"])
-    assert rooms_table([{"method": "x", "groups": 1, "sub_goals": [{"sub_goal": "down"}]}]) == []
+    assert rooms_table(list(rows_of({"balanced_accuracy": 1.0}, method="x", member=0, scope="heldout"))) == []
 
 
 def test_all_n_of_a_method_have_one_name():

@@ -59,7 +59,7 @@ def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
     assert main([*train, *few]) == 0
     assert main(["evaluate", str(run), "-q"]) == 0
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text(encoding="utf-8"))
-    assert metrics["ensembles"][0]["sub_goals"][0]["balanced_accuracy"]["worst"] > 0.9
+    assert metrics["hypotheses"][0]["worst"]["mean"] > 0.9
 
 
 def test_images_too_small_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.domains.doorkey import DOMAIN, DoorKeyConfig
 from hypogoal.evaluation import choosing
+from hypogoal.evaluation.curves import read_run
 from hypogoal.evaluation.judging import Work
 from hypogoal.evaluation.pictures import BAR, draw_frame, episode_gif, frame_lines
 from hypogoal.evaluation.run import Contents
@@ -139,11 +140,11 @@ def test_a_bandit_is_back_and_learns_no_more(run, tmp_path):
     first, second = ([frame.option for frame in play_episode(loop)] for loop in loops)
     assert type(loops[0].chooser) is ThompsonChooser and kept.any() and first == second
     np.testing.assert_array_equal(loops[0].chooser.credit, kept)
-    work = Work(Contents(tmp_path, [], [artefact], [], [], []), None, None, metrics={})
-    run_of = {"path": work.contents.name(artefact), "seed": 0, "layout_seed": 100}
-    work.metrics["agents"] = [{"name": "a bandit", "runs": [run_of]}]
-    (judged,) = choosing.numbers(work)["choosing"]
-    assert len(judged["runs"][0]["members"]) == 5 * MEMBERS
+    contents = Contents(tmp_path, [], [artefact], [], [], [])
+    work = Work(contents, None, None, agents={"a bandit": [read_run(artefact, contents.name(artefact))]})
+    work.rows += list(choosing.rows(work))
+    (judged,) = choosing.view(work)["choosing"]
+    assert [len(goal["members"]) for goal in judged["runs"][0]["sub_goals"]] == [MEMBERS] * 5
 
 
 def test_weights_of_another_policy_are_one_line(run, tmp_path):
