@@ -4,16 +4,22 @@ It says only what manifest and files say, so the same seed gives the same card. 
 it, stands in indented lines, in which Markdown knows no markup, each of them made printable.
 """
 
+import contextlib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from hypogoal.core import artefacts
+from hypogoal.core.checkpoints import Checkpoints, checkpoints_of
 from hypogoal.core.config import as_dict
+from hypogoal.core.manifests import LOG
+from hypogoal.core.preflight import Needs, preflight
+from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.terminal import printable
 from hypogoal.inspection import outcome
 from hypogoal.settings import CONFIGS
@@ -44,3 +50,26 @@ def _quoted(lines: Iterable[str]) -> str:
 
 
 create_artefact = partial(artefacts.create_artefact, card=card)  # what stages write
+
+
+@dataclass(frozen=True)
+class Training:
+    """An artefact in training: the folder to fill, its log, its progress bar, its checkpoints."""
+
+    folder: Path
+    log: MetricsLog
+    progress: Progress
+    checkpoints: Checkpoints
+
+
+@contextlib.contextmanager
+def training(
+    stage: str, out: Path, needs: Needs, *, steps: int, quiet: bool, resume: bool, **artefact: Any
+) -> Iterator[Training]:
+    """Refuse what does not fit on this machine, then open the artefact; train and fill it in the block.
+
+    ``artefact``: see :func:`hypogoal.core.artefacts.create_artefact`.
+    """
+    preflight(stage, out, needs, resume=resume, quiet=quiet)
+    with create_artefact(out, resume=resume, **artefact) as folder, Progress(stage, steps, quiet=quiet) as progress:
+        yield Training(folder, MetricsLog(folder / LOG), progress, checkpoints_of(folder))

@@ -17,7 +17,7 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
-from hypogoal.core.tensors import save_tensors
+from hypogoal.core.tensors import load_tensors, save_tensors
 from hypogoal.dataset import PICTURE, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
@@ -26,6 +26,7 @@ from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainO
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import STACK
+from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Initiation
 from hypogoal.options.learner import Learner
 from hypogoal.options.light import LightLearner
@@ -62,7 +63,7 @@ def assemble(
     """
     sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
     columns = columns_of(domain, sub_goals) if oracle else []
-    options = len(sub_goals) * (1 if oracle else about["members"])
+    options = options_of(about, config)
     world = domain.world(played_world(domain, about["domain_config"], config.world))
     arguments = world | start_arguments(domain, config, options, seed)
     if layouts:
@@ -292,13 +293,25 @@ def check_fit(
             raise UserError(what, trained.path, f"Give --set {key}={before[key]}.")
 
 
-def description(
-    loop: OptionLoop, domain: Domain, about: Mapping[str, Any], config: PlayConfig, **more: Any
-) -> dict[str, Any]:
+def options_of(about: Mapping[str, Any], config: PlayConfig) -> int:
+    """How many options an ensemble's sub-goals have: one for each member, or for each truth."""
+    return len(about["sub_goals"]) * (1 if config.termination == "oracle" else about["members"])
+
+
+def continue_with(loop: OptionLoop, trained: Artefact) -> None:
+    """Go on with the options of an artefact; replays start empty."""
+    weights = load_tensors(trained.path / "options.safetensors")
+    loop.learner.load(weights)
+    loop.terminations.load(weights)
+    if loop.initiation and INITIATION in trained.manifest["files"]:
+        loop.initiation.load(load_tensors(trained.path / INITIATION))
+
+
+def description(domain: Domain, about: Mapping[str, Any], config: PlayConfig, **more: Any) -> dict[str, Any]:
     """An artefact's configuration: the stage's, what it has of its ensemble's (``about``), and ``more``."""
     return as_dict(config) | {
         "sub_goals": about["sub_goals"],
-        "members": loop.terminations.options // len(about["sub_goals"]),
+        "members": options_of(about, config) // len(about["sub_goals"]),
         "domain": about["domain"],
         "domain_config": played_world(domain, about["domain_config"], config.world),
         **more,
@@ -317,7 +330,7 @@ def write_trained(
         loop.visited.write(folder, domain, about, seed)
     save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
     if loop.initiation:
-        save_tensors(folder / "initiation.safetensors", loop.initiation.state())
+        save_tensors(folder / INITIATION, loop.initiation.state())
     if chooser := loop.chooser.state():
         save_tensors(folder / "meta.safetensors", chooser)
     about = {name: of for name, of in (("start", config.start), ("layouts", config.layouts.strip())) if of}

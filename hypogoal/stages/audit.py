@@ -83,7 +83,7 @@ def audit(
 
     loop = assemble(world, Path(), about, config, seed, device, ends)
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
-    settings = description(loop, world, about, config, classifier=classifier, member=member, steps=steps)
+    settings = description(world, about, config, classifier=classifier, member=member, steps=steps)
     with create_artefact(
         out, kind="audit", config=settings, seed=seed, inputs=inputs, force=force, resume=resume
     ) as folder:

@@ -9,12 +9,13 @@ from corridor import Corridor
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.learners.double_dqn import double_q_targets
+from hypogoal.learners.episodes import LAST
 from hypogoal.meta.training import LEARNERS
 from hypogoal.options import light, recurrent
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import EXECUTIONS_KEPT, Recorder
+from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations
 
 QUICK: dict[str, Any] = {
@@ -84,4 +85,4 @@ def test_after_a_break_no_more_executions_are_kept_than_before() -> None:
     """Spec F3: the last of each option; also when they were read back."""
     loop, _ = learned("light")
     loop.recorder.restore(loop.recorder.snapshot())
-    assert [kept.maxlen for kept in loop.recorder.executions] == [EXECUTIONS_KEPT] * 2
+    assert [kept.maxlen for kept in loop.recorder.executions] == [LAST] * 2
