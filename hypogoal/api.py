@@ -12,8 +12,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hypogoal import stages
 from hypogoal.core import drafts
 from hypogoal.core.artefacts import open_artefact
@@ -29,7 +27,7 @@ from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.policies import make_policies
-from hypogoal.options.termination import Dwell, Patience, rule_of, thresholds_in
+from hypogoal.options.termination import rule_of
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 Place = str | os.PathLike[str]
@@ -172,10 +170,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     policies = make_policies(config, weights, source.config, ensembles[0])
     goals, members = tuple(config["sub_goals"]), config["members"]
     rule, length = rule_of(config["termination"])
-    if rule is Patience:
-        lowered = thresholds_in(weights, len(goals) * members).reshape(len(goals), members)
-        for own, log_odds in zip(ensembles, lowered, strict=True):
-            own.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
+    rule.set_thresholds(ensembles, weights)
     initiation = None
     if INITIATION in artefact.manifest["files"]:
         learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
@@ -190,5 +185,5 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
         config["mask_reached"],
         domain=config["domain"],
         domain_config=config["domain_config"],
-        dwell=length if rule is Dwell else 1,
+        dwell=rule.dwell(length),
     )

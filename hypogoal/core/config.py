@@ -34,11 +34,12 @@ def setting(
     unit: str = "",
     source: str = "",
     choices: Iterable[Any] | None = None,
+    own: bool = False,
     low: float | None = None,
     high: float | None = None,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values."""
-    allowed = {"choices": None if choices is None else tuple(choices), "low": low, "high": high}
+    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon."""
+    allowed = {"choices": None if choices is None else tuple(choices), "own": own, "low": low, "high": high}
     return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
 
 
@@ -168,7 +169,7 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
 
 def _allowed(meta: Mapping[str, Any]) -> str:
     if meta.get("choices"):
-        return "|".join(str(choice) for choice in meta["choices"])
+        return "|".join([*map(str, meta["choices"]), *(["module:Class"] if meta["own"] else [])])
     low, high = ("" if meta.get(bound) is None else meta[bound] for bound in ("low", "high"))
     return "" if low == high == "" else f"{low} .. {high}".strip()
 
@@ -187,7 +188,7 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
             raise UserError("value is not finite", where, "Give a finite number.")
         if isinstance(item, int) and abs(item) > MOST_INTEGER:
             raise UserError("value out of range", where, f"Integers go from -{MOST_INTEGER} to {MOST_INTEGER}.")
-        if meta.get("choices") and item not in meta["choices"]:
+        if meta.get("choices") and item not in meta["choices"] and not (meta["own"] and ":" in item):
             raise UserError("value not allowed", where, f"Choose one of {_allowed(meta).replace('|', ', ')}.")
         for bound, outside in (("low", lambda a, b: a < b), ("high", lambda a, b: a > b)):
             if meta.get(bound) is not None and outside(item, meta[bound]):

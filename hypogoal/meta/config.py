@@ -80,12 +80,6 @@ class PlayConfig(OptionConfig):
         "changes to the world that the states were collected in: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
-    termination: str = setting(
-        "learned",
-        "where options end: learned, at the first yes; patience:N, with a threshold that falls after N steps of an "
-        "option that hardly ever gets there; dwell:N, at N yeses in a row; or oracle, at true sub-goals (upper bound)",
-        source="paper: learned; the others ours",
-    )
     save_visited: int = setting(
         0,
         "distinct visited states to save as a data file, for training ensembles",
@@ -132,6 +126,7 @@ class TrainOptionsConfig(PlayConfig):
         "random: uniform among the options offered; even: the one with the fewest steps so far",
         source="paper, policy learning",
         choices=("random", "even"),
+        own=True,
     )
 
 
@@ -147,6 +142,7 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
         "the meta-policy, uniform choice among the options offered, or a bandit that sees no state",
         source="ours: controls; Thompson 1933",
         choices=("ppo", "random", "thompson"),
+        own=True,
     )
 
 

@@ -71,8 +71,8 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
         domain, source.path, source.config, from_values(TrainMetaConfig, settings, "train-meta"), seed, layouts=others
     )
     continue_with(loop, artefact)
-    if "meta.safetensors" in files:
-        loop.chooser.load(load_tensors(artefact.path / "meta.safetensors"))
+    if loop.chooser.FILE in files:
+        loop.chooser.load(load_tensors(artefact.path / loop.chooser.FILE))
     return loop
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -11,14 +11,17 @@ from torch import Tensor, nn
 
 from hypogoal.core.checkpoints import State, growing
 from hypogoal.core.compute import tensor
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
 from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
+from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
@@ -56,6 +59,20 @@ class MetaPolicy(Chooser):
         }
         self._finished: list[Decisions] = []  # as they ended
         self.updates = 0
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Without settings of PPO there is nothing to learn by; the paper's network sees pictures only."""
+        if not isinstance(config, MetaConfig):
+            raise UserError("only train-meta learns the meta-policy", "chooser=ppo", "Give chooser=random or even.")
+        if config.meta_network == "paper" and engine.observation_dtype != PICTURE:
+            do = "Give --set meta_network=light."
+            raise UserError("the paper's networks see pictures only", "meta_network=paper", do)
+
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        assert isinstance(config, MetaConfig)
+        return cls(engine, options, config, seed, device)
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         with torch.no_grad():

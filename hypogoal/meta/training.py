@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +19,24 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors, save_tensors
-from hypogoal.dataset import PICTURE, standard_of
+from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.hypotheses.networks import AUTO
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
-from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
+from hypogoal.options.choosers import load_chooser
 from hypogoal.options.config import STACK
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Initiation
-from hypogoal.options.learner import Learner
-from hypogoal.options.light import LightLearner
+from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.planned import PlannedLearner
+from hypogoal.options.parts import Part
+from hypogoal.options.policy_views import Viewed, create_views, views_in
 from hypogoal.options.recording import Recorder
-from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
-from hypogoal.options.thompson import ThompsonChooser
+from hypogoal.options.termination import ORACLE, Terminations, learned_terminations, oracle_terminations, rule_of
 from hypogoal.options.visited import Visited
-from hypogoal.options.windows import AgentWindows, HalfPictures, localiser_of
 
 LOG_INTERVAL = 2_000  # environment steps
 ONE_LAYOUT = "an engine of this domain plays one layout"
-LEARNERS: dict[str, type[Learner]] = {"light": LightLearner, "paper": RecurrentLearner, "planned": PlannedLearner}
 
 
 def assemble(
@@ -52,77 +47,67 @@ def assemble(
     seed: int,
     device: str = "cpu",
     ends: Callable[[Engine], Terminations] | None = None,
+    standard: Standard | None = None,
     layouts: Layouts | None = None,
 ) -> OptionLoop:
     """Environments, an ensemble's options in them, fresh policies of these and over these.
 
-    ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, layouts and start states; ``ends`` gives terminations that are no ensemble's, ``layouts`` others than those
-    of ``config``. Where the domain has no such start, or not the true sub-goals at which options are to end, it is a
-    ``UserError``.
+    ``about`` is the ensemble manifest's configuration; ``seed`` is of weights, exploration, choices and, where there
+    are several, layouts and start states. ``ends`` gives other terminations than the ensemble's, ``standard`` goes with
+    them; ``layouts`` replace those of ``config``. What does not go together is a ``UserError``.
     """
-    sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
-    columns = columns_of(domain, sub_goals) if oracle else []
-    options = options_of(about, config)
-    world = domain.world(played_world(domain, about["domain_config"], config.world))
-    arguments = world | start_arguments(domain, config, options, seed)
-    if layouts:
-        arguments["layouts"] = layouts
-    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
-    cut(engine, config.cap)
+    first = partial(read_ensemble, ensemble, dict(about), about["sub_goals"][0])
+    learner, chooser = load_learner(config.network), load_chooser(config.chooser)
+    views = views_in(config.policy_view, config.policy_pixels)
+    engine = engine_for(domain, about, config, seed, layouts)
+    rules = [] if config.termination == ORACLE else [rule_of(config.termination)[0]]
+    parts: list[type[Part]] = [learner, chooser, *views, *rules]
+    for part in parts:
+        part.refuse(config, engine)
     if engine.observation_dtype != PICTURE:
-        for name in ("network", "meta_network"):
-            if getattr(config, name, "") == "paper":
-                raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
-        view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
-        engine.standard = view.standard if view else standard_of(engine.observation_shape)
-    if ends:
-        terminations = ends(engine)
-    elif oracle:
-        terminations = oracle_terminations(engine, columns)
-    else:
-        alone = config.experience == "own" and not config.mask_reached
-        terminations = judged(engine, ensemble, about, device, running_only=alone, rule=config.termination)
-    _check_rule(terminations, config)
-    if config.network != "light" and config.embedding != AUTO:
-        given = f"embedding={config.embedding}, network={config.network}"
-        raise UserError("only the light network has an embedding", given, "Give --set network=light.")
-    windows = None
-    if config.policy_view == "agent-crop":
-        if config.network != "light":
-            given = f"policy_view=agent-crop, network={config.network}"
-            raise UserError("only the light network sees windows", given, "Give --set network=light.")
-        windows = AgentWindows(engine, localiser_of(read_ensemble(ensemble, dict(about), sub_goals[0])))
-    seen: AgentWindows | HalfPictures | None = windows
-    if config.policy_pixels == "half":
-        if config.network != "light" or engine.observation_dtype != PICTURE:
-            given = f"policy_pixels=half, network={config.network}"
-            raise UserError(
-                "only the light network can see half the pixels, and only of pictures", given, "Leave it out."
-            )
-        seen = HalfPictures(engine, windows)
-    gamma, rng = 1.0, rng_for(seed, "random-choice")
-    chooser: Chooser = EvenChooser(options, rng) if config.chooser == "even" else RandomChooser(rng)
-    if isinstance(config, TrainMetaConfig):
-        gamma = config.gamma
-        if config.chooser == "ppo":
-            chooser = MetaPolicy(engine, options, config, seed, device)
-        elif config.chooser == "thompson":
-            chooser = ThompsonChooser(options, engine.count, rng)
+        engine.standard = (standard if ends else first().view.standard) or standard_of(engine.observation_shape)
+    terminations = ends(engine) if ends else terminations_for(domain, engine, ensemble, about, config, device)
+    view = Viewed(engine, create_views(views, engine.observation_shape, first)) if views else None
+    options = terminations.options
     loop = OptionLoop(
         engine,
         terminations,
-        LEARNERS[config.network](engine, terminations, config, seed, device, seen),
-        chooser,
+        learner(engine, terminations, config, seed, device, view),
+        chooser.create(engine, options, config, seed, device),
         Recorder(options, engine),
         config,
-        gamma,
+        config.gamma if isinstance(config, MetaConfig) else 1.0,
         initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
         visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
     )
     if near := nearness(domain, engine, about, config):
-        near(np.repeat(engine.ids[:1], options), np.arange(options))  # labels that fail do so before all is learned
+        near(np.repeat(engine.ids[:1], options), np.arange(options))  # so that a user's labels fail before training
     return loop
+
+
+def engine_for(
+    domain: Domain, about: Mapping[str, Any], config: PlayConfig, seed: int, layouts: Layouts | None = None
+) -> Engine:
+    """The environments in which options of an ensemble are played; arguments as of :func:`assemble`."""
+    if config.termination == ORACLE:
+        columns_of(domain, about["sub_goals"])
+    world = domain.world(played_world(domain, about["domain_config"], config.world))
+    arguments = world | start_arguments(domain, config, options_of(about, config), seed)
+    if layouts:
+        arguments["layouts"] = layouts
+    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
+    cut(engine, config.cap)
+    return engine
+
+
+def terminations_for(
+    domain: Domain, engine: Engine, ensemble: Path, about: Mapping[str, Any], config: PlayConfig, device: str
+) -> Terminations:
+    """Those that the setting ``termination`` names: of an ensemble's members, or of the true sub-goals."""
+    if config.termination == ORACLE:
+        return oracle_terminations(engine, columns_of(domain, about["sub_goals"]))
+    running_only = config.experience == "own" and not config.mask_reached
+    return judged(engine, ensemble, about, device, running_only=running_only, rule=config.termination)
 
 
 def judged(engine: Engine, ensemble: Path, about: Mapping[str, Any], device: str, **how: Any) -> Terminations:
@@ -143,7 +128,7 @@ def nearness(
     None where the domain has not all of the ensemble's sub-goals, or options end where they are true.
     """
     sub_goals = about["sub_goals"]
-    if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
+    if config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
         return None
     columns = np.repeat(columns_of(domain, sub_goals), about["members"])
 
@@ -173,16 +158,6 @@ def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence
             known = ", ".join(domain.engine_settings) or "none"
             raise UserError(f"the world of {domain.name} has no such setting", f"world={name}", f"It has {known}.")
     return {**collected, **domain.world(changed)}
-
-
-def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
-    """Whether the options can be learned that end so."""
-    given = f"termination={config.termination}"
-    if not terminations.SHARED and config.experience != "own":
-        what = "states that other options visit do not say whether an execution has reached its sub-goal"
-        raise UserError(what, f"{given}, experience={config.experience}", "Give --set experience=own.")
-    if config.network == "planned" and type(terminations) is not Terminations:
-        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
 
 
 def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
@@ -222,7 +197,7 @@ def frames_kept(config: PlayConfig, options: int) -> int:
     """How many states back an engine must remember: what the replays hold, and the meta-policy's open decisions."""
     decisions = config.decisions if isinstance(config, MetaConfig) else 0
     asked = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
-    return max(LEARNERS[config.network].reach(config, options), asked)
+    return max(load_learner(config.network).reach(config, options), asked)
 
 
 def train(
@@ -295,7 +270,7 @@ def check_fit(
 
 def options_of(about: Mapping[str, Any], config: PlayConfig) -> int:
     """How many options an ensemble's sub-goals have: one for each member, or for each truth."""
-    return len(about["sub_goals"]) * (1 if config.termination == "oracle" else about["members"])
+    return len(about["sub_goals"]) * (1 if config.termination == ORACLE else about["members"])
 
 
 def continue_with(loop: OptionLoop, trained: Artefact) -> None:
@@ -328,11 +303,11 @@ def write_trained(
         loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
         loop.visited.write(folder, domain, about, seed)
-    save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
+    save_tensors(folder / loop.learner.FILE, loop.learner.state() | loop.terminations.state())
     if loop.initiation:
         save_tensors(folder / INITIATION, loop.initiation.state())
-    if chooser := loop.chooser.state():
-        save_tensors(folder / "meta.safetensors", chooser)
+    if weights := loop.chooser.state():
+        save_tensors(folder / loop.chooser.FILE, weights)
     about = {name: of for name, of in (("start", config.start), ("layouts", config.layouts.strip())) if of}
     if about.get("layouts", "").isdecimal():
         seeds = layout_seeds(config.layouts, config.layout_seed)

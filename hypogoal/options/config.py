@@ -17,6 +17,14 @@ class OptionConfig:
         "knows what each action leads to",
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
+        own=True,
+    )
+    termination: str = setting(
+        "learned",
+        "where options end: learned, at the first positive prediction; patience:N, with a threshold that falls after "
+        "N steps of an option that hardly ever gets there; dwell:N, at N positive predictions in a row; or oracle, at "
+        "true sub-goals (upper bound)",
+        source="paper: learned; the others ours",
     )
     embedding: str = setting(
         "auto",
@@ -79,6 +87,7 @@ class OptionConfig:
         "ensemble's localiser (light)",
         source="ours",
         choices=("full", "agent-crop"),
+        own=True,
     )
     policy_pixels: str = setting(
         "all",

@@ -7,7 +7,7 @@ only its verdicts are asked for; then a transition may reach several steps ahead
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -19,13 +19,18 @@ from torch import Tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
+from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tensors
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, StepsAhead
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
-from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.learner import Learner, Policies, Transitions
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
+from hypogoal.options.policies import LightPolicies, saved_actions
+from hypogoal.options.policy_views import FULL, create_views, views_in
 
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
@@ -44,14 +49,35 @@ class LightLearner(Learner):
         *("online", "target", "optimiser", "replay", "ahead", "positive", "steps", "updates", "_due"),
     )
 
-    def build(self, config: OptionConfig, seed: int) -> None:
-        self.running_only = config.experience == "own"
-        if config.n_step > 1 and not self.running_only:
+    TAKES_VIEWS = True
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Other members' sub-goals may lie between the first and the last of several steps."""
+        super().refuse(config, engine)
+        if config.n_step > 1 and config.experience != "own":
             raise UserError(
                 "several steps at once are for an option's own member: others' sub-goals may lie among them",
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
+
+    @classmethod
+    def policies(
+        cls,
+        config: Mapping[str, Any],
+        weights: Mapping[str, Tensor],
+        shape: tuple[int, ...],
+        ensemble: Callable[[], Ensemble],
+    ) -> Policies:
+        options = len(config["sub_goals"]) * config["members"]
+        actions = saved_actions(weights, "online.heads.weight", options, options)
+        kinds = views_in(config.get("policy_view", FULL), config.get("policy_pixels", "all"))
+        views = create_views(kinds, shape, ensemble)
+        return LightPolicies(weights, shape, options, actions, views, config.get("embedding", AUTO))
+
+    def build(self, config: OptionConfig, seed: int) -> None:
+        self.running_only = config.experience == "own"
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))

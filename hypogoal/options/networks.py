@@ -14,7 +14,7 @@ from hypogoal.dataset import PICTURE, Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
-from hypogoal.options.windows import AgentWindows, HalfPictures
+from hypogoal.options.policy_views import Viewed
 
 CELL = 8  # pixels
 GRID = "grid"  # the embedding of this name
@@ -274,7 +274,7 @@ class PaperQNetwork(nn.Module):
         return nn.functional.linear(inputs, weight, bias)
 
 
-Pictures = Engine | AgentWindows | HalfPictures
+Pictures = Engine | Viewed
 
 
 def apply_to_states(network: nn.Module, engine: Pictures, ids: NDArray[np.int64]) -> Tensor:

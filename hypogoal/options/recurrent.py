@@ -6,7 +6,7 @@ BatchNorm sees a batch's distinct images, see DEV-51.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,16 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.learners.double_dqn import backward_of, descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
-from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.learner import Learner, Policies, Transitions
 from hypogoal.options.networks import PaperQNetwork
+from hypogoal.options.policies import PaperPolicies, saved_actions
 
 FIELDS = {
     "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
@@ -54,7 +57,12 @@ class RecurrentLearner(Learner):
 
     CHANGING = (*Learner.CHANGING, "members", "hidden", "running")
 
-    def build(self, config: OptionConfig, seed: int) -> None:
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """It sees pictures only, and learns single steps of its members' own executions."""
+        super().refuse(config, engine)
+        if engine.observation_dtype != PICTURE:
+            raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
         if config.experience != "own":
             raise UserError(
                 "the paper's network learns from its member's own executions only",
@@ -65,6 +73,19 @@ class RecurrentLearner(Learner):
             raise UserError(
                 "the paper's network learns one step ahead only", f"n_step={config.n_step}", "Give --set n_step=1."
             )
+
+    @classmethod
+    def policies(
+        cls,
+        config: Mapping[str, Any],
+        weights: Mapping[str, Tensor],
+        shape: tuple[int, ...],
+        ensemble: Callable[[], Ensemble],
+    ) -> Policies:
+        options = len(config["sub_goals"]) * config["members"]
+        return PaperPolicies(weights, shape, options, saved_actions(weights, "0.values.2.bias", 1, options))
+
+    def build(self, config: OptionConfig, seed: int) -> None:
         count = len(self.actions)
         self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)

@@ -77,11 +77,10 @@ def audit(
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
             return np.repeat(classify(engine, ids)[:, None], len(edges), axis=1).astype(np.float32)
 
-        engine.standard = standard or engine.standard
         rule, length = rule_of(config.termination)
         return rule(log_odds, len(edges), None, log_odds_of(edges).astype(np.float32), engine.count, length)
 
-    loop = assemble(world, Path(), about, config, seed, device, ends)
+    loop = assemble(world, Path(), about, config, seed, device, ends, standard)
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
     settings = description(world, about, config, classifier=classifier, member=member, steps=steps)
     with create_artefact(
