@@ -11,6 +11,7 @@ import hashlib
 import inspect
 import json
 import math
+import os
 import re
 import typing
 from collections.abc import Collection, Iterable, Mapping
@@ -20,6 +21,7 @@ from typing import Any, TypeVar
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
+from hypogoal.core.own_code import OF_FILE
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
@@ -35,12 +37,22 @@ def setting(
     source: str = "",
     choices: Iterable[Any] | None = None,
     own: bool = False,
+    idle: Mapping[str, tuple[str, ...]] | None = None,
     low: float | None = None,
     high: float | None = None,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon."""
+    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon.
+
+    It does nothing where another setting has one of its ``idle`` values.
+    """
     allowed = {"choices": None if choices is None else tuple(choices), "own": own, "low": low, "high": high}
-    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
+    about = {"meaning": meaning, "unit": unit, "source": source, "idle": idle or {}}
+    return dataclasses.field(default=default, metadata={**about, **allowed})
+
+
+def fixed(value: Any) -> Any:
+    """A field in place of a setting that a stage has taken from another one and does not heed: it cannot be set."""
+    return dataclasses.field(default=value, init=False)
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
@@ -118,16 +130,33 @@ def resolve(
     """
     values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})
-    values.update(parse_assignments(assignments))
-    return from_values(config_class, values, stage, domain)
+    assigned = parse_assignments(assignments)
+    config = from_values(config_class, {**values, **assigned}, stage, domain)
+    if OF_FILE not in os.environ:  # an experiment sets its cells alike, controls among them
+        refuse_idle(config, {*(key for key, value in (options or {}).items() if value is not None), *assigned})
+    return config
+
+
+def refuse_idle(config: Any, names: Collection[str]) -> None:
+    """Refuse (``UserError``) settings of these names that were changed and do nothing beside the others."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        for other, values in field.metadata.get("idle", {}).items():
+            if field.name in names and value != field.default and getattr(config, other, None) in values:
+                what = f"this setting does nothing with {other}={getattr(config, other)}"
+                raise UserError(what, f"{field.name}={value}", f"Leave it out, or change {other}.")
 
 
 def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, domain: str = DOMAIN) -> T:
     """Build ``config_class`` from plain values (text, TOML or JSON), checking each; ``domain`` is for messages."""
-    fields = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
+    every = dataclasses.fields(config_class)  # type: ignore[arg-type]
+    fields = {field.name: field for field in every if field.init}
+    constant = {field.name: field.default for field in every if not field.init}
     kinds = typing.get_type_hints(config_class)
     checked: dict[str, Any] = {}
     for key, value in values.items():
+        if key in constant and value == constant[key]:
+            continue
         if key not in fields:
             from hypogoal.core.commands import advice  # which needs more than this module may load
 
@@ -155,11 +184,13 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
     """Every setting with default (of the last of ``instead``, values and source, that has one), meaning and so on."""
     kinds = typing.get_type_hints(config_class)
     rows = []
-    for field in dataclasses.fields(config_class):
+    for field in (field for field in dataclasses.fields(config_class) if field.init):
         kind, default, about = kinds[field.name], field.default, dict(field.metadata)
         for values, source in instead:
             if field.name in values:
                 default, about["source"] = values[field.name], source
+        for other, values in about["idle"].items():
+            about["meaning"] += f"; does nothing with {other}={'|'.join(values)}"
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
         rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source")})
         home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))

@@ -5,9 +5,11 @@ The light recipe's are the defaults, those of Table 5 are in the ``paper`` prese
 
 from dataclasses import dataclass
 
-from hypogoal.core.config import MAX_RANGE, parse_integers, setting
+from hypogoal.core.config import MAX_RANGE, fixed, parse_integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import FULL, OptionConfig
+
+BANDITS = {"chooser": ("random", "even", "thompson")}  # choosers without PPO
 
 
 @dataclass(frozen=True)
@@ -19,28 +21,34 @@ class MetaConfig:
         "light, a small network on cells; or the paper's three convolutions",
         source="paper: three convolutions",
         choices=("light", "paper"),
+        idle=BANDITS,
     )
     head: str = setting(
-        "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")
+        "categorical",
+        "distribution over options",
+        source="gaussian: paper",
+        choices=("categorical", "gaussian"),
+        idle=BANDITS,
     )
     gamma: float = setting(
         0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="paper: not given"
     )
     gae_lambda: float = setting(
-        0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0
+        0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0, idle=BANDITS
     )
-    decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2)
-    epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
-    meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
-    meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
-    clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0)
-    entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
-    value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0)
+    decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2, idle=BANDITS)
+    epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1, idle=BANDITS)
+    meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1, idle=BANDITS)
+    meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0, idle=BANDITS)
+    clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0, idle=BANDITS)
+    entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0, idle=BANDITS)
+    value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0, idle=BANDITS)
     advantage_floor: float = setting(
         0.1,
         "advantages are divided by their standard deviation, or by this if it is larger",
         source="ours: docs/decisions.md; paper: 0",
         low=0.0,
+        idle=BANDITS,
     )
 
 
@@ -150,16 +158,18 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
 class AuditConfig(TrainOptionsConfig):
     """How policies learn to fool a classifier, and what is tried against them."""
 
+    policy_view: str = fixed(FULL)  # a classifier has no localiser
+    until: float = fixed(0.0)  # policies that fool a classifier do not bring the task to success
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
-    mask_reached: bool = setting(False, "do not begin executions where the classifier says yes already")
+    mask_reached: bool = setting(False, "do not begin executions where the prediction is already positive")
     steps: int = setting(80_000, "environment steps, all policies together", unit="steps", low=1)
     chooser: str = setting(
-        "even", "who plays: the policy with the fewest steps so far, or any", choices=("random", "even")
+        "even", "who plays: the policy with the fewest steps so far, or any", choices=("random", "even"), own=True
     )
     threshold: float = setting(
         0.0,
-        "a probability above this is a yes; 0: a member's own threshold, or 0.5 for other classifiers",
+        "a prediction is positive above this probability; 0: a member's own threshold, or 0.5 for other classifiers",
         low=0.0,
         high=1.0,
     )

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from hypogoal.core.config import setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
+FULL = "full"  # the policy view that shows the whole observation
+PLANNED = {"network": ("planned",)}  # what has no effect on options that are not learned
 
 
 @dataclass(frozen=True)
@@ -52,27 +54,45 @@ class OptionConfig:
         choices=("anywhere", "learned"),
     )
     initiation_threshold: float = setting(
-        0.05, "an option is held back where its chance of success is below this (initiation=learned)", low=0.0, high=1.0
+        0.05,
+        "an option is held back where its chance of success is below this",
+        low=0.0,
+        high=1.0,
+        idle={"initiation": ("anywhere",)},
     )
     initiation_ignored: float = setting(
-        0.1, "share of choices in which no option is held back (initiation=learned)", low=0.0, high=1.0
+        0.1, "share of choices in which no option is held back", low=0.0, high=1.0, idle={"initiation": ("anywhere",)}
     )
     bootstrap_timeout: bool = setting(
-        True, "do not treat an option's timeout as a terminal state", source="paper, appendix; light: ours"
+        True,
+        "do not treat an option's timeout as a terminal state",
+        source="paper, appendix; light: ours",
+        idle=PLANNED,
     )
     bounded_values: bool = setting(
-        True, "clip the targets of values to 0..1, the range of an option's return", source="ours; paper: false"
+        True,
+        "clip the targets of values to 0..1, the range of an option's return",
+        source="ours; paper: false",
+        idle=PLANNED,
     )
-    option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
+    option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0, idle=PLANNED)
     environments: int = setting(16, "environments stepped together", low=1, high=4096)
-    replay: int = setting(100_000, "transitions kept", source="Table 4", low=100)
-    warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1)
-    update_interval: int = setting(16, "environment steps per update", unit="steps", source="paper: 4", low=1)
-    option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
-    positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
-    option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
-    target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
-    target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
+    replay: int = setting(100_000, "transitions kept", source="Table 4", low=100, idle=PLANNED)
+    warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1, idle=PLANNED)
+    update_interval: int = setting(
+        16, "environment steps per update", unit="steps", source="paper: 4", low=1, idle=PLANNED
+    )
+    option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1, idle=PLANNED)
+    positives: float = setting(
+        0.25,
+        "share of a batch that reached a sub-goal (light)",
+        low=0.0,
+        high=1.0,
+        idle={"network": ("planned", "paper")},
+    )
+    option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0, idle=PLANNED)
+    target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1, idle=PLANNED)
+    target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0, idle=PLANNED)
     n_step: int = setting(
         1,
         "steps of an n-step return, within one execution (light, experience=own)",
@@ -80,9 +100,10 @@ class OptionConfig:
         source="paper: 1; Hessel et al. 2018",
         low=1,
         high=1_000,
+        idle=PLANNED,
     )
     policy_view: str = setting(
-        "full",
+        FULL,
         "what the policies see: full, the whole observation; agent-crop, the window around the agent as found by the "
         "ensemble's localiser (light)",
         source="ours",
@@ -100,28 +121,36 @@ class OptionConfig:
         "how long a random action lasts: one step, or several",
         source="persistent: Dabney et al. 2020",
         choices=("independent", "persistent"),
+        idle=PLANNED,
     )
     persistence: float = setting(
         2.0,
-        "exponent x of how long a random action lasts, P(n) ~ n^-x (exploration=persistent)",
+        "exponent x of how long a random action lasts, P(n) ~ n^-x",
         source="Dabney et al. 2020",
         low=1.1,
         high=10.0,
+        idle={"exploration": ("independent",), **PLANNED},
     )
     actions: str = setting(
         "all",
         "the primitive actions: all, or a set that the domain's engine names",
         source="paper, Montezuma's Revenge",
+        idle=PLANNED,
     )
-    epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
-    epsilon_final: float = setting(0.05, "final epsilon", source="paper: 0.01", low=0.0, high=1.0)
+    epsilon_steps: int = setting(
+        8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1, idle=PLANNED
+    )
+    epsilon_final: float = setting(0.05, "final epsilon", source="paper: 0.01", low=0.0, high=1.0, idle=PLANNED)
     epsilon_from: str = setting(
         "first-positive",
         "when a member's epsilon begins to fall",
         source="paper: start",
         choices=("start", "first-positive"),
+        idle=PLANNED,
     )
-    priority_alpha: float = setting(0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0)
+    priority_alpha: float = setting(
+        0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0, idle=PLANNED
+    )
     priority_beta: float = setting(
-        0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0
+        0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0, idle=PLANNED
     )

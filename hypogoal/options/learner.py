@@ -20,11 +20,11 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import FULL, OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
 from hypogoal.options.parts import Part, load_part
-from hypogoal.options.policy_views import FULL, Viewed
+from hypogoal.options.policy_views import Viewed
 from hypogoal.options.termination import Terminations
 
 COUNTERS = ("option_steps", "steps_since_positive")

@@ -26,11 +26,11 @@ from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tenso
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, StepsAhead
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import STACK, OptionConfig
+from hypogoal.options.config import FULL, STACK, OptionConfig
 from hypogoal.options.learner import Learner, Policies, Transitions
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
 from hypogoal.options.policies import LightPolicies, saved_actions
-from hypogoal.options.policy_views import FULL, create_views, views_in
+from hypogoal.options.policy_views import create_views, views_in
 
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0

@@ -16,11 +16,10 @@ from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.hypotheses.views import AgentView, windows
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import FULL, OptionConfig
 from hypogoal.options.parts import Part, load_part
 
 SIDE = 42  # pixels, half of what is seen of Montezuma's Revenge
-FULL = "full"  # the policy view that shows the whole observation
 VIEWS = {"agent-crop": f"{__name__}:AgentCrop"}
 
 Pictures = NDArray[np.uint8]  # (N, H, W, C)

@@ -134,7 +134,7 @@ class Terminations(Part):
         next_ids: NDArray[np.int64],
         reached: NDArray[np.bool_],
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """By today's thresholds, whether past transitions (n,) begin and end in their option's sub-goal, bool (n,) each.
+        """By today's thresholds, whether past transitions (n,) begin, and end, in their option's sub-goal.
 
         ``reached`` is whether the execution reached it then.
         """
