@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import allowed, vouched
 from hypogoal.core.tensors import AGAIN
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
@@ -255,7 +256,8 @@ def rule_of(termination: str) -> tuple[type[Terminations], int]:
     do = "Give learned, patience:STEPS, dwell:STEPS or oracle."
     if name not in RULES and (":" not in name or name.partition(":")[0] in RULES):
         raise UserError("unknown termination", f"termination={termination}", do)
-    rule = load_part(name, "termination rule", Terminations, RULES)
+    with vouched(*([name] if termination in allowed() else [])):  # who gave the rule with its number gave its name
+        rule = load_part(name, "termination rule", Terminations, RULES)
     if bool(rule.LENGTH) != bool(number) or (number and int(number) < 1):
         raise UserError("unknown termination", f"termination={termination}", do)
     return rule, int(number or 0)
