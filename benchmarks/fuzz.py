@@ -111,11 +111,11 @@ def make_seeds(root: Path) -> None:
             }
             save_tensors(folder / "options.safetensors", state | counters)
             write_table(
-                folder / "episodes.csv", Episodes.columns(), [(10 * n, 10, 1.0, n % 2, n % 2) for n in range(1, 6)]
+                folder / "episodes.csv", Episodes.names(), [(10 * n, 10, 1.0, n % 2, n % 2) for n in range(1, 6)]
             )
-            write_table(folder / "choices.csv", Choices.columns(), [(50, n, 9, 3, 2.5, 1, 8) for n in range(options)])
+            write_table(folder / "choices.csv", Choices.names(), [(50, n, 9, 3, 2.5, 1, 8) for n in range(options)])
             rows = [(n, n % options, 3, 1, 0, 0, 1, 10, 20, 5) for n in range(6)]
-            write_table(folder / "executions.csv", Executions.columns(), rows)
+            write_table(folder / "executions.csv", Executions.names(), rows)
             facts = {"layout_seed": 100, "shortest_path": 9, "random_success": 0.1, "random_episodes": 5}
             (folder / "layout.json").write_text(json.dumps(facts))
             (folder / "metrics.jsonl").write_text('{"step": 1, "success": 0.5}\n')

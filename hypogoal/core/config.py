@@ -37,17 +37,12 @@ def setting(
     source: str = "",
     choices: Iterable[Any] | None = None,
     own: bool = False,
-    idle: Mapping[str, tuple[str, ...]] | None = None,
     low: float | None = None,
     high: float | None = None,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon.
-
-    It does nothing where another setting has one of its ``idle`` values.
-    """
+    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon."""
     allowed = {"choices": None if choices is None else tuple(choices), "own": own, "low": low, "high": high}
-    about = {"meaning": meaning, "unit": unit, "source": source, "idle": idle or {}}
-    return dataclasses.field(default=default, metadata={**about, **allowed})
+    return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
 
 
 def fixed(value: Any) -> Any:
@@ -137,14 +132,16 @@ def resolve(
     return config
 
 
-def refuse_idle(config: Any, names: Collection[str]) -> None:
-    """Refuse (``UserError``) settings of these names that were changed and do nothing beside the others."""
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        for other, values in field.metadata.get("idle", {}).items():
-            if field.name in names and value != field.default and getattr(config, other, None) in values:
-                what = f"this setting does nothing with {other}={getattr(config, other)}"
-                raise UserError(what, f"{field.name}={value}", f"Leave it out, or change {other}.")
+def refuse_idle(config: Any, names: set[str]) -> None:
+    """Refuse (``UserError``) changed settings of these names that do nothing: ``IDLE`` of a class says beside what."""
+    defaults = type(config)()
+    for beside, idle in [item for part in type(config).__mro__ for item in vars(part).get("IDLE", {}).items()]:
+        other, _, value = beside.partition("=")
+        for name in names & set(idle) if getattr(config, other) == value else ():
+            if getattr(config, name) != getattr(defaults, name):
+                setting = f"{name}={getattr(config, name)}"
+                do = f"Leave it out, or change {other}."
+                raise UserError(f"this setting does nothing with {beside}", setting, do)
 
 
 def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, domain: str = DOMAIN) -> T:
@@ -189,8 +186,6 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
         for values, source in instead:
             if field.name in values:
                 default, about["source"] = values[field.name], source
-        for other, values in about["idle"].items():
-            about["meaning"] += f"; does nothing with {other}={'|'.join(values)}"
         row = {"name": field.name, "type": getattr(kind, "__name__", str(kind)), "default": default}
         rows.append(row | {key: about.get(key) for key in ("unit", "meaning", "source")})
         home = next(part for part in config_class.__mro__ if field.name in inspect.get_annotations(part))

@@ -3,52 +3,54 @@
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from hypogoal.core.config import MAX_RANGE, fixed, parse_integers, setting
 from hypogoal.core.errors import UserError
 from hypogoal.options.config import FULL, OptionConfig
-
-BANDITS = {"chooser": ("random", "even", "thompson")}  # choosers without PPO
 
 
 @dataclass(frozen=True)
 class MetaConfig:
     """PPO over options, with SMDP returns."""
 
+    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(
+        ("chooser=random", "chooser=thompson"),
+        (
+            *("meta_network", "head", "gae_lambda", "decisions", "epochs", "meta_batch"),
+            *("meta_learning_rate", "clip", "entropy", "value_weight", "advantage_floor"),
+        ),
+    )
+
     meta_network: str = setting(
         "light",
         "light, a small network on cells; or the paper's three convolutions",
         source="paper: three convolutions",
         choices=("light", "paper"),
-        idle=BANDITS,
     )
     head: str = setting(
-        "categorical",
-        "distribution over options",
-        source="gaussian: paper",
-        choices=("categorical", "gaussian"),
-        idle=BANDITS,
+        "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")
     )
     gamma: float = setting(
         0.99, "discount per environment step; an option of tau steps counts gamma^tau", source="paper: not given"
     )
     gae_lambda: float = setting(
-        0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0, idle=BANDITS
+        0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0
     )
-    decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2, idle=BANDITS)
-    epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1, idle=BANDITS)
-    meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1, idle=BANDITS)
-    meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0, idle=BANDITS)
-    clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0, idle=BANDITS)
-    entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0, idle=BANDITS)
-    value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0, idle=BANDITS)
+    decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2)
+    epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
+    meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
+    meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
+    clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0)
+    entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
+    value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0)
     advantage_floor: float = setting(
         0.1,
         "advantages are divided by their standard deviation, or by this if it is larger",
         source="ours: docs/decisions.md; paper: 0",
         low=0.0,
-        idle=BANDITS,
     )
 
 
@@ -98,11 +100,11 @@ class PlayConfig(OptionConfig):
 
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
-    """What ``layouts`` means, each seed once, a bare number so many from ``first`` on; else a ``UserError``."""
+    """The seeds that ``layouts`` names, each once, a bare number so many from ``first`` on; else a ``UserError``."""
     if not layouts.strip() and first is not None:
         return [first]
     if layouts.strip().isdecimal():
-        count, do = int(layouts), f"Give from 1 to {MAX_RANGE}, or seeds as 2000-2099."
+        count, do = int(layouts), f"Give 1 to {MAX_RANGE}, or seeds as 2000-2099."
         if first is None or not 0 < count <= MAX_RANGE:
             raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
         return list(range(first, first + count))

@@ -1,6 +1,7 @@
 """The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.checkpoints import State, growing
+from hypogoal.core.columns import Columns
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
@@ -26,7 +28,27 @@ from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
 
-Decisions = dict[str, NDArray[Any]]  # columns (n, ...)
+
+@dataclass(frozen=True)
+class Draws(Columns):
+    """Choices of an option, arrays (n, ...)."""
+
+    state: NDArray[np.int64]  # in which it was chosen
+    offered: NDArray[np.bool_]  # (n, O)
+    drawn: NDArray[np.float32]  # what the head remembers of the draw, (n, R)
+    log_prob: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Decisions(Draws):
+    """Choices and what came of them."""
+
+    environment: NDArray[np.int64]
+    returned: NDArray[np.float64]  # rewards inside the option, discounted from its start
+    discount: NDArray[np.float64]  # gamma ** tau
+    next_state: NDArray[np.int64]  # in which the option ended
+    terminated: NDArray[np.bool_]  # nothing follows it
+    ended: NDArray[np.bool_]  # the episode ended there, for whatever reason
 
 
 class MetaPolicy(Chooser):
@@ -35,7 +57,7 @@ class MetaPolicy(Chooser):
     ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
     """
 
-    CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "_finished", "updates")
+    CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "updates")
 
     def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int, device: torch.device | str = "cpu"):
         self.engine, self.options, self.config = engine, options, config
@@ -51,12 +73,12 @@ class MetaPolicy(Chooser):
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         count = engine.count
-        self._open: Decisions = {  # the last one of every environment
-            "state": np.zeros(count, np.int64),
-            "offered": np.zeros((count, options), np.bool_),
-            "drawn": np.zeros((count, self.head.remembered), np.float32),
-            "log_prob": np.zeros(count, np.float32),
-        }
+        self._open = Draws(  # the last one of every environment
+            state=np.zeros(count, np.int64),
+            offered=np.zeros((count, options), np.bool_),
+            drawn=np.zeros((count, self.head.remembered), np.float32),
+            log_prob=np.zeros(count, np.float32),
+        )
         self._finished: list[Decisions] = []  # as they ended
         self.updates = 0
 
@@ -80,57 +102,58 @@ class MetaPolicy(Chooser):
             mask = torch.from_numpy(offered)
             options, drawn = self.head.draw(scores, mask, self.generator)
             log_prob = self.head.log_prob(scores, mask, drawn)[0]
-        decided = {"state": ids, "offered": offered, "drawn": drawn.numpy(), "log_prob": log_prob.numpy()}
-        for name, values in decided.items():
-            self._open[name][environments] = values
+        self._open.put(environments, Draws(ids, offered, drawn.numpy(), log_prob.numpy()))
         return options.numpy()
 
     def record(self, outcome: Outcome) -> None:
-        came_of_it = {
-            "environment": outcome.environments,
-            "returned": outcome.returns,
-            "discount": outcome.discounts,
-            "next_state": outcome.next_ids,
-            "terminated": outcome.terminated,
-            "ended": outcome.terminated | outcome.truncated,
-        }
-        self._finished.append({name: values[outcome.environments] for name, values in self._open.items()} | came_of_it)
+        draws = self._open.at(outcome.environments)
+        decisions = Decisions(
+            **vars(draws),
+            environment=outcome.environments,
+            returned=outcome.returns,
+            discount=outcome.discounts,
+            next_state=outcome.next_ids,
+            terminated=outcome.terminated,
+            ended=outcome.terminated | outcome.truncated,
+        )
+        self._finished.append(decisions)
 
     def begin_anew(self) -> None:
         self._finished = []
 
     def learn(self) -> dict[str, float]:
-        if sum(len(part["state"]) for part in self._finished) < self.config.decisions:
+        if sum(map(len, self._finished)) < self.config.decisions:
             return {}
-        decisions, self._finished = _joined(self._finished), []
-        by_environment = np.argsort(decisions["environment"], kind="stable")
-        return self._update({name: values[by_environment] for name, values in decisions.items()})
+        decisions, self._finished = Decisions.joined(self._finished), []
+        return self._update(decisions.at(np.argsort(decisions.environment, kind="stable")))
 
     def _outputs(self, ids: NDArray[np.int64]) -> Tensor:
         return apply_to_states(self.network, self.engine, ids)
 
     def _update(self, decisions: Decisions) -> dict[str, float]:
         """Learn from decisions, those of an environment side by side in the order in which they were taken."""
-        config, states = self.config, decisions["state"]
+        config, states = self.config, decisions.state
         with torch.no_grad():
             values = self._outputs(states)[:, -1].double().cpu().numpy()
-            next_values = self._outputs(decisions["next_state"])[:, -1].double().cpu().numpy()
-        begins = np.flatnonzero(np.diff(decisions["environment"])) + 1
+            next_values = self._outputs(decisions.next_state)[:, -1].double().cpu().numpy()
+        begins = np.flatnonzero(np.diff(decisions.environment)) + 1
         advantages = np.concatenate(
             [
                 smdp_advantages(
-                    decisions["returned"][rows],
-                    decisions["discount"][rows],
+                    decisions.returned[rows],
+                    decisions.discount[rows],
                     values[rows],
                     next_values[rows],
-                    decisions["terminated"][rows],
-                    decisions["ended"][rows],
+                    decisions.terminated[rows],
+                    decisions.ended[rows],
                     config.gae_lambda,
                 )
                 for rows in np.split(np.arange(len(states)), begins)
             ]
         )
-        offered, drawn, old = (tensor(decisions[name], self.device) for name in ("offered", "drawn", "log_prob"))
+        offered, drawn, old = (
+            tensor(values, self.device) for values in (decisions.offered, decisions.drawn, decisions.log_prob)
+        )
         goal = tensor(advantages + values, self.device).float()
         scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
         entropy_seen = 0.0
@@ -160,27 +183,17 @@ class MetaPolicy(Chooser):
         check_fit(self.state(), state, "meta.safetensors", AGAIN)
         self.policy.load_state_dict(state)
 
-    def items(self) -> dict[str, Any]:
-        ids, numbers, truths = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.bool_)
-        columns = {
-            **self._open,
-            "environment": ids,
-            "returned": numbers,
-            "discount": numbers,
-            "next_state": ids,
-            "terminated": truths,
-            "ended": truths,
-        }
-        return {"_finished": {name: growing(values) for name, values in columns.items()}}
-
     def snapshot(self) -> State:
-        """As of :class:`Resumable`, in few arrays."""
-        self._finished = [_joined(self._finished)] if self._finished else []
-        return super().snapshot()
+        """As of :class:`Resumable`, and the decisions, in one array for each column."""
+        draws = vars(self._open.at(slice(0)))
+        outcomes = {name: np.zeros(0, kind) for name, kind in Decisions.types().items() if name not in draws}
+        self._finished = [Decisions.joined([Decisions(**draws, **outcomes), *self._finished])]
+        finished = {name: growing(values) for name, values in vars(self._finished[0]).items()}
+        return {**super().snapshot(), "finished": finished}
 
-
-def _joined(parts: Sequence[Decisions]) -> Decisions:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        super().restore(snapshot)
+        self._finished = [Decisions(**snapshot["finished"])]
 
 
 def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:

@@ -1,17 +1,30 @@
 """Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from hypogoal.core.config import setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
 FULL = "full"  # the policy view that shows the whole observation
-PLANNED = {"network": ("planned",)}  # what has no effect on options that are not learned
 
 
 @dataclass(frozen=True)
 class OptionConfig:
     """How the intra-option policies are executed and learned."""
+
+    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "network=planned": (
+            *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
+            *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
+            *("exploration", "persistence", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
+            *("priority_alpha", "priority_beta"),
+        ),
+        "network=paper": ("positives",),
+        "exploration=independent": ("persistence",),
+        "initiation=anywhere": ("initiation_threshold", "initiation_ignored"),
+    }
 
     network: str = setting(
         "light",
@@ -55,44 +68,29 @@ class OptionConfig:
     )
     initiation_threshold: float = setting(
         0.05,
-        "an option is held back where its chance of success is below this",
+        "options less likely to succeed are held back (initiation=learned)",
         low=0.0,
         high=1.0,
-        idle={"initiation": ("anywhere",)},
     )
     initiation_ignored: float = setting(
-        0.1, "share of choices in which no option is held back", low=0.0, high=1.0, idle={"initiation": ("anywhere",)}
+        0.1, "share of choices in which no option is held back (initiation=learned)", low=0.0, high=1.0
     )
     bootstrap_timeout: bool = setting(
-        True,
-        "do not treat an option's timeout as a terminal state",
-        source="paper, appendix; light: ours",
-        idle=PLANNED,
+        True, "do not treat an option's timeout as a terminal state", source="paper, appendix; light: ours"
     )
     bounded_values: bool = setting(
-        True,
-        "clip the targets of values to 0..1, the range of an option's return",
-        source="ours; paper: false",
-        idle=PLANNED,
+        True, "clip the targets of values to 0..1, the range of an option's return", source="ours; paper: false"
     )
-    option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0, idle=PLANNED)
+    option_gamma: float = setting(0.95, "discount per step inside an option", low=0.0, high=1.0)
     environments: int = setting(16, "environments stepped together", low=1, high=4096)
-    replay: int = setting(100_000, "transitions kept", source="Table 4", low=100, idle=PLANNED)
-    warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1, idle=PLANNED)
-    update_interval: int = setting(
-        16, "environment steps per update", unit="steps", source="paper: 4", low=1, idle=PLANNED
-    )
-    option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1, idle=PLANNED)
-    positives: float = setting(
-        0.25,
-        "share of a batch that reached a sub-goal (light)",
-        low=0.0,
-        high=1.0,
-        idle={"network": ("planned", "paper")},
-    )
-    option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0, idle=PLANNED)
-    target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1, idle=PLANNED)
-    target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0, idle=PLANNED)
+    replay: int = setting(100_000, "transitions kept", source="Table 4", low=100)
+    warm_up: int = setting(1_000, "steps before the first update", unit="steps", low=1)
+    update_interval: int = setting(16, "environment steps per update", unit="steps", source="paper: 4", low=1)
+    option_batch: int = setting(128, "transitions per update", source="paper: 32", low=1)
+    positives: float = setting(0.25, "share of a batch that reached a sub-goal (light)", low=0.0, high=1.0)
+    option_learning_rate: float = setting(5e-4, "Adam's step size", source="paper: 2.5e-4", low=0.0)
+    target_interval: int = setting(1, "updates between two target updates", source="paper: 10", low=1)
+    target_tau: float = setting(0.01, "soft-update rate of the target network", low=0.0, high=1.0)
     n_step: int = setting(
         1,
         "steps of an n-step return, within one execution (light, experience=own)",
@@ -100,14 +98,13 @@ class OptionConfig:
         source="paper: 1; Hessel et al. 2018",
         low=1,
         high=1_000,
-        idle=PLANNED,
     )
     policy_view: str = setting(
         FULL,
         "what the policies see: full, the whole observation; agent-crop, the window around the agent as found by the "
         "ensemble's localiser (light)",
         source="ours",
-        choices=("full", "agent-crop"),
+        choices=(FULL, "agent-crop"),
         own=True,
     )
     policy_pixels: str = setting(
@@ -121,36 +118,28 @@ class OptionConfig:
         "how long a random action lasts: one step, or several",
         source="persistent: Dabney et al. 2020",
         choices=("independent", "persistent"),
-        idle=PLANNED,
     )
     persistence: float = setting(
         2.0,
-        "exponent x of how long a random action lasts, P(n) ~ n^-x",
+        "exponent x of how long a random action lasts, P(n) ~ n^-x (exploration=persistent)",
         source="Dabney et al. 2020",
         low=1.1,
         high=10.0,
-        idle={"exploration": ("independent",), **PLANNED},
     )
     actions: str = setting(
         "all",
         "the primitive actions: all, or a set that the domain's engine names",
         source="paper, Montezuma's Revenge",
-        idle=PLANNED,
     )
-    epsilon_steps: int = setting(
-        8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1, idle=PLANNED
-    )
-    epsilon_final: float = setting(0.05, "final epsilon", source="paper: 0.01", low=0.0, high=1.0, idle=PLANNED)
+    epsilon_steps: int = setting(8_000, "steps until the final epsilon", unit="steps", source="Table 4", low=1)
+    epsilon_final: float = setting(0.05, "final epsilon", source="paper: 0.01", low=0.0, high=1.0)
     epsilon_from: str = setting(
         "first-positive",
         "when a member's epsilon begins to fall",
         source="paper: start",
         choices=("start", "first-positive"),
-        idle=PLANNED,
     )
-    priority_alpha: float = setting(
-        0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0, idle=PLANNED
-    )
+    priority_alpha: float = setting(0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0)
     priority_beta: float = setting(
-        0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0, idle=PLANNED
+        0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0
     )

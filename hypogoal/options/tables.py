@@ -8,11 +8,12 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Self, get_args, get_type_hints
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hypogoal.core.columns import Columns
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_text, write_table
 from hypogoal.learners.episodes import LAST
@@ -24,50 +25,37 @@ MAX_OPTIONS = 2**16
 BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
 
 
-class Table:
-    """A dataclass whose fields are the columns, arrays (n,) of their annotated types; one with a default may lack."""
+@dataclass(frozen=True)
+class Table(Columns):
+    """Columns (n,) of a file; it may lack one that has a default."""
 
     FILE: ClassVar[str]
-
-    @classmethod
-    def columns(cls) -> tuple[str, ...]:
-        """Names, in the order of the file."""
-        return tuple(field.name for field in fields(cls))  # type: ignore[arg-type]
 
     @classmethod
     def of_rows(cls, rows: Iterable[Sequence[float]]) -> Self:
         """A table of rows, each with a number for every column."""
         listed = list(rows)
-        columns = zip(*listed, strict=True) if listed else [()] * len(cls.columns())
-        return cls(*(np.array(column, kind) for column, kind in zip(columns, cls._types().values(), strict=True)))
+        columns = zip(*listed, strict=True) if listed else [()] * len(cls.names())
+        return cls.cast(*columns)
 
     @classmethod
     def read(cls, path: Path) -> Self:
         """The table in a file; a ``UserError`` where it is missing or damaged, see :func:`read_table`."""
-        optional = [field.name for field in fields(cls) if field.default is not MISSING]  # type: ignore[arg-type]
-        required = [name for name in cls.columns() if name not in optional]
-        columns, types = read_table(path, required, optional), cls._types()
+        optional = [field.name for field in fields(cls) if field.default is not MISSING]
+        required = [name for name in cls.names() if name not in optional]
+        columns, types = read_table(path, required, optional), cls.types()
         return cls(**{name: values.astype(types[name]) for name, values in columns.items()})
 
     def write(self, folder: Path) -> None:
         """The file of this table into ``folder``; a NaN is an empty cell."""
         rows = [["" if value != value else value for value in row] for row in self.rows()]
-        write_table(folder / self.FILE, self.columns(), rows)
+        write_table(folder / self.FILE, self.names(), rows)
 
     def rows(self) -> list[tuple[Any, ...]]:
         """Plain numbers, row by row; truth values are 0 and 1."""
-        columns = [getattr(self, name) for name in self.columns()]
+        columns = [getattr(self, name) for name in self.names()]
         lists = [(values.astype(np.int64) if values.dtype == np.bool_ else values).tolist() for values in columns]
         return list(zip(*lists, strict=True))
-
-    def at(self, rows: Any) -> Self:
-        """Some rows, by whatever NumPy takes for an index."""
-        return type(self)(*(getattr(self, name)[rows] for name in self.columns()))
-
-    @classmethod
-    def _types(cls) -> dict[str, type[np.generic]]:
-        hints = get_type_hints(cls)
-        return {name: get_args(get_args(hints[name])[1])[0] for name in cls.columns()}
 
 
 @dataclass(frozen=True)

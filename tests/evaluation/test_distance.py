@@ -34,7 +34,7 @@ def read(tmp_path):
 
 def test_the_columns_are_those_that_are_written():
     """Spec A8: the reader's columns are the recorder's."""
-    assert Executions.columns() == COLUMNS
+    assert Executions.names() == COLUMNS
 
 
 def test_an_execution_that_begins_inside_counts_300(read):

@@ -57,6 +57,6 @@ def test_tables_and_checkpoints_keep_it_and_older_tables_are_read(tmp_path: Path
         again.restore(episodes.snapshot())
         assert again == episodes and again.steps == 9
         if not told:
-            write_table(tmp_path / "episodes.csv", Episodes.columns()[:4], [row[:4] for row in episodes])
+            write_table(tmp_path / "episodes.csv", Episodes.names()[:4], [row[:4] for row in episodes])
             old = Episodes.read(tmp_path / "episodes.csv")
             assert old.succeeded.tolist() == found.succeeded.tolist() and old.succeeded.dtype == np.bool_

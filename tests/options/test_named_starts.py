@@ -81,7 +81,7 @@ class TallDomain:
 def rows_of(folder: Path) -> list[dict[str, int]]:
     with (folder / "executions.csv").open(newline="") as file:
         reader = csv.DictReader(file)
-        assert tuple(reader.fieldnames) == Executions.columns()
+        assert tuple(reader.fieldnames) == Executions.names()
         return [{name: int(value) for name, value in row.items()} for row in reader]
 
 

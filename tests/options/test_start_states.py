@@ -75,7 +75,7 @@ def play(engine, actions, options, **changes):
 def columns(folder: Path) -> list[dict[str, int]]:
     with (folder / "executions.csv").open(newline="") as file:
         reader = csv.DictReader(file)
-        assert tuple(reader.fieldnames) == Executions.columns()
+        assert tuple(reader.fieldnames) == Executions.names()
         return [{name: int(value) for name, value in row.items()} for row in reader]
 
 
@@ -230,9 +230,9 @@ def test_forgotten_states_are_not_learned_from() -> None:
     learner.act = lambda ids, options, age, **_: np.zeros(len(ids), np.int64)  # from now on nothing is reached
     for _ in range(150):
         loop.step()
-    assert not engine.remembers(learner.positive["next"][learner.positive["next"] > 0]).any()
+    assert not engine.remembers(learner.positive.next_state[learner.positive.next_state > 0]).any()
     batch, indices, weights = learner._batch()
-    assert engine.remembers(batch["s"]).all() and engine.remembers(batch["next"]).all()
+    assert engine.remembers(batch.state).all() and engine.remembers(batch.next_state).all()
     assert len(indices) == len(weights) == config.option_batch, "all of it from the replay"
 
 
