@@ -221,11 +221,11 @@ class LightLearner(Learner):
         return values.index_select(0, now), next_online, next_target
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
-        """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""
+        """Follow the loss's gradient; ``errors`` (n, O) name the options where it is NaN or Inf."""
         finite = bool(torch.isfinite(loss))
-        whose = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
+        owner = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
         where = f"in the batch of update {self.updates}, step {self.steps}"
-        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, whose, where)
+        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, owner, where)
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
             follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)

@@ -268,9 +268,9 @@ class PaperQNetwork(nn.Module):
             states.append(state)
         return self.values(torch.stack(states, dim=1)), state[None]
 
-    def _gates(self, inputs: Tensor, of: str) -> Tensor:
+    def _gates(self, inputs: Tensor, source: str) -> Tensor:
         """float32 (N, 3 * 512): what the gates get from images (``ih``) or from the state before (``hh``)."""
-        weight, bias = (self.gru.get_parameter(f"{kind}_{of}_l0") for kind in ("weight", "bias"))
+        weight, bias = (self.gru.get_parameter(f"{kind}_{source}_l0") for kind in ("weight", "bias"))
         return nn.functional.linear(inputs, weight, bias)
 
 

@@ -22,10 +22,14 @@ from hypogoal.options.termination import ORACLE
 
 
 def make_policies(
-    config: Mapping[str, Any], weights: Mapping[str, Tensor], about: Mapping[str, Any], ensemble: Ensemble | None = None
+    config: Mapping[str, Any],
+    weights: Mapping[str, Tensor],
+    ensemble_config: Mapping[str, Any],
+    ensemble: Ensemble | None = None,
 ) -> Policies:
-    """Greedy policies from an options artefact's weights and configuration, that of its ensembles (``about``), and the
-    first of these, which policies need that look at the window around the agent.
+    """Greedy policies from an options artefact's weights and configuration and its ensembles' configuration.
+
+    Policies that see the window around the agent also need the first ensemble.
     """
     if config["termination"] == ORACLE:
         raise UserError(
@@ -39,7 +43,7 @@ def make_policies(
         return ensemble
 
     learner = load_learner(config["network"])
-    return learner.policies(config, weights, tuple(about.get("observation_shape", ())), first_ensemble)
+    return learner.policies(config, weights, tuple(ensemble_config.get("observation_shape", ())), first_ensemble)
 
 
 def saved_actions(weights: Mapping[str, Tensor], layer: str, heads: int, options: int) -> NDArray[np.int64]:

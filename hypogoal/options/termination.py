@@ -94,8 +94,8 @@ class Terminations(Part):
         unknown = np.isnan(self._log_odds[ids]).any(1)
         if unknown.any():
             fresh = np.unique(ids[unknown])
-            known = self._log_odds[fresh]
-            self._log_odds[fresh] = np.where(np.isnan(known), self.classify(fresh), known)
+            before = self._log_odds[fresh]
+            self._log_odds[fresh] = np.where(np.isnan(before), self.classify(fresh), before)
         positive: NDArray[np.bool_] = self._log_odds[ids] > self.thresholds
         return positive
 

@@ -58,12 +58,17 @@ def audit(
         raise UserError(what, f"mend={config.mend:g}", "Give a higher one, or 0.")
     if config.termination == ORACLE:
         raise UserError("an audit takes one classifier only", "termination=oracle", "Leave it out.")
-    about = {"sub_goals": [sub_goal], "members": len(edges), "domain": domain, "domain_config": target.domain_config}
+    ensemble_config = {
+        "sub_goals": [sub_goal],
+        "members": len(edges),
+        "domain": domain,
+        "domain_config": target.domain_config,
+    }
     out = claim(out, kind="audit", inputs=target.inputs, force=force, resume=resume)
     start_arguments(world, config, 1, seed)  # refuse an impossible start before estimating the cost
     steps = config.steps * (len(edges) if config.steps_for == "each" else 1)
-    settings = description(world, about, config, classifier=classifier, member=member, steps=steps)
-    needs = play_needs(world, about, config)
+    settings = description(world, ensemble_config, config, classifier=classifier, member=member, steps=steps)
+    needs = play_needs(world, ensemble_config, config)
 
     def ends(engine: Engine) -> Terminations:
         def log_odds(ids: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -74,9 +79,9 @@ def audit(
 
     artefact: dict[str, Any] = {"kind": "audit", "config": settings, "seed": seed, "inputs": target.inputs}
     with training("audit", out, needs, steps=steps, quiet=quiet, resume=resume, force=force, **artefact) as work:
-        loop = assemble(world, Path(), about, config, seed, device, ends, target.standard)
+        loop = assemble(world, Path(), ensemble_config, config, seed, device, ends, target.standard)
         train(loop, steps, work.log, work.progress, work.checkpoints)
-        write_trained(work.folder, loop, world, about, config, seed)
+        write_trained(work.folder, loop, world, ensemble_config, config, seed)
         table, report = read_table(work.folder / exploits.TABLE, exploits.COLUMNS), dict.fromkeys(POLICIES)
         for option, (name, edge) in enumerate(zip(POLICIES, edges.tolist(), strict=False)):
             ended = float(1 / (1 + np.exp(-loop.terminations.thresholds[option])))  # it may have fallen: patience

@@ -105,8 +105,8 @@ class EngineEnv(VecEnv):
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
-        own = {"engine": self.engine.kept(), "episodes": self.episodes.snapshot()}
-        return {**own, "bonus": self.bonus.snapshot()} if self.bonus else own
+        state = {"engine": self.engine.kept(), "episodes": self.episodes.snapshot()}
+        return {**state, "bonus": self.bonus.snapshot()} if self.bonus else state
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of environments made with the same arguments."""
