@@ -34,7 +34,7 @@ from hypogoal.options.choosers import RandomChooser  # noqa: E402
 from hypogoal.options.light import LightLearner  # noqa: E402
 from hypogoal.options.loop import OptionLoop  # noqa: E402
 from hypogoal.options.recording import Recorder  # noqa: E402
-from hypogoal.options.recurrent import RecurrentLearner  # noqa: E402
+from hypogoal.options.recurrent import RecurrentLearner, Rows  # noqa: E402
 from hypogoal.options.termination import Terminations  # noqa: E402
 
 LAYOUT = 100
@@ -80,10 +80,10 @@ class PlainLearner:
         """One update with 32 transitions."""
         data = self.replay.data
         indices, weights = self.replay.sample(32, self.rng)
-        place = data["place"][indices].astype(np.int64)
+        place = data.place[indices].astype(np.int64)
         steps = np.minimum(np.arange(int(place.max()) + 1), place[:, None])  # padded with the last step
         prefix = indices[:, None] - place[:, None] + steps
-        here, after = data["s"][prefix].astype(np.int64), data["next"][prefix].astype(np.int64)
+        here, after = data.state[prefix].astype(np.int64), data.next_state[prefix].astype(np.int64)
         row, last = torch.arange(32), torch.from_numpy(place)
         self.online.train()
         values = self.online(self._images(here))[row, last]
@@ -91,10 +91,10 @@ class PlainLearner:
         with torch.no_grad():
             best = self.online(following)[row, last].argmax(1)
             ahead = self.target(following)[row, last].gather(1, best[:, None])[:, 0]
-        reward = torch.from_numpy(self.reached.of(data["next"][indices].astype(np.int64))[:, 0]).float()
-        end = torch.from_numpy((data["reached"] | data["end"])[indices])
+        reward = torch.from_numpy(self.reached.of(data.next_state[indices].astype(np.int64))[:, 0]).float()
+        end = torch.from_numpy((data.reached | data.terminated)[indices])
         goal = reward + 0.95 * ahead * ~end
-        taken = values.gather(1, torch.from_numpy(data["a"][indices].astype(np.int64))[:, None])[:, 0]
+        taken = values.gather(1, torch.from_numpy(data.action[indices].astype(np.int64))[:, None])[:, 0]
         errors = nn.functional.huber_loss(taken, goal, reduction="none")
         loss = (errors * torch.from_numpy(weights)).mean()
         self.adam.zero_grad()
@@ -172,15 +172,13 @@ def updates(repeats: int, count: int) -> tuple[list[dict[str, Any]], list[dict[s
 
 def replay_figures(repeats: int) -> dict[str, float]:
     """Memory of 15 full replays of 1e5 transitions, and a sample of 32 with its new priorities."""
-    fields = {"s": np.int32, "a": np.int8, "next": np.int32, "terminal": np.bool_, "timeout": np.bool_,
-              "place": np.int16, "execution": np.int32}  # fmt: skip
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    replays = [PrioritisedReplay(100_000, fields, alpha=0.6, beta=0.4) for _ in range(15)]
+    replays = [PrioritisedReplay(100_000, Rows, alpha=0.6, beta=0.4) for _ in range(15)]
     rng = np.random.default_rng(0)
     for replay in replays:
         for _ in range(100):
-            replay.add(**{name: rng.integers(0, 2, 1_000).astype(kind) for name, kind in fields.items()})
-    held = sum(part.nbytes for replay in replays for part in (*replay.tree.levels, *replay.data.values()))
+            replay.add(Rows.cast(*rng.integers(0, 2, (len(Rows.names()), 1_000))))
+    held = sum(part.nbytes for replay in replays for part in (*replay.tree.levels, *vars(replay.data).values()))
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
 
     def sampled() -> None:

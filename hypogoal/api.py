@@ -1,6 +1,6 @@
 """The Python interface: run stages, load what was trained, predict, play options as actions of an environment.
 
-The functions of the stages do what their commands do. ``given`` takes a command's options, ``preset``, ``seed``,
+The functions of the stages do what their commands do. ``arguments`` takes a command's options, ``preset``, ``seed``,
 ``device``, ``force``, ``resume`` and ``quiet``, and any setting by name. What would end a command is a ``UserError``.
 """
 
@@ -11,8 +11,6 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from hypogoal import stages
 from hypogoal.core import drafts
@@ -29,11 +27,11 @@ from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Narrowed
 from hypogoal.options.policies import make_policies
-from hypogoal.options.termination import Dwell, Patience, rule_of, thresholds_in
+from hypogoal.options.termination import rule_of
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
 Place = str | os.PathLike[str]
-HOW = ("preset", "seed", "device", "force", "resume", "quiet")  # of what is given: no settings
+OPTIONS = ("preset", "seed", "device", "force", "resume", "quiet")  # arguments that are no settings
 
 
 class Made:
@@ -51,48 +49,48 @@ class Made:
         return numbers_in(describe_path(self.path)["kind"], self.path)
 
     def __repr__(self) -> str:
-        about = describe_path(self.path)
-        return "\n".join(map(printable, [lines(about)[0], *outcome(about["kind"], self.path)]))
+        summary = describe_path(self.path)
+        return "\n".join(map(printable, [lines(summary)[0], *outcome(summary["kind"], self.path)]))
 
     def _repr_html_(self) -> str:
         return f'<pre style="line-height: 1.2">{escape(repr(self))}</pre>'
 
     def show(self) -> None:
         """Print what ``hypogoal show`` prints: result, configuration, inputs."""
-        about = describe_path(self.path)
-        for line in [*repr(self).splitlines(), *lines({**about, "counts": None})[1:]]:
+        summary = describe_path(self.path)
+        for line in [*repr(self).splitlines(), *lines({**summary, "counts": None})[1:]]:
             say(line)
 
 
-def collect(domain: str | Domain, out: Place, **given: Any) -> Made:
+def collect(domain: str | Domain, out: Place, **arguments: Any) -> Made:
     """Collect states into the HDF5 file ``out``. A domain object is known by its ``name``, in this process only."""
     if isinstance(domain, Domain):
         if domain.name in BUILT_IN and load_domain(domain.name) is not domain:
             raise UserError("this domain has the name of one of hypogoal's", domain.name, "Give it another name.")
         REGISTERED[domain.name] = domain
-    return _made("collect", domain if isinstance(domain, str) else domain.name, out, given)
+    return _made("collect", domain if isinstance(domain, str) else domain.name, out, arguments)
 
 
-def train_ensemble(data: Place, out: Place, *, unlabelled: Iterable[Place] = (), **given: Any) -> Made:
+def train_ensemble(data: Place, out: Place, *, unlabelled: Iterable[Place] = (), **arguments: Any) -> Made:
     """Train an ensemble for each sub-goal of a data file, if wanted with ``unlabelled`` states from elsewhere."""
-    return _made("train-ensemble", Path(data), out, given, unlabelled=[*map(Path, unlabelled)])
+    return _made("train-ensemble", Path(data), out, arguments, unlabelled=[*map(Path, unlabelled)])
 
 
-def train_options(ensemble: Place, out: Place, *, options: Place | None = None, **given: Any) -> Made:
+def train_options(ensemble: Place, out: Place, *, options: Place | None = None, **arguments: Any) -> Made:
     """Learn an option for every member of an ensemble, or continue training its ``options``."""
-    return _made("train-options", Path(ensemble), out, given, options=Path(options) if options else None)
+    return _made("train-options", Path(ensemble), out, arguments, options=Path(options) if options else None)
 
 
-def train_meta(ensemble: Place, out: Place, *, options: Place | None = None, **given: Any) -> Made:
+def train_meta(ensemble: Place, out: Place, *, options: Place | None = None, **arguments: Any) -> Made:
     """Learn from the reward which options to choose: fresh ones, or trained ``options``."""
-    return _made("train-meta", Path(ensemble), out, given, options=Path(options) if options else None)
+    return _made("train-meta", Path(ensemble), out, arguments, options=Path(options) if options else None)
 
 
-def evaluate(run: Place, out: Place | None = None, **given: Any) -> Made:
-    """Compute every number of a run into ``run/evaluation`` or ``out``. ``given`` takes ``layouts``, no settings."""
+def evaluate(run: Place, out: Place | None = None, **arguments: Any) -> Made:
+    """Compute every number of a run into ``run/evaluation`` or ``out``; takes ``layouts``, and no settings."""
     path, place = Path(run), Path(out or Path(run) / "evaluation")
-    call = partial(stages.named("evaluate"), path, place, **given)
-    return _called("evaluate", place, call, {"run": path, **given})
+    call = partial(stages.named("evaluate"), path, place, **arguments)
+    return _called("evaluate", place, call, {"run": path, **arguments})
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
@@ -102,18 +100,18 @@ def compare(*runs: Place, out: Place, force: bool = False) -> Made:
     return _called("compare", Path(out), call, {"runs": paths})
 
 
-def _made(stage: str, source: str | Path, out: Place, given: dict[str, Any], **own: Any) -> Made:
-    settings = {name: value for name, value in given.items() if name not in HOW}
-    how = {name: value for name, value in given.items() if name in HOW}
-    run = partial(stages.make, stage, source, Path(out), settings, **own, **how)
-    return _called(stage, Path(out), run, {"source": source, **own, **given})
+def _made(stage: str, source: str | Path, out: Place, arguments: dict[str, Any], **sources: Any) -> Made:
+    settings = {name: value for name, value in arguments.items() if name not in OPTIONS}
+    options = {name: value for name, value in arguments.items() if name in OPTIONS}
+    run = partial(stages.make, stage, source, Path(out), settings, **sources, **options)
+    return _called(stage, Path(out), run, {"source": source, **sources, **arguments})
 
 
 def _called(stage: str, out: Path, run: Callable[[], object], words: Mapping[str, Any]) -> Made:
-    """What a stage makes; the manifest's command is the call. What is to be resumed may be complete."""
-    texts = {name: ",".join(map(str, of)) if isinstance(of, list | tuple) else of for name, of in words.items()}
-    told = (f"{name}={of}" for name, of in texts.items() if of not in (None, "") and name != "resume")
-    token = drafts.COMMAND.set((f"hypogoal.{stage.replace('-', '_')}", f"out={out}", *told))
+    """Call a stage; the manifest's command is the call. With ``resume`` the result may be complete already."""
+    texts = {name: ",".join(map(str, word)) if isinstance(word, list | tuple) else word for name, word in words.items()}
+    shown = (f"{name}={text}" for name, text in texts.items() if text not in (None, "") and name != "resume")
+    token = drafts.COMMAND.set((f"hypogoal.{stage.replace('-', '_')}", f"out={out}", *shown))
     try:
         with contextlib.suppress(Complete):
             run()
@@ -172,10 +170,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     policies = make_policies(config, weights, source.config, ensembles[0])
     goals, members = tuple(config["sub_goals"]), config["members"]
     rule, length = rule_of(config["termination"])
-    if rule is Patience:
-        lowered = thresholds_in(weights, len(goals) * members).reshape(len(goals), members)
-        for own, log_odds in zip(ensembles, lowered, strict=True):
-            own.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
+    rule.set_thresholds(ensembles, weights)
     initiation = None
     if INITIATION in artefact.manifest["files"]:
         learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
@@ -190,5 +185,5 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
         config["mask_reached"],
         domain=config["domain"],
         domain_config=config["domain_config"],
-        dwell=length if rule is Dwell else 1,
+        dwell=rule.dwell(length),
     )

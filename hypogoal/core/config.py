@@ -10,6 +10,7 @@ import hashlib
 import inspect
 import json
 import math
+import os
 import re
 import typing
 from collections.abc import Collection, Iterable, Mapping
@@ -19,6 +20,7 @@ from typing import Any, TypeVar
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import MOST_INTEGER, parse_toml, read_text
+from hypogoal.core.own_code import OF_FILE
 
 T = TypeVar("T")
 MAX_PRESET_BYTES = 2**20
@@ -33,12 +35,18 @@ def setting(
     unit: str = "",
     source: str = "",
     choices: Iterable[Any] | None = None,
+    own: bool = False,
     low: float | None = None,
     high: float | None = None,
 ) -> Any:
-    """A dataclass field with its unit, meaning, source and allowed values."""
-    allowed = {"choices": None if choices is None else tuple(choices), "low": low, "high": high}
+    """A dataclass field with its unit, meaning, source and allowed values; ``own``: also a name with a colon."""
+    allowed = {"choices": None if choices is None else tuple(choices), "own": own, "low": low, "high": high}
     return dataclasses.field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source, **allowed})
+
+
+def fixed(value: Any) -> Any:
+    """A field in place of a setting that a stage has taken from another one and does not heed: it cannot be set."""
+    return dataclasses.field(default=value, init=False)
 
 
 def load_preset(name: str | None, stage: str, domain: str = DOMAIN, tables: Collection[str] = ()) -> dict[str, Any]:
@@ -116,16 +124,35 @@ def resolve(
     """
     values: dict[str, Any] = {**(defaults or {}), **load_preset(preset, stage, domain, tables)}
     values.update({key: value for key, value in (options or {}).items() if value is not None})
-    values.update(parse_assignments(assignments))
-    return from_values(config_class, values, stage, domain)
+    assigned = parse_assignments(assignments)
+    config = from_values(config_class, {**values, **assigned}, stage, domain)
+    if OF_FILE not in os.environ:  # an experiment sets its cells alike, controls among them
+        refuse_idle(config, {*(key for key, value in (options or {}).items() if value is not None), *assigned})
+    return config
+
+
+def refuse_idle(config: Any, names: set[str]) -> None:
+    """Refuse (``UserError``) changed settings of these names that do nothing: ``IDLE`` of a class says beside what."""
+    defaults = type(config)()
+    for beside, idle in [item for part in type(config).__mro__ for item in vars(part).get("IDLE", {}).items()]:
+        other, _, value = beside.partition("=")
+        for name in names & set(idle) if getattr(config, other) == value else ():
+            if getattr(config, name) != getattr(defaults, name):
+                setting = f"{name}={getattr(config, name)}"
+                do = f"Leave it out, or change {other}."
+                raise UserError(f"this setting does nothing with {beside}", setting, do)
 
 
 def from_values(config_class: type[T], values: Mapping[str, Any], stage: str, domain: str = DOMAIN) -> T:
     """Build ``config_class`` from plain values (text, TOML or JSON), checking each; ``domain`` is for messages."""
-    fields = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
+    every = dataclasses.fields(config_class)  # type: ignore[arg-type]
+    fields = {field.name: field for field in every if field.init}
+    constant = {field.name: field.default for field in every if not field.init}
     kinds = typing.get_type_hints(config_class)
     checked: dict[str, Any] = {}
     for key, value in values.items():
+        if key in constant and value == constant[key]:
+            continue
         if key not in fields:
             from hypogoal.core.commands import advice  # loads more than this module may
 
@@ -153,7 +180,7 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
     """Every setting with default, meaning and so on; the last of ``instead``, (defaults, source), overrides."""
     kinds = typing.get_type_hints(config_class)
     rows = []
-    for field in dataclasses.fields(config_class):
+    for field in (field for field in dataclasses.fields(config_class) if field.init):
         kind, default, details = kinds[field.name], field.default, dict(field.metadata)
         for values, source in instead:
             if field.name in values:
@@ -167,7 +194,7 @@ def describe(config_class: type, *instead: tuple[Mapping[str, Any], str]) -> lis
 
 def _allowed(meta: Mapping[str, Any]) -> str:
     if meta.get("choices"):
-        return "|".join(str(choice) for choice in meta["choices"])
+        return "|".join([*map(str, meta["choices"]), *(["module:Class"] if meta["own"] else [])])
     low, high = ("" if meta.get(bound) is None else meta[bound] for bound in ("low", "high"))
     return "" if low == high == "" else f"{low} .. {high}".strip()
 
@@ -186,7 +213,7 @@ def _checked(field: dataclasses.Field[Any], kind: Any, value: Any, stage: str) -
             raise UserError("value is not finite", where, "Give a finite number.")
         if isinstance(item, int) and abs(item) > MOST_INTEGER:
             raise UserError("value out of range", where, f"Integers go from -{MOST_INTEGER} to {MOST_INTEGER}.")
-        if meta.get("choices") and item not in meta["choices"]:
+        if meta.get("choices") and item not in meta["choices"] and not (meta["own"] and ":" in item):
             raise UserError("value not allowed", where, f"Choose one of {_allowed(meta).replace('|', ', ')}.")
         for bound, outside in (("low", lambda a, b: a < b), ("high", lambda a, b: a > b)):
             if meta.get(bound) is not None and outside(item, meta[bound]):

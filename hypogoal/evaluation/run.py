@@ -6,14 +6,10 @@ Each damaged file is told in one line (Spec G2).
 from __future__ import annotations
 
 import contextlib
-import csv
-import inspect
-import io
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +17,24 @@ from numpy.typing import NDArray
 from hypogoal.core.artefacts import MANIFEST, Artefact, file_fault, find_artefacts, sha256_of
 from hypogoal.core.commands import advice
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import plain_name, read_json, read_text
+from hypogoal.core.files import plain_name, read_json
 from hypogoal.core.hdf5 import members, open_hdf5, read_array, walk
+from hypogoal.learners.episodes import LAST as LAST
+from hypogoal.options.tables import AGAIN as AGAIN
+from hypogoal.options.tables import BLANK as BLANK
+from hypogoal.options.tables import MAX_INTEGER
+from hypogoal.options.tables import Choices as Choices
+from hypogoal.options.tables import Episodes as Episodes
+from hypogoal.options.tables import Executions as Executions
+from hypogoal.options.tables import read_table as read_table
 
-AGAIN = "Evaluate the run again."
-WINDOW = 100  # episodes at the end of training by which an agent is judged
-LAST = 100  # executions of an option that count
-MOST = 2**53  # integers that a float holds
-MOST_OPTIONS = 2**16
-MAX_TABLE_BYTES = 2**30
-BLANK = ("best_near", "best_far")  # columns whose cells may be empty, NaN
+WINDOW = LAST  # episodes at the end of training by which an agent is judged; executions of an option that count
 FORMAT = 2  # of ``metrics.json``: 1 until 0.15
 PARTS = (  # of it
     *("agents", "layouts", "rooms", "distance", "exploits", "hypotheses", "ranking", "explorer", "saliency"),
     *("selection", "choosing", "ensembles", "settings", "missing", "provenance", "quantities", "comparisons"),
 )
-Table = TypeVar("Table")
+read_episodes, read_choices, read_executions = Episodes.read, Choices.read, Executions.read
 
 
 @dataclass(frozen=True)
@@ -117,104 +115,12 @@ def within(contents: Contents, source: Artefact) -> str | None:
     return next(map(contents.name, same), None)
 
 
-class Columns:
-    """Rows of a table, a field for each column: arrays (n,)."""
-
-    def at(self, rows: Any) -> Self:
-        """Some of them, by whatever NumPy takes for an index."""
-        return type(self)(*(getattr(self, name)[rows] for name in inspect.signature(type(self)).parameters))
-
-
-@dataclass(frozen=True)
-class Episodes(Columns):
-    """A run's training episodes in the order in which they ended; arrays (n,)."""
-
-    step: NDArray[np.int64]  # environment steps when it ended, summed over parallel environments and stages
-    length: NDArray[np.int64]  # steps
-    reward: NDArray[np.float64]  # undiscounted
-    terminated: NDArray[np.bool_]  # it reached a terminal state; else it was cut at the cap
-    # Spec F5: as its domain says; else, and in tables of before this column, it terminated, and with a reward: an agent
-    # that dies reaches a terminal state too.
-    succeeded: NDArray[np.bool_] = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.succeeded is None:
-            object.__setattr__(self, "succeeded", self.terminated & (self.reward > 0))  # type: ignore[unreachable]
-
-    def last(self, count: int = WINDOW) -> Episodes:
-        """The last ``count`` episodes, or all where there are fewer."""
-        return self.at(slice(max(0, len(self.step) - count), None))
-
-
-@dataclass(frozen=True)
-class Choices(Columns):
-    """Rows of ``choices.csv``, arrays (n,): one row per option and window of steps that ends at ``step``."""
-
-    step: NDArray[np.int64]
-    option: NDArray[np.int64]
-    offered: NDArray[np.int64]
-    chosen: NDArray[np.int64]
-    expected: NDArray[np.float64]
-    reached: NDArray[np.int64]
-    duration: NDArray[np.int64]
-
-    def total(self, name: str, options: int) -> NDArray[np.float64]:
-        """The sum of column ``name`` over all windows, (O,)."""
-        return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
-
-
-@dataclass(frozen=True)
-class Executions(Columns):
-    """Executions of options in the order in which they ended, arrays (n,): the rows of ``executions.csv``."""
-
-    step: NDArray[np.int64]  # environment steps when it ended
-    option: NDArray[np.int64]  # g*K + k
-    duration: NDArray[np.int64]  # steps
-    reached: NDArray[np.bool_]  # its own termination classifier said yes
-    inside_at_start: NDArray[np.bool_]  # that classifier said yes where it began
-    terminated: NDArray[np.bool_]  # the episode ended in a terminal state: the agent died
-    room: NDArray[np.int64]  # where it stopped; x and y too
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
-    distance: NDArray[np.int64]  # from there to the nearest true sub-goal, in the domain's units
-
-    def of(self, option: int, last: int = LAST) -> Executions:
-        """The last executions of one option."""
-        return self.at(np.flatnonzero(self.option == option)[-last:])
-
-    def positions(self) -> NDArray[np.int64]:
-        """Where they stopped, (n, 3)."""
-        return np.stack([self.room, self.x, self.y], axis=1)
-
-
-def read_episodes(path: Path) -> Episodes:
-    """``episodes.csv``: step, length, reward, terminated, succeeded."""
-    kinds = {"reward": np.float64, "terminated": np.bool_, "succeeded": np.bool_}
-    return _read(Episodes, path, kinds, ("succeeded",))
-
-
-def read_choices(path: Path) -> Choices:
-    """``choices.csv``: one row per option and window."""
-    return _read(Choices, path, {"expected": np.float64})
-
-
-def read_executions(path: Path) -> Executions:
-    """``executions.csv``: one row per execution of an option, in the order in which they ended."""
-    return _read(Executions, path, dict.fromkeys(("reached", "inside_at_start", "terminated"), np.bool_))
-
-
-def _read(kind: type[Table], path: Path, kinds: Mapping[str, Any], optional: Sequence[str] = ()) -> Table:
-    """A table with a column for each field, int64 where ``kinds`` says nothing else; ``optional`` ones may lack."""
-    table = read_table(path, [name for name in inspect.signature(kind).parameters if name not in optional], optional)
-    return kind(**{name: column.astype(kinds.get(name, np.int64)) for name, column in table.items()})
-
-
 def read_layout(path: Path) -> dict[str, Any]:
     """``layout.json``: layout_seed, shortest_path, random_success, random_episodes; of many layouts also layouts."""
     facts = read_json(path, "the layout's file is", AGAIN)
     wanted = {"layout_seed": int, "shortest_path": int | None, "random_success": float | int | None}
     fits = isinstance(facts, dict) and all(isinstance(facts.get(key, ...), kind) for key, kind in wanted.items())
-    if not fits or not 0 <= facts["layout_seed"] < MOST or type(facts.get("random_episodes")) is not int:
+    if not fits or not 0 <= facts["layout_seed"] < MAX_INTEGER or type(facts.get("random_episodes")) is not int:
         raise UserError("the layout's file is damaged", path, AGAIN)
     more = {"layouts": facts["layouts"]} if isinstance(facts.get("layouts"), str) else {}
     return {key: facts[key] for key in (*wanted, "random_episodes")} | more
@@ -227,39 +133,6 @@ def read_terminations(path: Path) -> dict[int, NDArray[Any]]:
             return {int(name): read_array(file, name, "uf") for name in members(file)}
         except ValueError as error:  # a name that is no number
             raise UserError(f"the file of terminations is damaged ({error})", path, AGAIN) from None
-
-
-def read_table(
-    path: Path, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
-) -> dict[str, NDArray[np.float64]]:
-    """Columns of a table of numbers, a CSV file with a header; float (n,) each.
-
-    ``columns`` are those that must be there; all that are where None; ``optional`` those that may be. A file that is
-    missing, too large, no table, or holds anything but finite numbers of at most 2^53 (or, in a ``BLANK`` column,
-    nothing) is a ``UserError``.
-    """
-    text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
-    try:
-        reader = csv.DictReader(io.StringIO(text, newline=""))
-        header = list(reader.fieldnames or ())
-        columns = header if columns is None else [*columns, *(name for name in optional if name in header)]
-        if not set(columns) <= set(header):
-            raise KeyError(path)
-        rows = [
-            [math.nan if row[column] == "" and column in BLANK else float(row[column]) for column in columns]
-            for row in reader
-        ]
-    except (ValueError, KeyError, TypeError, csv.Error):
-        raise UserError("the table is damaged", path, AGAIN) from None
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
-    # NaN is no number, and of an integer column nothing may be lost.
-    if not ((np.abs(values) < MOST) | (np.isnan(values) & np.isin(columns, BLANK))).all():
-        raise UserError("a number in the table is missing or too large", path, AGAIN)
-    table = {name: values[:, index] for index, name in enumerate(columns)}
-    options = table.get("option", np.zeros(0))
-    if not ((options >= 0) & (options < MOST_OPTIONS)).all():
-        raise UserError("an option in the table has an impossible number", path, AGAIN)
-    return table
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def follow_tensors(ours: Sequence[Tensor], theirs: Sequence[Tensor], tau: float)
 
 
 def descend(
-    loss: Tensor, backward: Callable[[Tensor], Tensor], optimiser: torch.optim.Optimizer, whose: str, where: str
+    loss: Tensor, backward: Callable[[Tensor], Tensor], optimiser: torch.optim.Optimizer, owner: str, where: str
 ) -> None:
     """Spec G3: a step of ``optimiser`` down a loss; ``backward`` fills the gradients and returns their norm, ().
 
@@ -68,10 +68,10 @@ def descend(
     weights stay as they are.
     """
     if not torch.isfinite(loss):
-        raise NumericalError(f"the loss of {whose} is {float(loss.detach())} {where}")
+        raise NumericalError(f"the loss of {owner} is {float(loss.detach())} {where}")
     norm = backward(loss)
     if not torch.isfinite(norm):
-        raise NumericalError(f"a gradient of {whose} is {float(norm)} {where}")
+        raise NumericalError(f"a gradient of {owner} is {float(norm)} {where}")
     optimiser.step()
 
 

@@ -1,21 +1,24 @@
 """The episodes played so far: how long each was, what it earned, how it ended (Spec E7, F5)."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hypogoal.core.checkpoints import Resumable, State, growing
-from hypogoal.core.files import write_table
-from hypogoal.domains.base import Step
 
-EPISODE_COLUMNS = ("step", "length", "reward", "terminated", "succeeded")
-LAST = 100  # episodes, of which success and length are told
+if TYPE_CHECKING:
+    from hypogoal.domains.base import Step
+
+LAST = 100  # an agent is judged by its last so many episodes, an option by its last so many executions (Spec F3)
 
 
-class Episodes(list[tuple[int, int, float, int, int]], Resumable):
-    """A row of ``EPISODE_COLUMNS`` for every finished episode of E environments, in the order in which they ended.
+class EpisodeRecorder(list[tuple[int, int, float, int, int]], Resumable):
+    """Every finished episode of E environments, in the order in which they ended.
+
+    A row is step, length, reward, terminated, succeeded: the columns of :class:`hypogoal.options.tables.Episodes`.
 
     ``steps`` are environment steps so far, summed over the environments.
     """
@@ -33,10 +36,10 @@ class Episodes(list[tuple[int, int, float, int, int]], Resumable):
         self._length += 1
         self._reward += step.rewards
         over = step.terminated | step.truncated
-        for place in np.flatnonzero(over):
-            length, reward, done = int(self._length[place]), float(self._reward[place]), bool(step.terminated[place])
-            success = done and reward > 0 if step.succeeded is None else step.succeeded[place]
-            self.append((self.steps, length, reward, int(done), int(success)))
+        for e in np.flatnonzero(over):
+            length, reward, terminated = int(self._length[e]), float(self._reward[e]), bool(step.terminated[e])
+            succeeded = terminated and reward > 0 if step.succeeded is None else step.succeeded[e]
+            self.append((self.steps, length, reward, int(terminated), int(succeeded)))
         self._length[over], self._reward[over] = 0, 0.0
 
     def success(self) -> float:
@@ -53,12 +56,8 @@ class Episodes(list[tuple[int, int, float, int, int]], Resumable):
         last = self[-LAST:]
         return sum(row[1] for row in last) / len(last) if last else float("nan")
 
-    def write(self, folder: Path) -> None:
-        """``episodes.csv`` into ``folder``."""
-        write_table(folder / "episodes.csv", EPISODE_COLUMNS, self)
-
     def snapshot(self) -> State:
-        return {**super().snapshot(), "rows": growing(np.array(self, np.float64).reshape(-1, len(EPISODE_COLUMNS)))}
+        return {**super().snapshot(), "rows": growing(np.array(self, np.float64).reshape(-1, 5))}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)

@@ -4,15 +4,31 @@ A transition costs bytes, not images.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable, growing
+from hypogoal.core.columns import Columns
 
 FAN = 64  # children of a node: 1e5 leaves are three levels, and NumPy's cost is by the call
+Rows = TypeVar("Rows", bound=Columns)
+
+
+@dataclass(frozen=True)
+class Steps(Columns):
+    """Steps of sequences, or transitions over several of these."""
+
+    state: NDArray[np.int32]  # ids
+    action: NDArray[np.int16]
+    next_state: NDArray[np.int32]  # ids
+    steps: NDArray[np.int16]  # from state to next_state
+
+
+Joined = TypeVar("Joined", bound=Steps)
 
 
 class SumTree:
@@ -57,28 +73,27 @@ class SumTree:
         return places
 
 
-class PrioritisedReplay(Resumable):
+class PrioritisedReplay(Resumable, Generic[Rows]):
     """A ring of transitions (Tables 2 and 4: 1e5), sampled in proportion to priority ** alpha.
 
-    ``fields`` are by name the NumPy dtypes of what is stored per transition. An ``alpha`` of 0 samples uniformly, 1 in
-    full proportion; ``beta`` is the strength of the importance weights that correct for it.
+    ``kind`` is the class of what is stored, ``data``. An ``alpha`` of 0 samples uniformly, 1 in full proportion;
+    ``beta`` is the strength of the importance weights that correct for it.
     """
 
-    def __init__(self, capacity: int, fields: Mapping[str, Any], *, alpha: float, beta: float):
+    def __init__(self, capacity: int, kind: type[Rows], *, alpha: float, beta: float):
         self.capacity, self.alpha, self.beta = capacity, alpha, beta
-        self.data = {name: np.zeros(capacity, dtype=kind) for name, kind in fields.items()}
+        self.data = kind.zeros(capacity)
         self.tree = SumTree(capacity)
         self.size = self._next = 0
         self._largest = 1.0
 
-    def add(self, **columns: NDArray[Any]) -> NDArray[np.int64]:
+    def add(self, rows: Rows) -> NDArray[np.int64]:
         """Append n transitions with the largest priority seen; returns their indices, int64 (n,)."""
-        count = len(next(iter(columns.values())))
+        count = len(rows)
         if not count:
             return np.empty(0, dtype=np.int64)
         indices = (self._next + np.arange(count)) % self.capacity
-        for name, values in columns.items():
-            self.data[name][indices] = values
+        self.data.put(indices, rows)
         self.tree.set(indices, np.full(count, self._largest**self.alpha))
         self._next = int((self._next + count) % self.capacity)
         self.size = min(self.size + count, self.capacity)
@@ -101,7 +116,7 @@ class PrioritisedReplay(Resumable):
 
     def snapshot(self) -> dict[str, Any]:
         return {
-            "data": {name: growing(values[: self.size].copy()) for name, values in self.data.items()},
+            "data": {name: growing(values[: self.size].copy()) for name, values in vars(self.data).items()},
             "priorities": growing(self.tree.get(np.arange(self.size))),
             "largest": self._largest,
             "next": self._next,
@@ -111,7 +126,7 @@ class PrioritisedReplay(Resumable):
         """Continue, on a fresh replay, from a ``snapshot`` of one of the same capacity and fields."""
         self.size = len(snapshot["priorities"])
         for name, values in snapshot["data"].items():
-            self.data[name][: self.size] = values
+            getattr(self.data, name)[: self.size] = values
         if self.size:
             self.tree.set(np.arange(self.size), snapshot["priorities"])
         self._largest, self._next = snapshot["largest"], snapshot["next"]
@@ -132,29 +147,25 @@ class StepsAhead(Resumable):
     def items(self) -> dict[str, Any]:
         return {"_open": (0, 0)}
 
-    def add(
-        self,
-        s: NDArray[np.int64],
-        a: NDArray[np.int64],
-        following: NDArray[np.int64],
-        ended: NDArray[np.bool_],
-        **columns: NDArray[Any],
-    ) -> dict[str, NDArray[Any]]:
-        """One step of every sequence, arrays (E,); returns the transitions that are complete now, arrays (m,).
+    def add(self, rows: Joined, ended: NDArray[np.bool_]) -> Joined:
+        """One step of every sequence, and which sequences end with it, bool (E,); returns the transitions now complete.
 
-        Of a step state ids before, actions, state ids after, and ``columns`` are given; of a transition ``s``, ``a``,
-        ``next``, ``steps`` (how far it reaches, 1 .. n) and the ``columns`` of its last step.
+        A transition has ``state`` and ``action`` of its first step, and all else of its last.
         """
         if self.n == 1:
-            return {"s": s, "a": a, "next": following, "steps": np.ones(len(s), dtype=np.int64), **columns}
-        rows: list[tuple[int, int, int, int]] = []  # sequence, s, a, steps
+            return rows
+        complete: list[tuple[int, int, int, int]] = []  # sequence, state, action, steps
         for e, steps in enumerate(self._open):
-            steps.append((int(s[e]), int(a[e])))
+            steps.append((int(rows.state[e]), int(rows.action[e])))
             if ended[e]:
-                rows.extend((e, *first, len(steps) - place) for place, first in enumerate(steps))
+                complete.extend((e, *first, len(steps) - place) for place, first in enumerate(steps))
                 steps.clear()
             elif len(steps) == self.n:
-                rows.append((e, *steps.pop(0), self.n))
-        sequence, from_s, by_a, over = np.array(rows, dtype=np.int64).reshape(-1, 4).T
-        last = {name: values[sequence] for name, values in columns.items()}
-        return {"s": from_s, "a": by_a, "next": following[sequence], "steps": over, **last}
+                complete.append((e, *steps.pop(0), self.n))
+        sequence, state, action, count = np.array(complete, dtype=np.int64).reshape(-1, 4).T
+        return replace(
+            rows.at(sequence),
+            state=state.astype(np.int32),
+            action=action.astype(np.int16),
+            steps=count.astype(np.int16),
+        )

@@ -3,16 +3,26 @@
 The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
-from hypogoal.core.config import MAX_RANGE, parse_integers, setting
+from hypogoal.core.config import MAX_RANGE, fixed, parse_integers, setting
 from hypogoal.core.errors import UserError
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import FULL, OptionConfig
 
 
 @dataclass(frozen=True)
 class MetaConfig:
     """PPO over options, with SMDP returns."""
+
+    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(
+        ("chooser=random", "chooser=thompson"),
+        (
+            *("meta_network", "head", "gae_lambda", "decisions", "epochs", "meta_batch"),
+            *("meta_learning_rate", "clip", "entropy", "value_weight", "advantage_floor"),
+        ),
+    )
 
     meta_network: str = setting(
         "light",
@@ -80,12 +90,6 @@ class PlayConfig(OptionConfig):
         "changes to the world that the states were collected in: settings of the domain as name=value",
         source="ours: a task in which choosing decides",
     )
-    termination: str = setting(
-        "learned",
-        "where options end: learned, at the first yes; patience:N, with a threshold that falls after N steps of an "
-        "option that hardly ever gets there; dwell:N, at N yeses in a row; or oracle, at true sub-goals (upper bound)",
-        source="paper: learned; the others ours",
-    )
     save_visited: int = setting(
         0,
         "distinct visited states to save as a data file, for training ensembles",
@@ -96,11 +100,11 @@ class PlayConfig(OptionConfig):
 
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
-    """What ``layouts`` means, each seed once, a bare number so many from ``first`` on; else a ``UserError``."""
+    """The seeds that ``layouts`` names, each once, a bare number so many from ``first`` on; else a ``UserError``."""
     if not layouts.strip() and first is not None:
         return [first]
     if layouts.strip().isdecimal():
-        count, do = int(layouts), f"Give from 1 to {MAX_RANGE}, or seeds as 2000-2099."
+        count, do = int(layouts), f"Give 1 to {MAX_RANGE}, or seeds as 2000-2099."
         if first is None or not 0 < count <= MAX_RANGE:
             raise UserError("which layouts, or how many?", f"layouts={layouts}", do)
         return list(range(first, first + count))
@@ -132,6 +136,7 @@ class TrainOptionsConfig(PlayConfig):
         "random: uniform among the options offered; even: the one with the fewest steps so far",
         source="paper, policy learning",
         choices=("random", "even"),
+        own=True,
     )
 
 
@@ -147,6 +152,7 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
         "the meta-policy, uniform choice among the options offered, or a bandit that sees no state",
         source="ours: controls; Thompson 1933",
         choices=("ppo", "random", "thompson"),
+        own=True,
     )
 
 
@@ -154,16 +160,18 @@ class TrainMetaConfig(PlayConfig, MetaConfig):
 class AuditConfig(TrainOptionsConfig):
     """How policies learn to fool a classifier, and what is tried against them."""
 
+    policy_view: str = fixed(FULL)  # a classifier has no localiser
+    until: float = fixed(0.0)  # policies that fool a classifier do not bring the task to success
     option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
-    mask_reached: bool = setting(False, "do not begin executions where the classifier says yes already")
+    mask_reached: bool = setting(False, "do not begin executions where the prediction is already positive")
     steps: int = setting(80_000, "environment steps, all policies together", unit="steps", low=1)
     chooser: str = setting(
-        "even", "who plays: the policy with the fewest steps so far, or any", choices=("random", "even")
+        "even", "who plays: the policy with the fewest steps so far, or any", choices=("random", "even"), own=True
     )
     threshold: float = setting(
         0.0,
-        "a probability above this is a yes; 0: a member's own threshold, or 0.5 for other classifiers",
+        "a prediction is positive above this probability; 0: a member's own threshold, or 0.5 for other classifiers",
         low=0.0,
         high=1.0,
     )

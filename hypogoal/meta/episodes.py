@@ -13,7 +13,7 @@ from hypogoal.core.tensors import load_tensors
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Layouts, load_domain
 from hypogoal.meta.config import TrainMetaConfig
-from hypogoal.meta.training import ONE_LAYOUT, assemble
+from hypogoal.meta.training import ONE_LAYOUT, assemble, continue_with
 from hypogoal.options.loop import OptionLoop, Transitions
 
 REPLAY = 1_000  # nothing is learned: a small one
@@ -58,7 +58,7 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
         "replay": REPLAY,
         "decisions": 2,
         "save_visited": 0,
-        "chooser": artefact.config["chooser"] if "meta.safetensors" in files else "random",
+        "chooser": artefact.config["chooser"] if artefact.kind == "meta" else "random",
         "initiation": "learned" if "initiation.safetensors" in files else "anywhere",
     }
     domain, others = load_domain(artefact.config["domain"]), None
@@ -70,12 +70,9 @@ def agent_of(artefact: Artefact, seed: int, environments: int = 1, layouts: Sequ
     loop = assemble(
         domain, source.path, source.config, from_values(TrainMetaConfig, settings, "train-meta"), seed, layouts=others
     )
-    learned = load_tensors(artefact.path / "options.safetensors")
-    loop.learner.load(learned)
-    loop.terminations.load(learned)
-    for name, part in (("meta", loop.chooser), ("initiation", loop.initiation)):
-        if part is not None and f"{name}.safetensors" in files:
-            part.load(load_tensors(artefact.path / f"{name}.safetensors"))
+    continue_with(loop, artefact)
+    if loop.chooser.FILE in files:
+        loop.chooser.load(load_tensors(artefact.path / loop.chooser.FILE))
     return loop
 
 

@@ -1,8 +1,9 @@
 """The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration (Spec E1-E3)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -10,20 +11,45 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hypogoal.core.checkpoints import State, growing
+from hypogoal.core.columns import Columns
 from hypogoal.core.compute import tensor
+from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for, seed_for, torch_generator
 from hypogoal.core.tensors import AGAIN, check_fit
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import descend
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import HEADS, NETWORKS
+from hypogoal.meta.smdp import smdp_advantages
 from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
+from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
 
-Decisions = dict[str, NDArray[Any]]  # columns (n, ...)
+
+@dataclass(frozen=True)
+class Draws(Columns):
+    """Choices of an option, arrays (n, ...)."""
+
+    state: NDArray[np.int64]  # in which it was chosen
+    offered: NDArray[np.bool_]  # (n, O)
+    drawn: NDArray[np.float32]  # what the head remembers of the draw, (n, R)
+    log_prob: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Decisions(Draws):
+    """Choices and what came of them."""
+
+    environment: NDArray[np.int64]
+    returned: NDArray[np.float64]  # rewards inside the option, discounted from its start
+    discount: NDArray[np.float64]  # gamma ** tau
+    next_state: NDArray[np.int64]  # in which the option ended
+    terminated: NDArray[np.bool_]  # nothing follows it
+    ended: NDArray[np.bool_]  # the episode ended there, for whatever reason
 
 
 class MetaPolicy(Chooser):
@@ -32,7 +58,7 @@ class MetaPolicy(Chooser):
     ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
     """
 
-    CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "_finished", "updates")
+    CHANGING = ("policy", "optimiser", "generator", "rng", "_open", "updates")
 
     def __init__(self, engine: Engine, options: int, config: MetaConfig, seed: int, device: torch.device | str = "cpu"):
         self.engine, self.options, self.config = engine, options, config
@@ -48,14 +74,28 @@ class MetaPolicy(Chooser):
         self.generator = torch_generator(seed, "meta-draws")
         self.rng = rng_for(seed, "meta-batches")
         count = engine.count
-        self._open: Decisions = {  # the last one of every environment
-            "state": np.zeros(count, np.int64),
-            "offered": np.zeros((count, options), np.bool_),
-            "drawn": np.zeros((count, self.head.remembered), np.float32),
-            "log_prob": np.zeros(count, np.float32),
-        }
+        self._open = Draws(  # the last one of every environment
+            state=np.zeros(count, np.int64),
+            offered=np.zeros((count, options), np.bool_),
+            drawn=np.zeros((count, self.head.remembered), np.float32),
+            log_prob=np.zeros(count, np.float32),
+        )
         self._finished: list[Decisions] = []  # as they ended
         self.updates = 0
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Without settings of PPO there is nothing to learn by; the paper's network sees pictures only."""
+        if not isinstance(config, MetaConfig):
+            raise UserError("only train-meta learns the meta-policy", "chooser=ppo", "Give chooser=random or even.")
+        if config.meta_network == "paper" and engine.observation_dtype != PICTURE:
+            do = "Give --set meta_network=light."
+            raise UserError("the paper's networks see pictures only", "meta_network=paper", do)
+
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        assert isinstance(config, MetaConfig)
+        return cls(engine, options, config, seed, device)
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         with torch.no_grad():
@@ -63,57 +103,58 @@ class MetaPolicy(Chooser):
             mask = torch.from_numpy(offered)
             options, drawn = self.head.draw(scores, mask, self.generator)
             log_prob = self.head.log_prob(scores, mask, drawn)[0]
-        decided = {"state": ids, "offered": offered, "drawn": drawn.numpy(), "log_prob": log_prob.numpy()}
-        for name, values in decided.items():
-            self._open[name][environments] = values
+        self._open.put(environments, Draws(ids, offered, drawn.numpy(), log_prob.numpy()))
         return options.numpy()
 
     def record(self, outcome: Outcome) -> None:
-        came_of_it = {
-            "environment": outcome.environments,
-            "returned": outcome.returns,
-            "discount": outcome.discounts,
-            "next_state": outcome.next_ids,
-            "terminated": outcome.terminated,
-            "ended": outcome.terminated | outcome.truncated,
-        }
-        self._finished.append({name: values[outcome.environments] for name, values in self._open.items()} | came_of_it)
+        draws = self._open.at(outcome.environments)
+        decisions = Decisions(
+            **vars(draws),
+            environment=outcome.environments,
+            returned=outcome.returns,
+            discount=outcome.discounts,
+            next_state=outcome.next_ids,
+            terminated=outcome.terminated,
+            ended=outcome.terminated | outcome.truncated,
+        )
+        self._finished.append(decisions)
 
     def begin_anew(self) -> None:
         self._finished = []
 
     def learn(self) -> dict[str, float]:
-        if sum(len(part["state"]) for part in self._finished) < self.config.decisions:
+        if sum(map(len, self._finished)) < self.config.decisions:
             return {}
-        decisions, self._finished = _joined(self._finished), []
-        by_environment = np.argsort(decisions["environment"], kind="stable")
-        return self._update({name: values[by_environment] for name, values in decisions.items()})
+        decisions, self._finished = Decisions.joined(self._finished), []
+        return self._update(decisions.at(np.argsort(decisions.environment, kind="stable")))
 
     def _outputs(self, ids: NDArray[np.int64]) -> Tensor:
         return apply_to_states(self.network, self.engine, ids)
 
     def _update(self, decisions: Decisions) -> dict[str, float]:
         """Learn from decisions, those of an environment side by side in the order in which they were taken."""
-        config, states = self.config, decisions["state"]
+        config, states = self.config, decisions.state
         with torch.no_grad():
             values = self._outputs(states)[:, -1].double().cpu().numpy()
-            next_values = self._outputs(decisions["next_state"])[:, -1].double().cpu().numpy()
-        begins = np.flatnonzero(np.diff(decisions["environment"])) + 1
+            next_values = self._outputs(decisions.next_state)[:, -1].double().cpu().numpy()
+        begins = np.flatnonzero(np.diff(decisions.environment)) + 1
         advantages = np.concatenate(
             [
                 smdp_advantages(
-                    decisions["returned"][rows],
-                    decisions["discount"][rows],
+                    decisions.returned[rows],
+                    decisions.discount[rows],
                     values[rows],
                     next_values[rows],
-                    decisions["terminated"][rows],
-                    decisions["ended"][rows],
+                    decisions.terminated[rows],
+                    decisions.ended[rows],
                     config.gae_lambda,
                 )
                 for rows in np.split(np.arange(len(states)), begins)
             ]
         )
-        offered, drawn, old = (tensor(decisions[name], self.device) for name in ("offered", "drawn", "log_prob"))
+        offered, drawn, old = (
+            tensor(values, self.device) for values in (decisions.offered, decisions.drawn, decisions.log_prob)
+        )
         goal = tensor(advantages + values, self.device).float()
         scaled = tensor(scaled_advantages(advantages, config.advantage_floor), self.device).float()
         entropy_seen = 0.0
@@ -143,27 +184,17 @@ class MetaPolicy(Chooser):
         check_fit(self.state(), state, "meta.safetensors", AGAIN)
         self.policy.load_state_dict(state)
 
-    def items(self) -> dict[str, Any]:
-        ids, numbers, truths = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.bool_)
-        columns = {
-            **self._open,
-            "environment": ids,
-            "returned": numbers,
-            "discount": numbers,
-            "next_state": ids,
-            "terminated": truths,
-            "ended": truths,
-        }
-        return {"_finished": {name: growing(values) for name, values in columns.items()}}
-
     def snapshot(self) -> State:
-        """As of :class:`Resumable`, in few arrays."""
-        self._finished = [_joined(self._finished)] if self._finished else []
-        return super().snapshot()
+        """As of :class:`Resumable`, and the decisions, in one array for each column."""
+        draws = vars(self._open.at(slice(0)))
+        outcomes = {name: np.zeros(0, kind) for name, kind in Decisions.types().items() if name not in draws}
+        self._finished = [Decisions.joined([Decisions(**draws, **outcomes), *self._finished])]
+        finished = {name: growing(values) for name, values in vars(self._finished[0]).items()}
+        return {**super().snapshot(), "finished": finished}
 
-
-def _joined(parts: Sequence[Decisions]) -> Decisions:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        super().restore(snapshot)
+        self._finished = [Decisions(**snapshot["finished"])]
 
 
 def scaled_advantages(advantages: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
@@ -182,40 +213,3 @@ def clipped_surrogate(log_prob: Tensor, old: Tensor, advantages: Tensor, clip: f
     """
     ratio = (log_prob - old).exp()
     return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()
-
-
-def smdp_advantages(
-    returns: NDArray[np.float64],
-    discounts: NDArray[np.float64],
-    values: NDArray[np.float64],
-    next_values: NDArray[np.float64],
-    terminated: NDArray[np.bool_],
-    ended: NDArray[np.bool_],
-    trace: float,
-) -> NDArray[np.float64]:
-    """Spec E1: generalised advantages of consecutive decisions of one environment.
-
-    delta_t = R_t + gamma^tau_t (1 - terminated_t) V(s'_t) - V(s_t);
-    A_t = delta_t + gamma^tau_t lambda (1 - ended_t) A_{t+1}.
-
-    Args:
-        returns: R_t, rewards inside the option, discounted from its start, (T,).
-        discounts: gamma ** tau_t, (T,).
-        values: V(s_t), (T,).
-        next_values: V of the state reached, (T,).
-        terminated: nothing follows the state reached, (T,).
-        ended: the episode ended there, for whatever reason, (T,).
-        trace: lambda.
-
-    Returns:
-        A_t, (T,).
-
-    Source: Schulman et al. 2016 (GAE) with the SMDP discount of Sutton, Precup and Singh 1999.
-    """
-    advantages = np.zeros(len(returns))
-    following = 0.0
-    for t in reversed(range(len(returns))):
-        delta = returns[t] + discounts[t] * (not terminated[t]) * next_values[t] - values[t]
-        following = delta + discounts[t] * trace * (not ended[t]) * following
-        advantages[t] = following
-    return advantages

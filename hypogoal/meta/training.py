@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,141 +18,128 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.rounding import DIGITS
 from hypogoal.core.seeding import rng_for
-from hypogoal.core.tensors import save_tensors
-from hypogoal.dataset import PICTURE, standard_of
+from hypogoal.core.tensors import load_tensors, save_tensors
+from hypogoal.dataset import PICTURE, Standard, standard_of
 from hypogoal.domains.base import Domain, Engine, Layouts
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.hypotheses.networks import AUTO
 from hypogoal.meta.config import MetaConfig, PlayConfig, TrainMetaConfig, TrainOptionsConfig, layout_seeds
-from hypogoal.meta.ppo import MetaPolicy
-from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
+from hypogoal.options.choosers import load_chooser
 from hypogoal.options.config import STACK
+from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Initiation
-from hypogoal.options.learner import Learner
-from hypogoal.options.light import LightLearner
+from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.planned import PlannedLearner
+from hypogoal.options.parts import Part
+from hypogoal.options.policy_views import Viewed, create_views, views_in
 from hypogoal.options.recording import Recorder
-from hypogoal.options.recurrent import RecurrentLearner
-from hypogoal.options.termination import Terminations, learned_terminations, oracle_terminations
-from hypogoal.options.thompson import ThompsonChooser
+from hypogoal.options.termination import ORACLE, Terminations, learned_terminations, oracle_terminations, rule_of
 from hypogoal.options.visited import Visited
-from hypogoal.options.windows import AgentWindows, HalfPictures, localiser_of
 
 LOG_INTERVAL = 2_000  # environment steps
 ONE_LAYOUT = "an engine of this domain plays one layout"
-LEARNERS: dict[str, type[Learner]] = {"light": LightLearner, "paper": RecurrentLearner, "planned": PlannedLearner}
 
 
 def assemble(
     domain: Domain,
     ensemble: Path,
-    about: Mapping[str, Any],
+    ensemble_config: Mapping[str, Any],
     config: TrainOptionsConfig | TrainMetaConfig,
     seed: int,
     device: str = "cpu",
     ends: Callable[[Engine], Terminations] | None = None,
+    standard: Standard | None = None,
     layouts: Layouts | None = None,
 ) -> OptionLoop:
     """Environments, an ensemble's options in them, fresh policies of these and over these.
 
-    ``about`` is the ensemble manifest's configuration; ``seed`` of weights, exploration, choices and, where there are
-    several, layouts and start states; ``ends`` gives terminations that are no ensemble's, ``layouts`` others than those
-    of ``config``. Where the domain has no such start, or not the true sub-goals at which options are to end, it is a
-    ``UserError``.
+    ``ensemble_config`` is that of the ensemble's manifest; ``seed`` is of weights, exploration, choices and, where
+    there are several, layouts and start states. ``ends`` gives other terminations than the ensemble's, ``standard``
+    goes with them; ``layouts`` replace those of ``config``. What does not go together is a ``UserError``.
     """
-    sub_goals, oracle = about["sub_goals"], config.termination == "oracle"
-    columns = columns_of(domain, sub_goals) if oracle else []
-    options = len(sub_goals) * (1 if oracle else about["members"])
-    world = domain.world(played_world(domain, about["domain_config"], config.world))
-    arguments = world | start_arguments(domain, config, options, seed)
+    first = partial(read_ensemble, ensemble, dict(ensemble_config), ensemble_config["sub_goals"][0])
+    learner, chooser = load_learner(config.network), load_chooser(config.chooser)
+    views = views_in(config.policy_view, config.policy_pixels)
+    engine = engine_for(domain, ensemble_config, config, seed, layouts)
+    rules = [] if config.termination == ORACLE else [rule_of(config.termination)[0]]
+    parts: list[type[Part]] = [learner, chooser, *views, *rules]
+    for part in parts:
+        part.refuse(config, engine)
+    if engine.observation_dtype != PICTURE:
+        engine.standard = (standard if ends else first().view.standard) or standard_of(engine.observation_shape)
+    terminations = ends(engine) if ends else terminations_for(domain, engine, ensemble, ensemble_config, config, device)
+    view = Viewed(engine, create_views(views, engine.observation_shape, first)) if views else None
+    options = terminations.options
+    loop = OptionLoop(
+        engine,
+        terminations,
+        learner(engine, terminations, config, seed, device, view),
+        chooser.create(engine, options, config, seed, device),
+        Recorder(options, engine),
+        config,
+        config.gamma if isinstance(config, MetaConfig) else 1.0,
+        initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
+        visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
+    )
+    if near := nearness(domain, engine, ensemble_config, config):
+        near(np.repeat(engine.ids[:1], options), np.arange(options))  # so that a user's labels fail before training
+    return loop
+
+
+def engine_for(
+    domain: Domain, ensemble_config: Mapping[str, Any], config: PlayConfig, seed: int, layouts: Layouts | None = None
+) -> Engine:
+    """The environments in which options of an ensemble are played; arguments as of :func:`assemble`."""
+    if config.termination == ORACLE:
+        columns_of(domain, ensemble_config["sub_goals"])
+    world = domain.world(played_world(domain, ensemble_config["domain_config"], config.world))
+    arguments = world | start_arguments(domain, config, options_of(ensemble_config, config), seed)
     if layouts:
         arguments["layouts"] = layouts
     engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
     cut(engine, config.cap)
-    if engine.observation_dtype != PICTURE:
-        for name in ("network", "meta_network"):
-            if getattr(config, name, "") == "paper":
-                raise UserError("the paper's networks see pictures only", f"{name}=paper", f"Give --set {name}=light.")
-        view = None if ends else read_ensemble(ensemble, dict(about), sub_goals[0]).view
-        engine.standard = view.standard if view else standard_of(engine.observation_shape)
-    if ends:
-        terminations = ends(engine)
-    elif oracle:
-        terminations = oracle_terminations(engine, columns)
-    else:
-        alone = config.experience == "own" and not config.mask_reached
-        terminations = judged(engine, ensemble, about, device, running_only=alone, rule=config.termination)
-    _check_rule(terminations, config)
-    if config.network != "light" and config.embedding != AUTO:
-        given = f"embedding={config.embedding}, network={config.network}"
-        raise UserError("only the light network has an embedding", given, "Give --set network=light.")
-    windows = None
-    if config.policy_view == "agent-crop":
-        if config.network != "light":
-            given = f"policy_view=agent-crop, network={config.network}"
-            raise UserError("only the light network sees windows", given, "Give --set network=light.")
-        windows = AgentWindows(engine, localiser_of(read_ensemble(ensemble, dict(about), sub_goals[0])))
-    seen: AgentWindows | HalfPictures | None = windows
-    if config.policy_pixels == "half":
-        if config.network != "light" or engine.observation_dtype != PICTURE:
-            given = f"policy_pixels=half, network={config.network}"
-            raise UserError(
-                "only the light network can see half the pixels, and only of pictures", given, "Leave it out."
-            )
-        seen = HalfPictures(engine, windows)
-    gamma, rng = 1.0, rng_for(seed, "random-choice")
-    chooser: Chooser = EvenChooser(options, rng) if config.chooser == "even" else RandomChooser(rng)
-    if isinstance(config, TrainMetaConfig):
-        gamma = config.gamma
-        if config.chooser == "ppo":
-            chooser = MetaPolicy(engine, options, config, seed, device)
-        elif config.chooser == "thompson":
-            chooser = ThompsonChooser(options, engine.count, rng)
-    loop = OptionLoop(
-        engine,
-        terminations,
-        LEARNERS[config.network](engine, terminations, config, seed, device, seen),
-        chooser,
-        Recorder(options, engine),
-        config,
-        gamma,
-        initiation=Initiation(engine, options, config, seed, device) if config.initiation == "learned" else None,
-        visited=Visited(engine, config.save_visited, config.layout_seed, seed) if config.save_visited else None,
-    )
-    if near := nearness(domain, engine, about, config):
-        near(np.repeat(engine.ids[:1], options), np.arange(options))  # labels that fail do so before all is learned
-    return loop
+    return engine
 
 
-def judged(engine: Engine, ensemble: Path, about: Mapping[str, Any], device: str, **how: Any) -> Terminations:
-    """An ensemble's ``learned_terminations``; ``about`` is its manifest's configuration."""
-    ensembles = [read_ensemble(ensemble, dict(about), sub_goal).to(device) for sub_goal in about["sub_goals"]]
+def terminations_for(
+    domain: Domain, engine: Engine, ensemble: Path, ensemble_config: Mapping[str, Any], config: PlayConfig, device: str
+) -> Terminations:
+    """Those that the setting ``termination`` names: of an ensemble's members, or of the true sub-goals."""
+    if config.termination == ORACLE:
+        return oracle_terminations(engine, columns_of(domain, ensemble_config["sub_goals"]))
+    running_only = config.experience == "own" and not config.mask_reached
+    return judged(engine, ensemble, ensemble_config, device, running_only=running_only, rule=config.termination)
+
+
+def judged(engine: Engine, ensemble: Path, ensemble_config: Mapping[str, Any], device: str, **how: Any) -> Terminations:
+    """An ensemble's ``learned_terminations``; all states that can be reached are classified at once."""
+    ensembles = [
+        read_ensemble(ensemble, dict(ensemble_config), sub_goal).to(device) for sub_goal in ensemble_config["sub_goals"]
+    ]
     terminations = learned_terminations(engine, ensembles, **how)
     many = engine.layouts is not None and engine.layouts.many
     if not many and (reachable := engine.reachable()) is not None:
-        terminations.of(reachable)  # most of what will be visited, judged at once
+        terminations.of(reachable)
     return terminations
 
 
 def nearness(
-    domain: Domain, engine: Engine, about: Mapping[str, Any], config: PlayConfig
+    domain: Domain, engine: Engine, ensemble_config: Mapping[str, Any], config: PlayConfig
 ) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None:
-    """Spec H5: of states (n,) and options (n,) whether these options' true sub-goals hold there, or nearly.
+    """Spec H5: a function of states (n,) and options (n,): whether these options' true sub-goals hold, or nearly.
 
-    None where the domain has not all of the ensemble's sub-goals, or options end where they are true.
+    None where the domain lacks a sub-goal of the ensemble, or options end at true sub-goals.
     """
-    sub_goals = about["sub_goals"]
-    if config.termination == "oracle" or not set(sub_goals) <= set(domain.sub_goals):
+    sub_goals = ensemble_config["sub_goals"]
+    if config.termination == ORACLE or not set(sub_goals) <= set(domain.sub_goals):
         return None
-    columns = np.repeat(columns_of(domain, sub_goals), about["members"])
+    columns = np.repeat(columns_of(domain, sub_goals), ensemble_config["members"])
 
     def near(ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
         with UsersCode("the engine's labels", engine, "labels"):
-            told = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
+            holds = engine.labels(ids)[np.arange(len(ids)), columns[options]].astype(np.bool_)
         if not (domain.measures and engine.position_names):
-            return told
-        return told | (domain.distance(engine.positions(ids)) <= domain.near)
+            return holds
+        return holds | (domain.distance(engine.positions(ids)) <= domain.near)
 
     return near
 
@@ -165,38 +153,28 @@ def cut(engine: Engine, cap: float) -> None:
 
 
 def played_world(domain: Domain, collected: Mapping[str, Any], changes: Sequence[str]) -> dict[str, Any]:
-    """The domain's settings that states were collected with, but for ``changes``, the setting ``world``."""
+    """The domain's settings with which states were collected, after ``changes``, the setting ``world``."""
     changed = parse_assignments(changes)
     for name in changed:
         if name not in domain.engine_settings:
-            known = ", ".join(domain.engine_settings) or "none"
-            raise UserError(f"the world of {domain.name} has no such setting", f"world={name}", f"It has {known}.")
+            names = ", ".join(domain.engine_settings) or "none"
+            raise UserError(f"the world of {domain.name} has no such setting", f"world={name}", f"It has {names}.")
     return {**collected, **domain.world(changed)}
 
 
-def _check_rule(terminations: Terminations, config: PlayConfig) -> None:
-    """Whether the options can be learned that end so."""
-    given = f"termination={config.termination}"
-    if not terminations.SHARED and config.experience != "own":
-        what = "states that other options visit do not say whether an execution has reached its sub-goal"
-        raise UserError(what, f"{given}, experience={config.experience}", "Give --set experience=own.")
-    if config.network == "planned" and type(terminations) is not Terminations:
-        raise UserError("only options that end at a single verdict can be planned", given, "Give termination=learned.")
-
-
 def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
-    """Where among the domain's own these sub-goals are; a ``UserError`` that says ``do`` where one is not."""
+    """The columns of these sub-goals among the domain's; a ``UserError`` that says ``do`` where it lacks one."""
     for sub_goal in sub_goals:
         if sub_goal not in domain.sub_goals:
-            what, known = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
-            raise UserError(what, sub_goal, f"It knows of {known}. {do}")
+            what, names = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
+            raise UserError(what, sub_goal, f"It knows of {names}. {do}")
     return [domain.sub_goals.index(sub_goal) for sub_goal in sub_goals]
 
 
 def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int) -> dict[str, Any]:
-    """Spec D4, H6: what an engine is told of where episodes begin; nothing where there is one place, one layout only.
+    """Spec D4, H6: an engine's arguments for where episodes begin; none where there is only one place and layout.
 
-    Where the domain has no such start or no layouts, or has several starts and none is given, it is a ``UserError``.
+    An unknown start, no start where the domain has several, or layouts where it has one is a ``UserError``.
     """
     layouts: dict[str, Any] = {}
     if config.layouts.strip():
@@ -206,8 +184,8 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
         layouts["layouts"] = Layouts(seeds, rng_for(seed, "layouts") if len(seeds) > 1 else None)
     if not domain.starts:
         if config.start or config.along:
-            given = f"start={config.start}" if config.start else f"along={config.along}"
-            raise UserError(f"{domain.name} has no named starts", given, "Leave it out.")
+            setting = f"start={config.start}" if config.start else f"along={config.along}"
+            raise UserError(f"{domain.name} has no named starts", setting, "Leave it out.")
         return layouts
     for start in config.start.split(",") if domain.many_starts else [config.start]:
         if start not in domain.starts:
@@ -218,20 +196,20 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:
-    """How many states back an engine must remember: what the replays hold, and the meta-policy's open decisions."""
+    """How many states back an engine must remember: those in replays and in the meta-policy's decisions."""
     decisions = config.decisions if isinstance(config, MetaConfig) else 0
-    asked = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
-    return max(LEARNERS[config.network].reach(config, options), asked)
+    steps = (decisions + config.environments) * config.option_timeout + STACK * config.environments if decisions else 0
+    return max(load_learner(config.network).reach(config, options), steps)
 
 
 def train(
     loop: OptionLoop, steps: int, log: MetricsLog, progress: Progress, checkpoints: Checkpoints, until: float = 0.0
 ) -> bool:
-    """Step ``loop`` until ``steps`` more environment steps were taken, logging every ``LOG_INTERVAL`` steps.
+    """Step ``loop`` for ``steps`` more environment steps, logging every ``LOG_INTERVAL`` steps.
 
-    It ends before where ``until`` of the last episodes have succeeded (0: it does not); returns whether they have.
-    ``loop`` is as it was when ``steps`` began; where there is a checkpoint (spec G1), it goes on from there. Those are
-    of no use where the engine cannot be resumed.
+    It ends earlier once a share ``until`` of the last episodes has succeeded (0: never); returns whether it has.
+    ``loop`` is at the beginning of these ``steps``; from there it goes on to the last checkpoint, if there is one
+    (Spec G1). An engine that cannot be resumed gets none.
     """
     recorder = loop.recorder
     end = recorder.steps + steps
@@ -278,64 +256,77 @@ def train(
 def check_fit(
     trained: Artefact, source: Artefact, config: TrainOptionsConfig | TrainMetaConfig, fixed: Sequence[str]
 ) -> None:
-    """Whether options can be trained further: they are of this ensemble (``source``), and alike in these settings."""
+    """Refuse (``UserError``) to train options further that are of another ensemble or differ in ``fixed`` settings."""
     made_from = [entry["sha256"] for entry in trained.manifest["inputs"] if entry["kind"] == "ensemble"]
     if sha256_of(source.path / "manifest.json") not in made_from:
         what = "these options were trained with another ensemble"
         raise UserError(what, trained.path, f"Train them from {source.path}.")
-    before = as_dict(type(config)()) | trained.config  # of settings from before there were any, the default
+    before = as_dict(type(config)()) | trained.config  # older artefacts lack some settings
     for key in fixed:
-        if key == "layout_seed" and before["layouts"]:  # their layouts were many: they may live anywhere
+        if key == "layout_seed" and before["layouts"]:  # options of many layouts may be played in any
             continue
         if before[key] != getattr(config, key):
             what = f"these options were trained with {key}={before[key]}, not {getattr(config, key)}"
             raise UserError(what, trained.path, f"Give --set {key}={before[key]}.")
 
 
-def description(
-    loop: OptionLoop, domain: Domain, about: Mapping[str, Any], config: PlayConfig, **more: Any
-) -> dict[str, Any]:
-    """An artefact's configuration: the stage's, what it has of its ensemble's (``about``), and ``more``."""
+def options_of(ensemble_config: Mapping[str, Any], config: PlayConfig) -> int:
+    """How many options an ensemble's sub-goals have: one for each member, or for each truth."""
+    return len(ensemble_config["sub_goals"]) * (1 if config.termination == ORACLE else ensemble_config["members"])
+
+
+def continue_with(loop: OptionLoop, trained: Artefact) -> None:
+    """Go on with the options of an artefact; replays start empty."""
+    weights = load_tensors(trained.path / "options.safetensors")
+    loop.learner.load(weights)
+    loop.terminations.load(weights)
+    if loop.initiation and INITIATION in trained.manifest["files"]:
+        loop.initiation.load(load_tensors(trained.path / INITIATION))
+
+
+def description(domain: Domain, ensemble_config: Mapping[str, Any], config: PlayConfig, **more: Any) -> dict[str, Any]:
+    """An artefact's configuration: the stage's, what it takes from its ensemble's, and ``more``."""
     return as_dict(config) | {
-        "sub_goals": about["sub_goals"],
-        "members": loop.terminations.options // len(about["sub_goals"]),
-        "domain": about["domain"],
-        "domain_config": played_world(domain, about["domain_config"], config.world),
+        "sub_goals": ensemble_config["sub_goals"],
+        "members": options_of(ensemble_config, config) // len(ensemble_config["sub_goals"]),
+        "domain": ensemble_config["domain"],
+        "domain_config": played_world(domain, ensemble_config["domain_config"], config.world),
         **more,
         "setting": config.network,
     }
 
 
 def write_trained(
-    folder: Path, loop: OptionLoop, domain: Domain, about: Mapping[str, Any], config: PlayConfig, seed: int
+    folder: Path, loop: OptionLoop, domain: Domain, ensemble_config: Mapping[str, Any], config: PlayConfig, seed: int
 ) -> None:
-    """Into an artefact's folder: what was learned and what happened meanwhile."""
+    """Write what was learned, and what happened meanwhile, into an artefact's folder."""
     loop.recorder.write(folder)
-    if near := nearness(domain, loop.engine, about, config):
+    if near := nearness(domain, loop.engine, ensemble_config, config):
         loop.recorder.write_exploits(folder, near, loop.terminations.log_odds)
     if loop.visited:
-        loop.visited.write(folder, domain, about, seed)
-    save_tensors(folder / "options.safetensors", loop.learner.state() | loop.terminations.state())
+        loop.visited.write(folder, domain, ensemble_config, seed)
+    save_tensors(folder / loop.learner.FILE, loop.learner.state() | loop.terminations.state())
     if loop.initiation:
-        save_tensors(folder / "initiation.safetensors", loop.initiation.state())
-    if chooser := loop.chooser.state():
-        save_tensors(folder / "meta.safetensors", chooser)
-    about = {name: of for name, of in (("start", config.start), ("layouts", config.layouts.strip())) if of}
-    if about.get("layouts", "").isdecimal():
+        save_tensors(folder / INITIATION, loop.initiation.state())
+    if weights := loop.chooser.state():
+        save_tensors(folder / loop.chooser.FILE, weights)
+    places = {"start": config.start, "layouts": config.layouts.strip()}
+    if places["layouts"].isdecimal():
         seeds = layout_seeds(config.layouts, config.layout_seed)
-        about["layouts"] = f"{seeds[0]}-{seeds[-1]}"
-    write_layout(folder, loop.engine, config.layout_seed, config.random_episodes, seed, **about)
+        places["layouts"] = f"{seeds[0]}-{seeds[-1]}"
+    places = {name: place for name, place in places.items() if place}
+    write_layout(folder, loop.engine, config.layout_seed, config.random_episodes, seed, **places)
 
 
-def write_layout(folder: Path, engine: Engine, layout_seed: int, episodes: int, seed: int, **about: str) -> None:
+def write_layout(folder: Path, engine: Engine, layout_seed: int, episodes: int, seed: int, **places: str) -> None:
     """Spec F5: ``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
 
-    Where the engine cannot tell them they are null, and no episode of random play was played. ``about`` stands there
-    too.
+    Both are null where the engine does not know them; then no episode of random play is played. ``places`` are written
+    first.
     """
     success = engine.random_success(episodes, rng_for(seed, "random-play")) if episodes else None
     facts = {
-        **about,
+        **places,
         "layout_seed": layout_seed,
         "shortest_path": engine.shortest_path(),
         "random_success": success,

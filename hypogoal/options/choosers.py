@@ -5,16 +5,26 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.seeding import rng_for
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.parts import Part, load_part
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from hypogoal.domains.base import Engine
+
+CHOOSERS = {
+    "random": f"{__name__}:RandomChooser",
+    "even": f"{__name__}:EvenChooser",
+    "thompson": "hypogoal.options.thompson:ThompsonChooser",
+    "ppo": "hypogoal.meta.ppo:MetaPolicy",
+}
 
 Ids = NDArray[np.int64]  # (n,), of environments, states or options
 Offered = NDArray[np.bool_]  # (n, O), the options that may be chosen
@@ -39,8 +49,19 @@ class Outcome:
     succeeded: NDArray[np.bool_] | None = None  # the episode did, where the domain says what that is, see ``Step``
 
 
-class Chooser(Resumable, ABC):
-    """A policy over options."""
+class Chooser(Part, ABC):
+    """A policy over options.
+
+    Attributes:
+        FILE: what an artefact calls the file of its :meth:`state`, if there is any.
+    """
+
+    FILE: ClassVar[str] = "meta.safetensors"
+
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        """A fresh one that chooses among so many options; ``seed`` is of weights and draws."""
+        return cls()
 
     @abstractmethod
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
@@ -72,6 +93,10 @@ class RandomChooser(Chooser):
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
 
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        return cls(rng_for(seed, "random-choice"))
+
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         return np.where(offered, self.rng.random(offered.shape), -1.0).argmax(1)
 
@@ -89,6 +114,10 @@ class EvenChooser(RandomChooser):
         super().__init__(rng)
         self.steps = np.zeros(options, dtype=np.int64)
 
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        return cls(options, rng_for(seed, "random-choice"))
+
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         """For each environment in turn, int64 (n,); an option that runs counts as one step more."""
         chosen = np.empty(len(environments), dtype=np.int64)
@@ -101,3 +130,8 @@ class EvenChooser(RandomChooser):
     def record(self, outcome: Outcome) -> None:
         """The steps that the options took."""
         np.add.at(self.steps, outcome.options, outcome.durations - 1)
+
+
+def load_chooser(name: str) -> type[Chooser]:
+    """The class that the setting ``chooser`` names; a ``UserError`` where it names none."""
+    return load_part(name, "chooser", Chooser, CHOOSERS)  # type: ignore[type-abstract]

@@ -1,15 +1,30 @@
 """Settings of option learning (Spec D), with the light recipe as defaults and the paper's values in its preset."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from hypogoal.core.config import setting
 
 STACK = 4  # steps that an observation looks back at most: a state is forgotten with its oldest frame
+FULL = "full"  # the policy view that shows the whole observation
 
 
 @dataclass(frozen=True)
 class OptionConfig:
     """How the intra-option policies are executed and learned."""
+
+    IDLE: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "network=planned": (
+            *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
+            *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
+            *("exploration", "persistence", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
+            *("priority_alpha", "priority_beta"),
+        ),
+        "network=paper": ("positives",),
+        "exploration=independent": ("persistence",),
+        "initiation=anywhere": ("initiation_threshold", "initiation_ignored"),
+    }
 
     network: str = setting(
         "light",
@@ -17,6 +32,14 @@ class OptionConfig:
         "knows what each action leads to",
         source="paper, appendix; light, planned: ours",
         choices=("light", "paper", "planned"),
+        own=True,
+    )
+    termination: str = setting(
+        "learned",
+        "where options end: learned, at the first positive prediction; patience:N, with a threshold that falls after "
+        "N steps of an option that hardly ever gets there; dwell:N, at N positive predictions in a row; or oracle, at "
+        "true sub-goals (upper bound)",
+        source="paper: learned; the others ours",
     )
     embedding: str = setting(
         "auto",
@@ -44,7 +67,10 @@ class OptionConfig:
         choices=("anywhere", "learned"),
     )
     initiation_threshold: float = setting(
-        0.05, "an option is held back where its chance of success is below this (initiation=learned)", low=0.0, high=1.0
+        0.05,
+        "options less likely to succeed are held back (initiation=learned)",
+        low=0.0,
+        high=1.0,
     )
     initiation_ignored: float = setting(
         0.1, "share of choices in which no option is held back (initiation=learned)", low=0.0, high=1.0
@@ -74,11 +100,12 @@ class OptionConfig:
         high=1_000,
     )
     policy_view: str = setting(
-        "full",
+        FULL,
         "what the policies see: full, the whole observation; agent-crop, the window around the agent as found by the "
         "ensemble's localiser (light)",
         source="ours",
-        choices=("full", "agent-crop"),
+        choices=(FULL, "agent-crop"),
+        own=True,
     )
     policy_pixels: str = setting(
         "all",

@@ -1,7 +1,7 @@
 """What all learners of intra-option policies do: act, explore, count, and keep it in artefacts (Spec D2, D8)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,21 +10,32 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import linear_epsilon
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import OptionConfig
+from hypogoal.options.config import FULL, OptionConfig
 from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
+from hypogoal.options.parts import Part, load_part
+from hypogoal.options.policy_views import Viewed
 from hypogoal.options.termination import Terminations
-from hypogoal.options.windows import AgentWindows, HalfPictures
 
 COUNTERS = ("option_steps", "steps_since_positive")
+LEARNERS = {
+    "light": "hypogoal.options.light:LightLearner",
+    "paper": "hypogoal.options.recurrent:RecurrentLearner",
+    "planned": "hypogoal.options.planned:PlannedLearner",
+}
+
+# Starts an execution of an option: gives a function from an observation (*obs) to the action.
+Policies = Callable[[int], Callable[[Observations], int]]
 
 
 @dataclass(frozen=True)
@@ -42,10 +53,12 @@ class Transitions:
     ended: NDArray[np.bool_]  # the option stopped here for whatever reason
 
 
-class Learner(Resumable, ABC):
-    """The intra-option policies of all O options; ``windows``: what they see of states, all of it where None.
+class Learner(Part, ABC):
+    """The intra-option policies of all O options; ``view``: what they see of states, all of it where None.
 
     Attributes:
+        FILE: what an artefact calls the file of its :meth:`state`.
+        TAKES_VIEWS: whether it heeds the settings ``embedding``, ``policy_view`` and ``policy_pixels``.
         actions: the engine's actions that the policies choose among, int64 (A,).
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
@@ -55,7 +68,9 @@ class Learner(Resumable, ABC):
         UserError: settings that do not go together, or a replay longer than the engine's memory of states.
     """
 
-    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "windows", *COUNTERS)
+    FILE: ClassVar[str] = "options.safetensors"
+    TAKES_VIEWS: ClassVar[bool] = False
+    CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "view", *COUNTERS)
 
     def __init__(
         self,
@@ -64,10 +79,11 @@ class Learner(Resumable, ABC):
         config: OptionConfig,
         seed: int,
         device: torch.device | str = "cpu",
-        windows: AgentWindows | HalfPictures | None = None,
+        view: Viewed | None = None,
     ):
-        self.engine, self.terminations, self.config, self.windows = engine, terminations, config, windows
-        self.pictures: Pictures = windows or engine
+        self.refuse(config, engine)
+        self.engine, self.terminations, self.config, self.view = engine, terminations, config, view
+        self.pictures: Pictures = view or engine
         self.options, self.device = terminations.options, torch.device(device)
         self.actions = action_set(engine, config.actions)
         self._index = np.zeros(engine.n_actions, dtype=np.int64)
@@ -83,6 +99,34 @@ class Learner(Resumable, ABC):
                 f"replay={config.replay}",
                 f"Give --set replay={max(100, config.replay - (reach - engine.memory))} or less.",
             )
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Raise a ``UserError`` where it cannot learn with these settings in this engine."""
+        if cls.TAKES_VIEWS:
+            return
+        for name, default, what in (
+            ("embedding", AUTO, "only the light network has an embedding"),
+            ("policy_view", FULL, "only the light network sees windows"),
+            ("policy_pixels", "all", "only the light network can see half the pixels"),
+        ):
+            if (value := getattr(config, name)) != default:
+                raise UserError(what, f"{name}={value}, network={config.network}", "Give --set network=light.")
+
+    @classmethod
+    def policies(
+        cls,
+        config: Mapping[str, Any],
+        weights: Mapping[str, Tensor],
+        shape: tuple[int, ...],
+        ensemble: Callable[[], Ensemble],
+    ) -> Policies:
+        """Greedy policies from an artefact's configuration and weights, for observations of this shape.
+
+        ``ensemble`` reads the first of the options' ensembles. Where policies need an engine it is a ``UserError``.
+        """
+        what = "these options need their domain's engine, which is not in the artefact"
+        raise UserError(what, f"network={config['network']}", "Load options of the light or the paper's network.")
 
     @abstractmethod
     def build(self, config: OptionConfig, seed: int) -> None:
@@ -155,3 +199,8 @@ class Learner(Resumable, ABC):
             if saved is None or saved.shape != (self.options,) or saved.dtype != torch.int64 or (saved < 0).any():
                 raise UserError(f"the weights do not fit the manifest (at {name})", f"{self.options} options", AGAIN)
             setattr(self, name, saved.numpy().copy())
+
+
+def load_learner(name: str) -> type[Learner]:
+    """The class that the setting ``network`` names; a ``UserError`` where it names none."""
+    return load_part(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]

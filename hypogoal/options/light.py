@@ -7,7 +7,8 @@ only its verdicts are asked for; then a transition may reach several steps ahead
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,21 +20,31 @@ from torch import Tensor
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
+from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import Ensemble
+from hypogoal.hypotheses.networks import AUTO
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tensors
 from hypogoal.learners.flat import FlatParameters
-from hypogoal.learners.replay import PrioritisedReplay, StepsAhead
+from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options.choosers import Ids
-from hypogoal.options.config import STACK, OptionConfig
-from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.config import FULL, STACK, OptionConfig
+from hypogoal.options.learner import Learner, Policies, Transitions
 from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
+from hypogoal.options.policies import LightPolicies, saved_actions
+from hypogoal.options.policy_views import create_views, views_in
 
 POSITIVES_KEPT = 512  # per member
 GRADIENT_NORM = 10.0
-FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
-    "steps": np.int16,  # from s to next
-    "option": np.int16,
-}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Lessons(Steps):
+    """Transitions to learn from, arrays (n,)."""
+
+    option: NDArray[np.int16]  # that was running
+    terminated: NDArray[np.bool_]  # the task is over
+    timed_out: NDArray[np.bool_]  # the option's time was up
+    reached: NDArray[np.bool_]  # the option reached its sub-goal
 
 
 class LightLearner(Learner):
@@ -44,29 +55,48 @@ class LightLearner(Learner):
         *("online", "target", "optimiser", "replay", "ahead", "positive", "steps", "updates", "_due"),
     )
 
-    def build(self, config: OptionConfig, seed: int) -> None:
-        self.running_only = config.experience == "own"
-        if config.n_step > 1 and not self.running_only:
+    TAKES_VIEWS = True
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Other members' sub-goals may lie between the first and the last of several steps."""
+        super().refuse(config, engine)
+        if config.n_step > 1 and config.experience != "own":
             raise UserError(
                 "several steps at once are for an option's own member: others' sub-goals may lie among them",
                 f"n_step={config.n_step}, experience={config.experience}",
                 "Give --set experience=own or --set n_step=1.",
             )
+
+    @classmethod
+    def policies(
+        cls,
+        config: Mapping[str, Any],
+        weights: Mapping[str, Tensor],
+        shape: tuple[int, ...],
+        ensemble: Callable[[], Ensemble],
+    ) -> Policies:
+        options = len(config["sub_goals"]) * config["members"]
+        actions = saved_actions(weights, "online.heads.weight", options, options)
+        kinds = views_in(config.get("policy_view", FULL), config.get("policy_pixels", "all"))
+        views = create_views(kinds, shape, ensemble)
+        return LightPolicies(weights, shape, options, actions, views, config.get("embedding", AUTO))
+
+    def build(self, config: OptionConfig, seed: int) -> None:
+        self.running_only = config.experience == "own"
         self.ahead = StepsAhead(self.engine.count, config.n_step)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "option-weights"))
             shape, standard = self.pictures.observation_shape, self.engine.standard
-            made = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
-            self.online = made.to(self.device)
+            network = LightQNetwork(shape, self.options, len(self.actions), standard, config.embedding)
+            self.online = network.to(self.device)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         pictures = isinstance(self.online.cells, PictureEmbedding)
         self.pixels = Pixels(self.pictures, 2 * config.option_batch, self.device) if pictures else None
         self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
         self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
-        self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
-        self.positive: dict[str, NDArray[Any]] = {
-            name: np.zeros((self.options, POSITIVES_KEPT), kind) for name, kind in FIELDS.items()
-        }
+        self.replay = PrioritisedReplay(config.replay, Lessons, alpha=config.priority_alpha, beta=config.priority_beta)
+        self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
         self.steps = self.updates = self._due = 0
 
     @staticmethod
@@ -80,31 +110,38 @@ class LightLearner(Learner):
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        last = {"option": moved.options, "end": moved.terminated, "timeout": moved.timed_out, "reached": moved.reached}
-        rows = self.ahead.add(moved.ids, self._index[moved.actions], moved.next_ids, moved.ended, **last)
-        self.replay.add(**rows)
-        here, reached = self._judged(rows)
-        for place, option in zip(*np.nonzero(reached & ~here), strict=True):
-            slot = self.positives[option] % POSITIVES_KEPT
-            for name, values in rows.items():
-                self.positive[name][option, slot] = values[place]
+        steps = Lessons.cast(
+            moved.ids,
+            self._index[moved.actions],
+            moved.next_ids,
+            np.ones(len(moved.ids), np.int64),
+            moved.options,
+            moved.terminated,
+            moved.timed_out,
+            moved.reached,
+        )
+        rows = self.ahead.add(steps, moved.ended)
+        self.replay.add(rows)
+        inside, reached = self._judged(rows)
+        for row, option in zip(*np.nonzero(reached & ~inside), strict=True):
+            self.positive.put((option, self.positives[option] % POSITIVES_KEPT), rows.at(row))
             self.positives[option] += 1
         self.count(moved.options)
         self.steps += len(moved.ids)
         self._due += len(moved.ids)
 
-    def _judged(self, rows: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which options' sub-goals hold in ``s`` and in ``next`` of transitions, bool (m, O) each.
+    def _judged(self, rows: Lessons) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which options' sub-goals hold in ``state`` and in ``next_state`` of transitions, bool (m, O) each.
 
-        With own experience those of other members than the one that was running are not looked at: False.
+        With own experience, False for all options but the one that was running.
         """
-        s, following = rows["s"].astype(np.int64), rows["next"].astype(np.int64)
+        states, next_states = rows.state.astype(np.int64), rows.next_state.astype(np.int64)
         if not self.running_only:
-            return self.terminations.of(s), self.terminations.of(following)
-        option = rows["option"].astype(np.int64)
+            return self.terminations.of(states), self.terminations.of(next_states)
+        option = rows.option.astype(np.int64)
         owner = option[:, None] == np.arange(self.options)
-        here, reached = self.terminations.judged(option, s, following, rows["reached"])
-        return owner & here[:, None], owner & reached[:, None]
+        inside, reached = self.terminations.judged(option, states, next_states, rows.reached)
+        return owner & inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
@@ -116,39 +153,39 @@ class LightLearner(Learner):
             numbers = self._update()
         return numbers
 
-    def _batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64], NDArray[np.float32]]:
+    def _batch(self) -> tuple[Lessons, NDArray[np.int64], NDArray[np.float32]]:
         counts = np.minimum(self.positives, POSITIVES_KEPT)
         kept: NDArray[np.bool_] | None = None  # where the engine forgets: the slots of states that it remembers
         if self.engine.memory is not None:
             kept = np.arange(POSITIVES_KEPT) < counts[:, None]
-            kept &= self.engine.remembers(self.positive["s"]) & self.engine.remembers(self.positive["next"])
+            kept &= self.engine.remembers(self.positive.state) & self.engine.remembers(self.positive.next_state)
             counts = kept.sum(1)
         have = np.flatnonzero(counts)
         extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
         extra = min(extra, self.config.option_batch - 1)  # priorities need one drawn by them
         indices, weights = self.replay.sample(self.config.option_batch - extra, self.rng)
-        batch = {name: values[indices] for name, values in self.replay.data.items()}
+        batch = self.replay.data.at(indices)
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
             slots = (self.rng.random(extra) * counts[options]).astype(np.int64)
             if kept is not None:
                 slots = (np.cumsum(kept, axis=1)[options] <= slots[:, None]).sum(1)
-            batch = {name: np.concatenate([batch[name], self.positive[name][options, slots]]) for name in batch}
+            batch = Lessons.joined([batch, self.positive.at((options, slots))])
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
         return batch, indices, weights
 
     def _update(self) -> dict[str, float]:
         batch, indices, weights = self._batch()
-        s, following = batch["s"].astype(np.int64), batch["next"].astype(np.int64)
-        here, reached = self._judged(batch)
-        owner = batch["option"][:, None] == np.arange(self.options)
-        terminal = reached | batch["end"][:, None]
+        inside, reached = self._judged(batch)
+        owner = batch.option[:, None] == np.arange(self.options)
+        terminal = reached | batch.terminated[:, None]
         if not self.config.bootstrap_timeout:
-            terminal = terminal | (owner & batch["timeout"][:, None])
-        learns = ~here & owner if self.running_only else ~here
-        ahead = self.tensor(batch["steps"]).float()[:, None]
+            terminal = terminal | (owner & batch.timed_out[:, None])
+        learns = ~inside & owner if self.running_only else ~inside
+        ahead = self.tensor(batch.steps).float()[:, None]
 
-        values, next_online, next_target = self._values(s, following)
+        states, next_states = batch.state.astype(np.int64), batch.next_state.astype(np.int64)
+        values, next_online, next_target = self._values(states, next_states)
         with torch.no_grad():
             goal = double_q_targets(
                 self.tensor(reached) * self.config.option_gamma ** (ahead - 1),
@@ -158,7 +195,7 @@ class LightLearner(Learner):
                 self.config.option_gamma**ahead,
                 bounded=self.config.bounded_values,
             )
-        actions = self.tensor(batch["a"].astype(np.int64))[:, None, None].expand(-1, self.options, 1)
+        actions = self.tensor(batch.action.astype(np.int64))[:, None, None].expand(-1, self.options, 1)
         error = values.gather(2, actions).squeeze(2) - goal
         error = error * self.tensor(learns)
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
@@ -168,28 +205,27 @@ class LightLearner(Learner):
         self.replay.set_priorities(indices, largest[: len(indices)])
         return {"option_loss": float(loss.detach())}
 
-    def _values(self, s: NDArray[np.int64], following: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
-        """The online network in ``s`` (with gradients) and in ``following``, the target there; (n, O, A) each."""
+    def _values(self, states: NDArray[np.int64], next_states: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+        """The online network in states (with gradients) and in next states, the target in these; (n, O, A) each."""
         if self.pixels:
-            both = self.pixels.of(np.concatenate([s, following]))
-            here, there = both[: len(s)], both[len(s) :]
+            now, later = self.pixels.of(np.concatenate([states, next_states])).split(len(states))
             with torch.no_grad():
-                ahead = self.online(there), self.target(there)
-            return self.online(here), *ahead
-        # A batch holds few distinct states, late in training 40 among 256: each is looked at once.
-        distinct, places = np.unique(np.concatenate([s, following]), return_inverse=True)
-        here, there = self.tensor(places).split(len(s))
+                next_values = self.online(later), self.target(later)
+            return self.online(now), *next_values
+        # A batch has few distinct states, late in training 40 of 256: the networks see each once.
+        distinct, places = np.unique(np.concatenate([states, next_states]), return_inverse=True)
+        now, later = self.tensor(places).split(len(states))
         values, target = apply_all_to_states((self.online, self.target), self.pictures, distinct)
         # index_select, not indexing, whose gradient takes several times as long.
-        next_online, next_target = (of.detach().index_select(0, there) for of in (values, target))
-        return values.index_select(0, here), next_online, next_target
+        next_online, next_target = (outputs.detach().index_select(0, later) for outputs in (values, target))
+        return values.index_select(0, now), next_online, next_target
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
-        """Follow the loss's gradient; ``errors`` (n, O) say whose it is when it is no number."""
+        """Follow the loss's gradient; ``errors`` (n, O) name the options where it is NaN or Inf."""
         finite = bool(torch.isfinite(loss))
-        whose = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
+        owner = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
         where = f"in the batch of update {self.updates}, step {self.steps}"
-        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, whose, where)
+        descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, owner, where)
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
             follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)

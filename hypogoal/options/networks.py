@@ -14,7 +14,7 @@ from hypogoal.dataset import PICTURE, Standard, standard_of, standardised
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.hypotheses.views import FullView
-from hypogoal.options.windows import AgentWindows, HalfPictures
+from hypogoal.options.policy_views import Viewed
 
 CELL = 8  # pixels
 GRID = "grid"  # the embedding of this name
@@ -268,13 +268,13 @@ class PaperQNetwork(nn.Module):
             states.append(state)
         return self.values(torch.stack(states, dim=1)), state[None]
 
-    def _gates(self, inputs: Tensor, of: str) -> Tensor:
+    def _gates(self, inputs: Tensor, source: str) -> Tensor:
         """float32 (N, 3 * 512): what the gates get from images (``ih``) or from the state before (``hh``)."""
-        weight, bias = (self.gru.get_parameter(f"{kind}_{of}_l0") for kind in ("weight", "bias"))
+        weight, bias = (self.gru.get_parameter(f"{kind}_{source}_l0") for kind in ("weight", "bias"))
         return nn.functional.linear(inputs, weight, bias)
 
 
-Pictures = Engine | AgentWindows | HalfPictures
+Pictures = Engine | Viewed
 
 
 def apply_to_states(network: nn.Module, engine: Pictures, ids: NDArray[np.int64]) -> Tensor:

@@ -15,6 +15,7 @@ from hypogoal.domains.base import Engine, Plan
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.termination import Terminations
 
 FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
 
@@ -32,6 +33,9 @@ class PlannedLearner(Learner):
     """
 
     def build(self, config: OptionConfig, seed: int) -> None:
+        if type(self.terminations) is not Terminations:
+            what = "only options that end at a single positive prediction can be planned"
+            raise UserError(what, f"termination={config.termination}", "Give termination=learned.")
         plan = self.engine.plan()
         if plan is None:
             what = "this domain does not know what each action leads to"

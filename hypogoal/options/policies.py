@@ -1,6 +1,6 @@
 """What options do, out of an artefact's weights: greedy policies that start anew with each execution."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,43 +13,49 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.dataset import Observations
 from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.localisers import Localiser
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.options.exploration import actions_of
+from hypogoal.options.learner import Policies, load_learner
 from hypogoal.options.networks import GRID, LightQNetwork, PaperQNetwork, standard_in
-from hypogoal.options.windows import SIDE, around_agent, halved, localiser_of
-
-# A policy starts an execution: (option) -> a function from an observation (*obs) to the action.
-Policies = Callable[[int], Callable[[Observations], int]]
+from hypogoal.options.policy_views import PolicyView
+from hypogoal.options.termination import ORACLE
 
 
 def make_policies(
-    config: Mapping[str, Any], weights: dict[str, Tensor], about: Mapping[str, Any], ensemble: Ensemble | None = None
+    config: Mapping[str, Any],
+    weights: Mapping[str, Tensor],
+    ensemble_config: Mapping[str, Any],
+    ensemble: Ensemble | None = None,
 ) -> Policies:
-    """Greedy policies from an options artefact's weights and configuration, that of its ensembles (``about``), and the
-    first of these, which policies need that look at the window around the agent.
+    """Greedy policies from an options artefact's weights and configuration and its ensembles' configuration.
+
+    Policies that see the window around the agent also need the first ensemble.
     """
-    if config["termination"] == "oracle":
+    if config["termination"] == ORACLE:
         raise UserError(
             "these options end at the true sub-goals, which only the domain's engine can see",
             "termination=oracle",
             "Load options that were trained with learned members.",
         )
-    if config["network"] == "planned":
-        what = "planned options need their domain's engine, which is not in the artefact"
-        raise UserError(what, "network=planned", "Load options that were learned.")
-    shape = tuple(about["observation_shape"])
-    options = len(config["sub_goals"]) * config["members"]
-    last = "online.heads.weight" if config["network"] == "light" else "0.values.2.bias"
-    outputs = len(weights[last]) // (options if config["network"] == "light" else 1) if last in weights else 0
+
+    def first_ensemble() -> Ensemble:
+        assert ensemble is not None
+        return ensemble
+
+    learner = load_learner(config["network"])
+    return learner.policies(config, weights, tuple(ensemble_config.get("observation_shape", ())), first_ensemble)
+
+
+def saved_actions(weights: Mapping[str, Tensor], layer: str, heads: int, options: int) -> NDArray[np.int64]:
+    """The actions, int64 (A,), that saved policies choose among, whose last ``layer`` has so many heads of A outputs.
+
+    A ``UserError`` where the weights are not those of so many options.
+    """
+    outputs = len(weights[layer]) // heads if layer in weights else 0
     actions = actions_of(weights, outputs)
     if not outputs or actions.shape != (outputs,):
         raise UserError("the weights do not fit the manifest", f"{options} options", "Make the artefact again.")
-    if config["network"] != "light":
-        return PaperPolicies(weights, shape, options, actions)
-    around = localiser_of(ensemble) if ensemble and config.get("policy_view", "full") == "agent-crop" else None
-    half = config.get("policy_pixels", "all") == "half"
-    return LightPolicies(weights, shape, options, actions, around, config.get("embedding", AUTO), half=half)
+    return actions
 
 
 class LightPolicies:
@@ -61,14 +67,11 @@ class LightPolicies:
         shape: tuple[int, ...],
         options: int,
         actions: NDArray[np.int64],
-        localiser: Localiser | None = None,
+        views: Sequence[PolicyView] = (),
         embedding: str = AUTO,
-        *,
-        half: bool = False,
     ):
-        self.localiser, self.half = localiser, half
-        shape = (SIDE, SIDE, *shape[2:]) if localiser else shape
-        shape = (shape[0] // 2, shape[1] // 2, *shape[2:]) if half else shape
+        self.views = views
+        shape = views[-1].shape if views else shape
         weights = below("online.", weights)
         make = partial(LightQNetwork, shape, options, len(actions), standard_in(weights, shape), embedding)
         custom = embedding not in (AUTO, GRID, *NETWORKS)
@@ -81,10 +84,8 @@ class LightPolicies:
 
     @torch.no_grad()
     def _act(self, option: int, observation: Any) -> int:
-        if self.localiser:
-            observation = around_agent(self.localiser, observation[None])[0]
-        if self.half:
-            observation = halved(observation[None])[0]
+        for view in self.views:
+            observation = view.see(observation[None])[0]
         values = self.network(_as_batch(observation))[0, option]
         return int(self.actions[int(values.argmax())])
 

@@ -1,5 +1,6 @@
 """What happened while options were played: episodes, choices, where options stopped (Spec E5, F3, F4, F5, F6)."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,16 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import Resumable, growing
-from hypogoal.core.files import write_table
 from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine, Step
-from hypogoal.learners.episodes import Episodes
+from hypogoal.learners.episodes import LAST, EpisodeRecorder
 from hypogoal.options.choosers import Outcome
+from hypogoal.options.tables import Choices, Episodes, Executions, Exploits
 
 STOPS_KEPT = 128  # per option
-EXECUTIONS_KEPT = 100  # per option: Spec F3
-CHOICE_COLUMNS = ("step", "option", "offered", "chosen", "expected", "reached", "duration")
 
 
 class Execution(NamedTuple):
@@ -34,10 +33,6 @@ class Execution(NamedTuple):
     began: int = -1  # the id of the one before them
 
 
-EXECUTION_COLUMNS = (*Execution._fields[:-2], "room", "x", "y", "distance")
-EXPLOIT_COLUMNS = ("step", "option", "reached", "near", "best_near", "best_far")
-
-
 class Recorder(Resumable):
     """Counts choices per ``window`` of steps, lists episodes, keeps the last executions and stops of each of O options.
 
@@ -48,14 +43,14 @@ class Recorder(Resumable):
 
     def __init__(self, options: int, engine: Engine, window: int = 5_000):
         self.options, self.engine, self.window = options, engine, window
-        self.episodes = Episodes(engine.count)
+        self.episodes = EpisodeRecorder(engine.count)
         self.choices: list[tuple[int, int, int, int, float, int, int]] = []
         self.stops: list[deque[int]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
-        self.executions: list[deque[Execution]] = [deque(maxlen=EXECUTIONS_KEPT) for _ in range(options)]
+        self.executions: list[deque[Execution]] = [deque(maxlen=LAST) for _ in range(options)]
         self._pictures: list[deque[Observations]] = [deque(maxlen=STOPS_KEPT) for _ in range(options)]
         self._states: list[list[int]] = [[] for _ in range(engine.count)]  # that running executions came to
         self._window_start = 0
-        self._window = np.zeros((options, len(CHOICE_COLUMNS) - 2))  # but for step and option
+        self._window = np.zeros((options, 5))  # offered, chosen, expected, reached, duration
 
     def items(self) -> dict[str, Any]:
         execution = Execution(0, 0, 0, False, False, False, growing([], 0), 0)
@@ -128,13 +123,13 @@ class Recorder(Resumable):
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         super().restore(snapshot)
-        self.executions = [deque((Execution(*row) for row in rows), EXECUTIONS_KEPT) for rows in self.executions]
+        self.executions = [deque((Execution(*row) for row in rows), LAST) for rows in self.executions]
 
     def write(self, folder: Path) -> None:
         """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
         self.flush()
-        self.episodes.write(folder)
-        write_table(folder / "choices.csv", CHOICE_COLUMNS, self.choices)
+        Episodes.of_rows(self.episodes).write(folder)
+        Choices.of_rows(self.choices).write(folder)
         with create_hdf5(folder / "terminations.h5") as file:
             for option, stops in enumerate(self.stops):
                 if stops:
@@ -147,14 +142,13 @@ class Recorder(Resumable):
 
         ``distance`` is of positions (n, 3) from where the sub-goal truly holds, int (n,).
         """
-        rows = [row for option in self.executions for row in option]
-        at = self.engine.positions(np.array([row.states[-1] for row in rows], dtype=np.int64).reshape(-1))
-        away = distance(at)
-        write_table(
-            folder / "executions.csv",
-            EXECUTION_COLUMNS,
-            [(*map(int, row[:-2]), *map(int, at[n]), int(away[n])) for n, row in enumerate(rows)],
-        )
+        executions = [execution for option in self.executions for execution in option]
+        stops = np.array([execution.states[-1] for execution in executions], dtype=np.int64)
+        places = self.engine.positions(stops)
+        Executions.of_rows(
+            (run.step, run.option, run.duration, run.reached, run.inside_at_start, run.terminated, *place, away)
+            for run, place, away in zip(executions, places.tolist(), distance(places).tolist(), strict=True)
+        ).write(folder)
 
     def write_exploits(
         self,
@@ -168,10 +162,10 @@ class Recorder(Resumable):
         there, or nearly, ``log_odds`` how sure their classifiers are. A cell is empty where there was no such state.
         """
         rows = []
-        for row in (row for option in self.executions for row in option):
-            states = np.array(row.states, dtype=np.int64)
-            options = np.full_like(states, row.option)
-            there, sure = near(states, options), log_odds(states, options)
-            best = [sure[part].max().item() if part.any() else "" for part in (there, ~there)]
-            rows.append((row.step, row.option, int(row.reached), int(there[-1]), *best))
-        write_table(folder / "exploits.csv", EXPLOIT_COLUMNS, rows)
+        for run in (run for option in self.executions for run in option):
+            states = np.array(run.states, dtype=np.int64)
+            options = np.full_like(states, run.option)
+            is_near, sure = near(states, options), log_odds(states, options)
+            best_near, best_far = (sure[part].max().item() if part.any() else math.nan for part in (is_near, ~is_near))
+            rows.append((run.step, run.option, run.reached, is_near[-1], best_near, best_far))
+        Exploits.of_rows(rows).write(folder)

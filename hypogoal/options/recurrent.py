@@ -6,30 +6,44 @@ BatchNorm sees a batch's distinct images, see DEV-51.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.columns import Columns
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.tensors import AGAIN, below, check_fit
+from hypogoal.dataset import PICTURE
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.learners.double_dqn import backward_of, descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
-from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.learner import Learner, Policies, Transitions
 from hypogoal.options.networks import PaperQNetwork
+from hypogoal.options.policies import PaperPolicies, saved_actions
 
-FIELDS = {
-    "s": np.int32, "a": np.int16, "next": np.int32, "end": np.bool_, "timeout": np.bool_, "reached": np.bool_,
-    "place": np.int16,  # steps since the option began
-    "execution": np.int32,
-}  # fmt: skip
+
+@dataclass(frozen=True)
+class Rows(Columns):
+    """Steps of executions, arrays (n,)."""
+
+    state: NDArray[np.int32]  # ids
+    action: NDArray[np.int16]
+    next_state: NDArray[np.int32]  # ids
+    terminated: NDArray[np.bool_]  # the task is over
+    timed_out: NDArray[np.bool_]  # the option's time was up
+    reached: NDArray[np.bool_]  # the option reached its sub-goal
+    place: NDArray[np.int16]  # steps since the option began
+    execution: NDArray[np.int32]
 
 
 class Member(Resumable):
@@ -45,7 +59,7 @@ class Member(Resumable):
             self.online = PaperQNetwork(engine.observation_shape, actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
-        self.replay = PrioritisedReplay(config.replay, FIELDS, alpha=config.priority_alpha, beta=config.priority_beta)
+        self.replay = PrioritisedReplay(config.replay, Rows, alpha=config.priority_alpha, beta=config.priority_beta)
         self.updates = self.due = self.executions = 0
 
 
@@ -54,7 +68,12 @@ class RecurrentLearner(Learner):
 
     CHANGING = (*Learner.CHANGING, "members", "hidden", "running")
 
-    def build(self, config: OptionConfig, seed: int) -> None:
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """It sees pictures only, and learns single steps of its members' own executions."""
+        super().refuse(config, engine)
+        if engine.observation_dtype != PICTURE:
+            raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
         if config.experience != "own":
             raise UserError(
                 "the paper's network learns from its member's own executions only",
@@ -65,6 +84,19 @@ class RecurrentLearner(Learner):
             raise UserError(
                 "the paper's network learns one step ahead only", f"n_step={config.n_step}", "Give --set n_step=1."
             )
+
+    @classmethod
+    def policies(
+        cls,
+        config: Mapping[str, Any],
+        weights: Mapping[str, Tensor],
+        shape: tuple[int, ...],
+        ensemble: Callable[[], Ensemble],
+    ) -> Policies:
+        options = len(config["sub_goals"]) * config["members"]
+        return PaperPolicies(weights, shape, options, saved_actions(weights, "0.values.2.bias", 1, options))
+
+    def build(self, config: OptionConfig, seed: int) -> None:
         count = len(self.actions)
         self.members = [Member(self.engine, config, seed, option, count, self.device) for option in range(self.options)]
         self.hidden = torch.zeros(self.engine.count, PaperQNetwork.HIDDEN, device=self.device)
@@ -109,15 +141,13 @@ class RecurrentLearner(Learner):
 
     def _store(self, option: int, steps: list[tuple[int, int, int, bool, bool, bool]]) -> None:
         member = self.members[option]
-        s, a, following, end, timeout, reached = (np.array(column) for column in zip(*steps, strict=True))
-        member.replay.add(
-            s=s, a=a, next=following, end=end, timeout=timeout, reached=reached,
-            place=np.arange(len(s)), execution=np.full(len(s), member.executions),
-        )  # fmt: skip
+        columns = [np.array(column) for column in zip(*steps, strict=True)]
+        rows = Rows.cast(*columns, np.arange(len(steps)), np.full(len(steps), member.executions))
+        member.replay.add(rows)
         member.executions += 1
-        member.due += len(s)
-        self.positives[option] += reached.sum()
-        self.count(np.full(len(s), option))
+        member.due += len(rows)
+        self.positives[option] += rows.reached.sum()
+        self.count(np.full(len(rows), option))
 
     def learn(self) -> dict[str, float]:
         """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
@@ -133,22 +163,22 @@ class RecurrentLearner(Learner):
     def _update(self, option: int, member: Member) -> float:
         config, data = self.config, member.replay.data
         indices, weights = member.replay.sample(config.option_batch, self.rng)
-        place = data["place"][indices].astype(np.int64)
+        place = data.place[indices].astype(np.int64)
         # Steps of an execution lie side by side in the ring; the oldest may have been overwritten at the seam.
         kept = np.arange(int(place.max()) + 1)
         prefix = (indices[:, None] - place[:, None] + kept) % config.replay
-        whole = data["execution"][prefix[:, 0]] == data["execution"][indices]
-        whole &= (self.engine.remembers(data["s"][prefix]) | (kept > place[:, None])).all(1)
-        whole &= self.engine.remembers(data["next"][indices])
+        whole = data.execution[prefix[:, 0]] == data.execution[indices]
+        whole &= (self.engine.remembers(data.state[prefix]) | (kept > place[:, None])).all(1)
+        whole &= self.engine.remembers(data.next_state[indices])
         if not whole.any():
             return 0.0
         indices, weights, place, prefix = indices[whole], weights[whole], place[whole], prefix[whole]
         length = int(place.max()) + 1
         rows = np.arange(len(indices))
-        states = data["s"][prefix[:, :length]].astype(np.int64)
+        states = data.state[prefix[:, :length]].astype(np.int64)
         states[kept[:length] > place[:, None]] = states[0, 0]
         states = np.concatenate([states, states[:, :1]], axis=1)
-        states[rows, place + 1] = data["next"][indices]
+        states[rows, place + 1] = data.next_state[indices]
 
         unique, inverse = np.unique(states, return_inverse=True)
         images = self.tensor(self.engine.images(unique))
@@ -157,23 +187,22 @@ class RecurrentLearner(Learner):
         values = member.online(member.online.embed(images)[places])[0]
         with torch.no_grad():
             next_target = member.target(member.target.embed(images)[places])[0]
-        here, after = self.tensor(place), self.tensor(place + 1)
+        now, later = self.tensor(place), self.tensor(place + 1)
         pick = torch.arange(len(indices), device=self.device)
-        of = np.full(len(indices), option)
-        following = data["next"][indices].astype(np.int64)
-        reached = self.terminations.judged(of, states[rows, place], following, data["reached"][indices])[1]
-        terminal = reached | data["end"][indices]
+        options, next_states = np.full(len(indices), option), data.next_state[indices].astype(np.int64)
+        reached = self.terminations.judged(options, states[rows, place], next_states, data.reached[indices])[1]
+        terminal = reached | data.terminated[indices]
         if not config.bootstrap_timeout:
-            terminal = terminal | data["timeout"][indices]
+            terminal = terminal | data.timed_out[indices]
         goal = double_q_targets(
             self.tensor(reached).float(),
             self.tensor(terminal),
-            values[pick, after].detach(),
-            next_target[pick, after],
+            values[pick, later].detach(),
+            next_target[pick, later],
             config.option_gamma,
             bounded=config.bounded_values,
         )
-        taken = values[pick, here, self.tensor(data["a"][indices].astype(np.int64))]
+        taken = values[pick, now, self.tensor(data.action[indices].astype(np.int64))]
         error = taken - goal
         huber = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
         loss = (huber * self.tensor(weights)).mean()

@@ -1,8 +1,8 @@
 """When options end: whether their sub-goals hold in states, each of which is judged once (Spec D1, D2).
 
-A member that is as sure as its threshold, to the last bits of a float32, may say yes to a state among some and no to it
-among others: libraries round otherwise in batches of another size. So the first verdict stands, for a run and for what
-resumes it.
+Libraries round differently in batches of another size. So a member whose probability is at its threshold, to the last
+bits of a float32, may give a state another prediction in another batch. The first prediction stands, for a run and for
+what resumes it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,51 +12,78 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.compute import tensor
 from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import allowed, vouched
 from hypogoal.core.tensors import AGAIN
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import as_input, folded
 from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.parts import Part, load_part
 
 THRESHOLDS = "thresholds"  # in an artefact: log-odds
+ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
 MANY = 256  # states from which each ensemble's own prediction, which computes distinct patches once, is faster
 
 
-class Terminations(Resumable):
-    """Which options' sub-goals hold in states; of each state and option a classifier is asked once.
+class Terminations(Part):
+    """Which options' sub-goals hold in states; each state is classified once for each option.
 
-    An execution ends at the first state in which its own sub-goal holds (the paper). Other rules are subclasses, which
-    are told how many ``environments`` there are, and their ``length``.
+    An execution ends at the first state in which its own sub-goal holds (the paper). Other rules are subclasses, by
+    which an execution ends otherwise.
 
     Args:
-        classify: state ids (n,) -> log-odds float32 (n, O), or verdicts, bool (n, O).
-        classify_one: state ids (n,) and an option -> (n, ``together``), where that costs less; None, where it does not.
-        together: how many options on end it judges at once, of which the option given is the first.
-        thresholds: float32 (O,), the log-odds above which it is a yes; 0 where None, which fits verdicts, too.
+        classify: state ids (n,) -> log-odds float32 (n, O), or predictions, bool (n, O).
+        classify_group: state ids (n,) and the first option of a group -> log-odds (n, ``group``); None where to
+            classify for some options costs as much as for all.
+        group: how many consecutive options it classifies for.
+        thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
+        environments: E.
+        length: the number in the rule's name (``dwell:3``).
+
+    Attributes:
+        SHARED: whether a state alone says if the sub-goal is reached, so that options can learn from what others visit.
+        LENGTH: what the number in the rule's name counts; empty where it has none.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("_log_odds", "thresholds")
-    SHARED = True  # whether it is enough to judge a state, so that options can learn from what others visit
+    SHARED: ClassVar[bool] = True
+    LENGTH: ClassVar[str] = ""
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Raise a ``UserError`` where options cannot be learned that end so."""
+        if not cls.SHARED and config.experience != "own":
+            what = "states that other options visit do not say whether an execution has reached its sub-goal"
+            setting = f"termination={config.termination}, experience={config.experience}"
+            raise UserError(what, setting, "Give --set experience=own.")
+
+    @staticmethod
+    def dwell(length: int) -> int:
+        """In how many states in a row a prediction must be positive to end an execution, outside an engine."""
+        return 1
+
+    @staticmethod
+    def set_thresholds(ensembles: Sequence[Ensemble], weights: Mapping[str, torch.Tensor]) -> None:
+        """Give ensembles the thresholds that an artefact's options end at; by default they have them already."""
 
     def __init__(
         self,
         classify: Callable[[NDArray[np.int64]], NDArray[np.float32] | NDArray[np.bool_]],
         options: int,
-        classify_one: Callable[[NDArray[np.int64], int], NDArray[np.float32]] | None = None,
+        classify_group: Callable[[NDArray[np.int64], int], NDArray[np.float32]] | None = None,
         thresholds: NDArray[np.float32] | None = None,
         environments: int = 0,
         length: int = 0,
-        together: int = 1,
+        group: int = 1,
     ):
-        self.together = together
-        self.classify, self.options, self.classify_one = classify, options, classify_one
+        self.classify, self.options, self.classify_group, self.group = classify, options, classify_group, group
         self.thresholds = np.zeros(options, dtype=np.float32) if thresholds is None else thresholds
         self.environments, self.length = environments, length
-        self._log_odds = np.full((1024, options), np.nan, dtype=np.float32)  # NaN: not asked yet
+        self._log_odds = np.full((1024, options), np.nan, dtype=np.float32)  # NaN: not classified yet
 
     def items(self) -> dict[str, Any]:
         return {"_log_odds": self._log_odds[:1]}
@@ -67,34 +94,34 @@ class Terminations(Resumable):
         unknown = np.isnan(self._log_odds[ids]).any(1)
         if unknown.any():
             fresh = np.unique(ids[unknown])
-            known = self._log_odds[fresh]
-            self._log_odds[fresh] = np.where(np.isnan(known), self.classify(fresh), known)
-        says_yes: NDArray[np.bool_] = self._log_odds[ids] > self.thresholds
-        return says_yes
+            before = self._log_odds[fresh]
+            self._log_odds[fresh] = np.where(np.isnan(before), self.classify(fresh), before)
+        positive: NDArray[np.bool_] = self._log_odds[ids] > self.thresholds
+        return positive
 
     def of_running(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the sub-goals of the options that run hold: bool (n,) for states (n,) and options (n,)."""
-        says_yes: NDArray[np.bool_] = self.log_odds(ids, options) > self.thresholds[options]
-        return says_yes
+        positive: NDArray[np.bool_] = self.log_odds(ids, options) > self.thresholds[options]
+        return positive
 
     def log_odds(self, ids: NDArray[np.int64], options: NDArray[np.int64]) -> NDArray[np.float32]:
         """How sure the options that run are that their sub-goals hold: float32 (n,)."""
         self._grow(ids)
-        if self.classify_one is None:
+        if self.classify_group is None:
             self.of(ids)
         unknown = np.isnan(self._log_odds[ids, options])
-        firsts = options - options % self.together
+        firsts = options - options % self.group
         for first in np.unique(firsts[unknown]):
-            assert self.classify_one is not None
+            assert self.classify_group is not None
             fresh = np.unique(ids[unknown & (firsts == first)])
-            judged = self.classify_one(fresh, int(first)).reshape(len(fresh), self.together)
-            self._log_odds[fresh, first : first + self.together] = judged
+            log_odds = self.classify_group(fresh, int(first)).reshape(len(fresh), self.group)
+            self._log_odds[fresh, first : first + self.group] = log_odds
         return self._log_odds[ids, options]
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether executions reach their sub-goals in the states they come to: bool (E,), asked once a step.
+        """Whether executions reach their sub-goals in the states they come to: bool (E,), called once a step.
 
-        ``age`` (E,) steps were made before this one.
+        ``age`` (E,) is their steps before this one.
         """
         return self.of_running(ids, options)
 
@@ -108,9 +135,9 @@ class Terminations(Resumable):
         next_ids: NDArray[np.int64],
         reached: NDArray[np.bool_],
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of transitions (n,) of the past, as of today: whether they begin and end in their option's sub-goal.
+        """By today's thresholds, whether past transitions (n,) begin, and end, in their option's sub-goal.
 
-        ``reached`` says whether its execution reached it then.
+        ``reached`` is whether the execution reached it then.
         """
         return self.of_running(ids, options), self.of_running(next_ids, options)
 
@@ -119,7 +146,7 @@ class Terminations(Resumable):
         return {THRESHOLDS: torch.from_numpy(self.thresholds.copy())}
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on with the thresholds of an artefact; where it is from before there were any, with the ensemble's."""
+        """Go on with the thresholds of an artefact; old ones have none: then with the ensemble's."""
         if THRESHOLDS in state:
             self.thresholds = thresholds_in(state, self.options)
 
@@ -131,7 +158,7 @@ class Terminations(Resumable):
 
 
 def thresholds_in(state: Mapping[str, torch.Tensor], options: int) -> NDArray[np.float32]:
-    """The log-odds float32 (O,) that an artefact keeps; a ``UserError`` where they are none."""
+    """The log-odds float32 (O,) that an artefact keeps; a ``UserError`` where they are missing or damaged."""
     saved = state.get(THRESHOLDS)
     if saved is None or saved.shape != (options,) or saved.dtype != torch.float32 or not saved.isfinite().all():
         raise UserError(f"the weights do not fit the manifest (at {THRESHOLDS})", f"{options} options", AGAIN)
@@ -139,11 +166,13 @@ def thresholds_in(state: Mapping[str, torch.Tensor], options: int) -> NDArray[np
 
 
 class Patience(Terminations):
-    """An option that hardly ever gets to its sub-goal becomes content with less (ours).
+    """The threshold of an option that hardly ever reaches its sub-goal falls (ours).
 
-    After every ``length`` steps of an option in which under ``ENOUGH`` of its executions reached, its threshold falls
-    to ``NEXT`` of the highest log-odds that it saw meanwhile, never below ``LEAST`` of the first threshold.
+    It falls after every ``length`` steps of the option in which less than ``ENOUGH`` of its executions reached: to
+    ``NEXT`` of the highest log-odds among these steps, never below ``LEAST`` of the first threshold.
     """
+
+    LENGTH = "STEPS"
 
     CHANGING = (*Terminations.CHANGING, "_first", "_best", "_steps", "_executions", "_reaches", "_highest")
     ENOUGH, NEXT, LEAST = 0.05, 0.75, 0.5
@@ -159,11 +188,17 @@ class Patience(Terminations):
         now = self.log_odds(ids, options)
         self._best = np.where(age == 0, now, np.maximum(self._best, now))
         np.add.at(self._steps, options, 1)
-        says_yes: NDArray[np.bool_] = now > self.thresholds[options]
-        return says_yes
+        positive: NDArray[np.bool_] = now > self.thresholds[options]
+        return positive
+
+    @staticmethod
+    def set_thresholds(ensembles: Sequence[Ensemble], weights: Mapping[str, torch.Tensor]) -> None:
+        lowered = thresholds_in(weights, sum(map(len, ensembles))).reshape(len(ensembles), -1)
+        for ensemble, log_odds in zip(ensembles, lowered, strict=True):
+            ensemble.set_thresholds((1 / (1 + np.exp(-log_odds))).astype(np.float32))
 
     def finished(self, environments: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
-        """As of :class:`Terminations`; then options whose time has come are judged."""
+        """Count them; then lower the thresholds that are due."""
         np.add.at(self._executions, options, 1)
         np.add.at(self._reaches, options, reached)
         np.maximum.at(self._highest, options, self._best[environments])
@@ -177,14 +212,19 @@ class Patience(Terminations):
 
 
 class Dwell(Terminations):
-    """An execution ends where its sub-goal has held in so many states on end, ``length`` of them."""
+    """An execution ends where its sub-goal has held in ``length`` states in a row."""
 
     CHANGING = (*Terminations.CHANGING, "_held")
     SHARED = False
+    LENGTH = "STEPS"
 
     def __init__(self, *arguments: Any, **more: Any):
         super().__init__(*arguments, **more)
         self._held = np.zeros(self.environments, dtype=np.int64)
+
+    @staticmethod
+    def dwell(length: int) -> int:
+        return length
 
     def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
         self._held = np.where(self.of_running(ids, options), np.where(age == 0, 0, self._held) + 1, 0)
@@ -198,34 +238,42 @@ class Dwell(Terminations):
         next_ids: NDArray[np.int64],
         reached: NDArray[np.bool_],
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """As of :class:`Terminations`; a state alone says nothing."""
+        """A state alone does not say whether the execution had dwelt long enough: only what it reached then counts."""
         return np.zeros_like(reached), reached
 
 
-RULES: dict[str, type[Terminations]] = {"learned": Terminations, "patience": Patience, "dwell": Dwell}
+RULES = {"learned": f"{__name__}:Terminations", "patience": f"{__name__}:Patience", "dwell": f"{__name__}:Dwell"}
 
 
 def rule_of(termination: str) -> tuple[type[Terminations], int]:
-    """The rule and its number of ``learned``, ``patience:10000``, ``dwell:3``; a ``UserError`` where it is none."""
-    name, colon, number = termination.partition(":")
-    known = name in RULES and (number.isdecimal() and int(number) > 0 if name != "learned" else not colon)
-    if not known:
-        do = "Give learned, patience:STEPS, dwell:STEPS or oracle."
+    """The rule and its number, of ``learned``, ``patience:10000``, ``dwell:3``, ``module:Class``, ``module:Class:3``.
+
+    Anything else is a ``UserError``.
+    """
+    name, _, number = termination.rpartition(":")
+    if not number.isdecimal():
+        name, number = termination, ""
+    do = "Give learned, patience:STEPS, dwell:STEPS or oracle."
+    if name not in RULES and (":" not in name or name.partition(":")[0] in RULES):
         raise UserError("unknown termination", f"termination={termination}", do)
-    return RULES[name], int(number or 0)
+    with vouched(*([name] if termination in allowed() else [])):  # who gave the rule with its number gave its name
+        rule = load_part(name, "termination rule", Terminations, RULES)
+    if bool(rule.LENGTH) != bool(number) or (number and int(number) < 1):
+        raise UserError("unknown termination", f"termination={termination}", do)
+    return rule, int(number or 0)
 
 
 def oracle_terminations(engine: Engine, columns: Sequence[int]) -> Terminations:
-    """Spec E6: the true predicates of these sub-goals, by number, one option each; an upper bound, never the method."""
+    """Spec E6: one option for each of these sub-goals, by number, that ends where it is true; an upper bound."""
     return Terminations(lambda ids: engine.labels(ids)[:, columns], len(columns))
 
 
 def learned_terminations(
     engine: Engine, ensembles: Sequence[Ensemble], *, running_only: bool = False, rule: str = "learned"
 ) -> Terminations:
-    """Spec D1: option g*K + k terminates where member k of sub-goal g's ensemble, of G with K members each, says yes.
+    """Spec D1: option g*K + k ends at a positive prediction of member k of sub-goal g's ensemble, of G with K members.
 
-    ``running_only``: nobody asks for other options than the running ones: with K members a state costs a K-th.
+    ``running_only``: states are classified for the running options only, which costs a K-th.
     ``rule``: see :func:`rule_of`.
     """
     stacked = StackedMembers(ensembles, repeats=engine.tiles is not None)
@@ -233,33 +281,33 @@ def learned_terminations(
     members = len(ensembles[0])
     shared = ensembles[0].trunk is not None  # all members cost little more than one
 
-    def seen(ids: NDArray[np.int64], needs_positions: bool) -> tuple[Observations, NDArray[np.int64] | None]:
+    def look_at(ids: NDArray[np.int64], needs_positions: bool) -> tuple[Observations, NDArray[np.int64] | None]:
         if needs_positions and not engine.position_names:
             what = "the ensemble needs the agent's positions (localiser=ram)"
             raise UserError(what, None, "Train it with localiser=learned.")
         return engine.images(ids), engine.positions(ids) if needs_positions else None
 
     def classify(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        states = seen(ids, stacked.needs_positions)
+        states = look_at(ids, stacked.needs_positions)
         if len(ids) < MANY:
             return stacked.log_odds(*states)
         return np.concatenate([ensemble.log_odds(*states) for ensemble in ensembles], axis=1)
 
-    def classify_one(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
+    def classify_group(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
         ensemble = ensembles[option // members]
         if shared:
-            return ensemble.log_odds(*seen(ids, ensemble.needs_positions))
-        views = ensemble.see(*seen(ids, ensemble.needs_positions))
+            return ensemble.log_odds(*look_at(ids, ensemble.needs_positions))
+        views = ensemble.see(*look_at(ids, ensemble.needs_positions))
         with torch.inference_mode():
             logits = networks[option](as_input(tensor(views, ensemble.thresholds.device)))
             log_odds: NDArray[np.float32] = (logits[:, 1] - logits[:, 0]).cpu().numpy()
         return log_odds
 
-    kind, length = rule_of(rule)
-    return kind(
+    termination, length = rule_of(rule)
+    return termination(
         classify,
         len(networks),
-        classify_one if running_only else None,
+        classify_group if running_only else None,
         np.concatenate([ensemble.thresholds_as_log_odds() for ensemble in ensembles]),
         engine.count,
         length,

@@ -7,14 +7,18 @@ An option's worth is taken for fixed: failures from before its policy had learne
 """
 
 from collections.abc import Mapping
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import AGAIN, check_fit
+from hypogoal.domains.base import Engine
 from hypogoal.options.choosers import Chooser, Ids, Offered, Outcome
+from hypogoal.options.config import OptionConfig
 
 
 class ThompsonChooser(Chooser):
@@ -33,6 +37,10 @@ class ThompsonChooser(Chooser):
         self.credit, self._due = np.zeros((2, options)), np.zeros((2, options))
         self._taken, self._drawn = np.zeros((environments, options)), np.zeros((environments, options))
         self._earned = np.zeros(environments)
+
+    @classmethod
+    def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
+        return cls(options, engine.count, rng_for(seed, "random-choice"))
 
     def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
         fresh = environments[~self._taken[environments].any(1)]

@@ -84,13 +84,11 @@ class Visited(Resumable):
         columns = np.array([origin for _, origin in kept], np.int64).reshape(-1, len(self.origins)).T
         return States(pictures, np.zeros((len(kept), 0), np.bool_), dict(zip(self.origins, columns, strict=True)))
 
-    def write(self, folder: Path, domain: Domain, about: Mapping[str, Any], seed: int) -> None:
-        """``visited.h5`` into ``folder``: a data file whose states are all unlabelled; ``about`` is the ensemble's
-        configuration.
-        """
+    def write(self, folder: Path, domain: Domain, ensemble_config: Mapping[str, Any], seed: int) -> None:
+        """``visited.h5`` into ``folder``: a data file of unlabelled states, of the ensemble's domain."""
         none = States(self.engine.room_for(0, None), np.zeros((0, len(domain.sub_goals)), np.bool_))
         collected = Collected(self.engine.observation_shape, domain.sub_goals, none, self.states(), none)
-        named = {"domain": about["domain"], "config": about["domain_config"]}
+        named = {"domain": ensemble_config["domain"], "config": ensemble_config["domain_config"]}
         write_dataset(folder / VISITED, collected, **named, seed=seed, force=True)
 
     def snapshot(self) -> dict[str, Any]:

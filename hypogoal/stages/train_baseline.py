@@ -4,20 +4,18 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from hypogoal.cards import create_artefact
+from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
-from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
 from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
-from hypogoal.core.preflight import preflight
-from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import save_tensors
 from hypogoal.dataset import PICTURE, open_dataset, standard_of
 from hypogoal.domains.base import load_domain
 from hypogoal.learners.baselines.settings import HYPERPARAMETERS, BaselineConfig
 from hypogoal.meta.training import cut, judged, played_world, write_layout
 from hypogoal.needs import baseline_needs, judging_member
+from hypogoal.options.tables import Episodes
 
 
 def train_baseline(
@@ -72,30 +70,25 @@ def train_baseline(
     cut(engine, config.cap)
     if data and engine.observation_dtype != PICTURE:
         engine.standard = standard_of(engine.observation_shape, open_dataset(data).unlabelled())
-    bonus = None
-    if taught:
-        members = judged(engine, taught.path, taught.config, device)
-        bonus = Bonus(members.of, members.options, engine.count, config.bonus, members)
-    env = EngineEnv(engine, bonus)
-    size = env.observation_space.sample().nbytes
     judges = 0.0
-    if taught and bonus:
-        shape, network = engine.observation_shape, taught.config["network"]
-        judges = bonus.members * judging_member(network, shape, engine.observation_dtype)
+    if taught:
+        members = len(taught.config["sub_goals"]) * taught.config["members"]
+        judges = members * judging_member(taught.config["network"], engine.observation_shape, engine.observation_dtype)
+    size = EngineEnv(engine).observation_space.sample().nbytes
     needs = baseline_needs(size, played.played_bytes(config.steps, 0), config.steps, chosen, judges)
-    preflight("train-baseline", out, needs, resume=resume, quiet=quiet)
-    about = as_dict(config) | {"domain": domain, "domain_config": world}
-    about |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
-    with create_artefact(
-        out, kind="baseline", config=about, seed=seed, inputs=inputs, force=force, resume=resume
-    ) as folder:
-        with Progress("train-baseline", total=config.steps, quiet=quiet) as progress:
-            log = MetricsLog(folder / "metrics.jsonl")
-            agent = train(env, chosen, config.steps, seed, log, progress, checkpoints_of(folder), device)
-            progress.update(config.steps)
-        env.episodes.write(folder)
-        save_tensors(folder / "policy.safetensors", weights(agent))
-        write_layout(folder, engine, config.layout_seed, config.random_episodes, seed)
-    episodes = env.episodes
-    counted = {"steps": episodes.steps, "episodes": len(episodes)}
-    return counted | {"success": episodes.success(), "length": episodes.length()}
+    settings = as_dict(config) | {"domain": domain, "domain_config": world}
+    settings |= {"environments": chosen.environments, "hyperparameters": as_dict(chosen)}
+    artefact: dict[str, Any] = {"kind": "baseline", "config": settings, "seed": seed, "inputs": inputs, "force": force}
+    with training("train-baseline", out, needs, steps=config.steps, quiet=quiet, resume=resume, **artefact) as work:
+        bonus = None
+        if taught:
+            terminations = judged(engine, taught.path, taught.config, device)
+            bonus = Bonus(terminations.of, terminations.options, engine.count, config.bonus, terminations)
+        env = EngineEnv(engine, bonus)
+        agent = train(env, chosen, config.steps, seed, work.log, work.progress, work.checkpoints, device)
+        work.progress.update(config.steps)
+        Episodes.of_rows(env.episodes).write(work.folder)
+        save_tensors(work.folder / "policy.safetensors", weights(agent))
+        write_layout(work.folder, engine, config.layout_seed, config.random_episodes, seed)
+    counts = {"steps": env.episodes.steps, "episodes": len(env.episodes)}
+    return counts | {"success": env.episodes.success(), "length": env.episodes.length()}

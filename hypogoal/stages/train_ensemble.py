@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hypogoal.cards import create_artefact
+from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
 from hypogoal.core.checkpoints import FOLDER, checkpoints_of, growing
 from hypogoal.core.compute import prepare
@@ -17,8 +17,7 @@ from hypogoal.core.config import as_dict
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import json_lines, read_end
 from hypogoal.core.manifests import LOG, SCORES
-from hypogoal.core.preflight import preflight
-from hypogoal.core.progress import MetricsLog, Progress
+from hypogoal.core.progress import MetricsLog
 from hypogoal.core.seeding import seed_for
 from hypogoal.core.workers import allowed, in_processes
 from hypogoal.dataset import Dataset, Observations, States, open_dataset
@@ -34,7 +33,7 @@ from hypogoal.hypotheses.views import StateOrigins, positions_of
 from hypogoal.needs import ensemble_needs
 from hypogoal.options.visited import VISITED
 
-PARTS = {LOG: ".jsonl", SCORES: ".scores"}  # a sub-goal's, while others are trained: beside its checkpoint
+SUFFIXES = {LOG: ".jsonl", SCORES: ".scores"}  # of one sub-goal's part of these, beside its checkpoint
 
 
 def train_ensemble(
@@ -67,80 +66,81 @@ def train_ensemble(
         if sub_goal not in dataset.sub_goals:
             raise UserError("unknown sub-goal", sub_goal, f"{data} has {', '.join(dataset.sub_goals)}.")
     others = tuple(unlabelled_file(path, dataset) for path in unlabelled)
-    out = claim(out, kind="ensemble", inputs=[data, *others], force=force, resume=resume)
-    about = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
-    about |= {"observation_dtype": str(dataset.observation_dtype)}
-    about |= {"domain": dataset.domain, "domain_config": dataset.config}
+    inputs = [data, *others]
+    out = claim(out, kind="ensemble", inputs=inputs, force=force, resume=resume)
+    settings = as_dict(config) | {"sub_goals": list(sub_goals), "observation_shape": list(dataset.observation_shape)}
+    settings |= {"observation_dtype": str(dataset.observation_dtype)}
+    settings |= {"domain": dataset.domain, "domain_config": dataset.config}
     workers = min(allowed(config.workers), len(sub_goals))
     needs = ensemble_needs(data, others or (data,), config, steps_of(config), workers, device)
-    preflight("train-ensemble", out, needs, resume=resume, quiet=quiet)
-    with create_artefact(
-        out, kind="ensemble", config=about, seed=seed, inputs=[data, *others], force=force, resume=resume
-    ) as folder:
+    steps = len(sub_goals) * steps_of(config)
+    artefact: dict[str, Any] = {"kind": "ensemble", "config": settings, "seed": seed, "inputs": inputs, "force": force}
+    with training("train-ensemble", out, needs, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
+        folder, parts = work.folder, work.folder.parent / FOLDER
         jobs = [partial(_train_one, data, others, sub_goal, config, seed, folder, device) for sub_goal in sub_goals]
         summaries: list[dict[str, Any]] = [{} for _ in jobs]
-        (folder.parent / FOLDER).mkdir(exist_ok=True)
-        logs = [folder.parent / FOLDER / f"{sub_goal}{PARTS[LOG]}" for sub_goal in sub_goals]
-        with Progress("train-ensemble", total=len(jobs) * steps_of(config), quiet=quiet) as progress:
-            progress.resume(steps_in(logs))
-            with progress.following(partial(steps_in, logs)):
-                in_processes(jobs, workers, summaries.__setitem__)
-        for log, part in [*PARTS.items()][: 2 if config.score_every else 1]:
-            parts = (folder.parent / FOLDER / f"{sub_goal}{part}" for sub_goal in sub_goals)
-            (folder / log).write_text("".join(path.read_text(encoding="utf-8") for path in parts), encoding="utf-8")
+        parts.mkdir(exist_ok=True)
+        logs = [parts / f"{sub_goal}{SUFFIXES[LOG]}" for sub_goal in sub_goals]
+        work.progress.resume(steps_in(logs))
+        with work.progress.following(partial(steps_in, logs)):
+            in_processes(jobs, workers, summaries.__setitem__)
+        for name in (LOG, SCORES) if config.score_every else (LOG,):
+            texts = [(parts / f"{sub_goal}{SUFFIXES[name]}").read_text(encoding="utf-8") for sub_goal in sub_goals]
+            (folder / name).write_text("".join(texts), encoding="utf-8")
     return summaries
 
 
 def steps_of(config: TrainEnsembleConfig) -> int:
-    """Training steps of a sub-goal's ensemble: of members one after the other, those of all."""
+    """Training steps of a sub-goal's ensemble: of all members, where they are trained one after another."""
     return config.steps * (config.members if config.schedule == "sequential" else 1)
 
 
 def steps_in(logs: Sequence[Path]) -> int:
-    """How many steps of all sub-goals are in their logs, which their processes are writing."""
+    """How many steps of all sub-goals are in the logs that their processes are writing."""
     return sum(next((line.get("step", 0) for line in json_lines(reversed(read_end(log, 400)))), 0) for log in logs)
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:
-    """Spec B7: the data file whose unlabelled states to take: ``path``, or that of an artefact with visited states.
+    """Spec B7: the file of unlabelled states: ``path``, or the file of an artefact with visited states.
 
-    None, or one of another domain or shape than ``dataset``, is a ``UserError``.
+    No such file, or one of another domain or shape than ``dataset``, is a ``UserError``.
     """
     file = path / VISITED if path.is_dir() else path
     if path.is_dir() and VISITED not in open_artefact(path, ("options", "meta")).whole().manifest["files"]:
         raise UserError("no visited states", path, "Make it with --set save_visited=N.")
-    found = open_dataset(file)
-    for what, here, there in (
-        ("the domain", found.domain, dataset.domain),
-        ("observations of shape", found.observation_shape, dataset.observation_shape),
-        ("observations of type", found.observation_dtype, dataset.observation_dtype),
+    source = open_dataset(file)
+    for name, value, expected in (
+        ("the domain", source.domain, dataset.domain),
+        ("observations of shape", source.observation_shape, dataset.observation_shape),
+        ("observations of type", source.observation_dtype, dataset.observation_dtype),
     ):
-        if here != there:
-            raise UserError(f"{what} {here}, the data have {there}", file, "Give unlabelled states that fit the data.")
+        if value != expected:
+            do = "Give unlabelled states that fit the data."
+            raise UserError(f"{name} {value}, the data have {expected}", file, do)
     return file
 
 
 def joined_unlabelled(files: Sequence[Path]) -> tuple[Observations, dict[str, NDArray[np.int64]]]:
-    """The unlabelled states (M, *obs) of some files one after another, and the origins that all of them have."""
-    found = [(dataset.unlabelled(), dataset.unlabelled_origins()) for dataset in map(open_dataset, files)]
-    names = set.intersection(*(set(origins) for _, origins in found))
-    joined = {name: np.concatenate([origins[name] for _, origins in found]) for name in sorted(names)}
-    return np.concatenate([states for states, _ in found]), joined
+    """The unlabelled states (M, *obs) of some files one after another, and the origins that all files have."""
+    sources = [(dataset.unlabelled(), dataset.unlabelled_origins()) for dataset in map(open_dataset, files)]
+    names = set.intersection(*(set(origins) for _, origins in sources))
+    joined = {name: np.concatenate([origins[name] for _, origins in sources]) for name in sorted(names)}
+    return np.concatenate([states for states, _ in sources]), joined
 
 
 def score_rows(
     ensemble: Ensemble, split: States, unlabelled: Observations, positions: NDArray[np.int64] | None
 ) -> Iterator[dict[str, Any]]:
-    """What members know of the held-out states, one row a member and scope.
+    """Scores of members on held-out states, one row for each member and scope.
 
     Scopes: ``all`` states, and those of the ``first`` and of the ``second`` half of their contexts (layouts or rooms:
-    see :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one and scored on the other.
+    see :func:`~hypogoal.hypotheses.scores.halves`), so that a member can be picked on one half and scored on the other.
     Balanced accuracy is at 0.5, above the 95th percentile of unlabelled states (``at_q95``) and at the best threshold
     that there is (``at_best``).
     """
     probabilities = ensemble.predict(split.observations, positions_of(split.origins))
     elsewhere = ensemble.predict(unlabelled, positions)
-    quantiles = thresholds("unlabelled-q95", elsewhere[:0], np.zeros(0, dtype=np.bool_), elsewhere)  # asks no label
+    quantiles = thresholds("unlabelled-q95", elsewhere[:0], np.zeros(0, dtype=np.bool_), elsewhere)  # needs no label
     contexts = next((split.origins[name] for name in ("layout_seed", "room") if name in split.origins), None)
     first = None if contexts is None else halves(contexts)
     scopes = {"all": np.ones(len(split.labels), dtype=np.bool_)}
@@ -155,14 +155,14 @@ def score_rows(
             "at_best": best_threshold(seen, labels)[1],
         }
         for member in range(len(ensemble)):
-            told = {name: float(values[member]) for name, values in columns.items()}
-            numbers = {name: None if np.isnan(value) else round(value, 6) for name, value in told.items()}
+            row = {name: float(values[member]) for name, values in columns.items()}
+            numbers = {name: None if np.isnan(value) else round(value, 6) for name, value in row.items()}
             counts = {"states": len(labels), "positives": int(labels.sum())}
             yield {"scope": scope, "member": member, **counts, **numbers}
 
 
 class _Report(Watcher):
-    """Writes the losses of a sub-goal's ensemble down as they come, and remembers the last ones; its scores too."""
+    """Logs the losses of a sub-goal's ensemble, and remembers the last ones; its scores too."""
 
     def __init__(self, sub_goal: str, log: MetricsLog, scores: MetricsLog, look: Look, look_at: set[int]):
         super().__init__(look=look, look_at=look_at)
@@ -191,7 +191,8 @@ def _train_one(
     dataset = open_dataset(data)
     split = dataset.labelled(sub_goal)
     unlabelled, origins = joined_unlabelled(others or (data,))
-    log, scores = (MetricsLog(folder.parent / FOLDER / f"{sub_goal}{part}") for part in PARTS.values())
+    parts = folder.parent / FOLDER
+    log, scores = (MetricsLog(parts / f"{sub_goal}{SUFFIXES[name]}") for name in (LOG, SCORES))
     if not checkpoints.saved:
         log.restore(0)
         scores.restore(0)

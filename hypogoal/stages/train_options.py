@@ -3,17 +3,24 @@
 from pathlib import Path
 from typing import Any
 
-from hypogoal.cards import create_artefact
+from hypogoal.cards import training
 from hypogoal.core.artefacts import claim, open_artefact
-from hypogoal.core.checkpoints import checkpoints_of
 from hypogoal.core.compute import prepare
-from hypogoal.core.preflight import preflight
-from hypogoal.core.progress import MetricsLog, Progress
-from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import load_domain
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.meta.training import assemble, check_fit, description, start_arguments, train, write_trained
+from hypogoal.meta.training import (
+    assemble,
+    check_fit,
+    continue_with,
+    description,
+    options_of,
+    start_arguments,
+    train,
+    write_trained,
+)
 from hypogoal.needs import play_needs
+
+FIXED = ("network", "embedding", "termination", "policy_view", "policy_pixels")  # as of the options trained before
 
 
 def train_options(
@@ -28,47 +35,41 @@ def train_options(
     quiet: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Train the options of an ensemble artefact, or those of ``options`` further, and write the artefact ``out``.
+    """Train the options of an ensemble artefact, or train ``options`` further, and write the artefact ``out``.
 
     Returns steps, episodes, and success and length over the last 100 episodes of random choice; where each option
     begins an episode, instead of these two the shares of ``recorder.recent``. With ``until`` also ``ended``: by what.
     """
     device = prepare(device)
     source = open_artefact(ensemble, "ensemble").whole()
-    trained = open_artefact(options, "options").whole() if options else None
-    if trained:
-        check_fit(trained, source, config, ("network", "embedding", "termination", "policy_view", "policy_pixels"))
+    practice = open_artefact(options, "options").whole() if options else None
+    if practice:
+        check_fit(practice, source, config, FIXED)
     inputs = [ensemble, options] if options else [ensemble]
     out = claim(out, kind="options", inputs=inputs, force=force, resume=resume)
     domain = load_domain(source.config["domain"])
-    start_arguments(domain, config, 1, seed)  # what cannot be is told before what it would need
-    preflight("train-options", out, play_needs(domain, source.config, config), resume=resume, quiet=quiet)
-    loop = assemble(domain, source.path, source.config, config, seed, device)
-    if trained:
-        learned = load_tensors(trained.path / "options.safetensors")
-        loop.learner.load(learned)
-        loop.terminations.load(learned)
-    recorder = loop.recorder
-    steps = config.steps * (loop.terminations.options if config.steps_for == "each" else 1)
-    about = description(loop, domain, source.config, config, steps=steps)
-    with create_artefact(
-        out, kind="options", config=about, seed=seed, inputs=inputs, force=force, resume=resume
-    ) as folder:
-        log = MetricsLog(folder / "metrics.jsonl")
-        with Progress("train-options", total=steps, quiet=quiet) as progress:
-            solved = train(loop, steps, log, progress, checkpoints_of(folder), config.until)
+    start_arguments(domain, config, 1, seed)  # refuse an impossible start before estimating the cost
+    steps = config.steps * (options_of(source.config, config) if config.steps_for == "each" else 1)
+    settings = description(domain, source.config, config, steps=steps)
+    needs = play_needs(domain, source.config, config)
+    artefact: dict[str, Any] = {"kind": "options", "config": settings, "seed": seed, "inputs": inputs, "force": force}
+    with training("train-options", out, needs, steps=steps, quiet=quiet, resume=resume, **artefact) as work:
+        loop = assemble(domain, source.path, source.config, config, seed, device)
+        if practice:
+            continue_with(loop, practice)
+        recorder = loop.recorder
+        solved = train(loop, steps, work.log, work.progress, work.checkpoints, config.until)
         if domain.measures and loop.engine.position_names:
-            recorder.write_executions(folder, domain.distance)
-        write_trained(folder, loop, domain, source.config, config, seed)
+            recorder.write_executions(work.folder, domain.distance)
+        write_trained(work.folder, loop, domain, source.config, config, seed)
         if config.until:
-            about |= {"ended_at": recorder.steps, "until_reached": solved}  # the manifest, which comes last, says so
-    counted: dict[str, Any] = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
+            settings |= {"ended_at": recorder.steps, "until_reached": solved}  # for the manifest, which comes last
+    counts: dict[str, Any] = {"steps": recorder.steps, "episodes": len(recorder.episodes)}
     if config.restart_options:
-        counted |= recorder.recent(restarted=True)
+        counts |= recorder.recent(restarted=True)
     else:
-        counted |= {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
+        counts |= {"success": recorder.episodes.success(), "length": recorder.episodes.length()}
     if config.until:
-        counted["ended"] = (
-            f"by until={config.until:g}" if solved else f"by the limit, until={config.until:g} not reached"
-        )
-    return counted
+        goal = f"until={config.until:g}"
+        counts["ended"] = f"by {goal}" if solved else f"by the limit, {goal} not reached"
+    return counts

@@ -81,9 +81,8 @@ def make_seeds(root: Path) -> None:
     from hypogoal.core.seeding import torch_generator
     from hypogoal.core.tensors import save_tensors
     from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-    from hypogoal.learners.episodes import EPISODE_COLUMNS
     from hypogoal.options.networks import LightQNetwork
-    from hypogoal.options.recording import CHOICE_COLUMNS, EXECUTION_COLUMNS
+    from hypogoal.options.tables import Choices, Episodes, Executions
 
     rng = np.random.default_rng(0)
 
@@ -112,11 +111,11 @@ def make_seeds(root: Path) -> None:
             }
             save_tensors(folder / "options.safetensors", state | counters)
             write_table(
-                folder / "episodes.csv", EPISODE_COLUMNS, [(10 * n, 10, 1.0, n % 2, n % 2) for n in range(1, 6)]
+                folder / "episodes.csv", Episodes.names(), [(10 * n, 10, 1.0, n % 2, n % 2) for n in range(1, 6)]
             )
-            write_table(folder / "choices.csv", CHOICE_COLUMNS, [(50, n, 9, 3, 2.5, 1, 8) for n in range(options)])
+            write_table(folder / "choices.csv", Choices.names(), [(50, n, 9, 3, 2.5, 1, 8) for n in range(options)])
             rows = [(n, n % options, 3, 1, 0, 0, 1, 10, 20, 5) for n in range(6)]
-            write_table(folder / "executions.csv", EXECUTION_COLUMNS, rows)
+            write_table(folder / "executions.csv", Executions.names(), rows)
             facts = {"layout_seed": 100, "shortest_path": 9, "random_success": 0.1, "random_episodes": 5}
             (folder / "layout.json").write_text(json.dumps(facts))
             (folder / "metrics.jsonl").write_text('{"step": 1, "success": 0.5}\n')

@@ -7,12 +7,12 @@ import numpy as np
 from toy_data import fill
 
 from hypogoal.core.artefacts import create_artefact
+from hypogoal.core.files import write_table
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.domains.base import Domain
 from hypogoal.domains.doorkey import DOMAIN as DOORKEY
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
-from hypogoal.options.recording import write_table
 
 SUB_GOAL = "climb-down-ladder"
 SHAPE = (36, 36, 4)  # the smallest that the network takes

@@ -5,6 +5,7 @@ import pytest
 from ladder_run import COLUMNS, executions
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import write_table
 from hypogoal.evaluation.distance import (
     BEGAN_INSIDE,
     HIT,
@@ -19,7 +20,7 @@ from hypogoal.evaluation.distance import (
 )
 from hypogoal.evaluation.run import read_executions
 from hypogoal.evaluation.table import BEST, VALIDATED, WORST, rows_of
-from hypogoal.options.recording import EXECUTION_COLUMNS, write_table
+from hypogoal.options.tables import Executions
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def read(tmp_path):
 
 def test_the_columns_are_those_that_are_written():
     """Spec A8: the reader's columns are the recorder's."""
-    assert COLUMNS == EXECUTION_COLUMNS
+    assert Executions.names() == COLUMNS
 
 
 def test_an_execution_that_begins_inside_counts_300(read):

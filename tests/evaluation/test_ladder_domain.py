@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from ladder_run import COLUMNS
 
+from hypogoal.core.files import write_table
 from hypogoal.domains.base import load_domain
 from hypogoal.evaluation.distance import at_base, distance_table, fates, options_of, rows_of_ladder, show_stops
 from hypogoal.evaluation.run import read_executions
-from hypogoal.options.recording import write_table
 
 
 @pytest.mark.atari

@@ -33,8 +33,7 @@ from hypogoal.dataset import Collected, States, write_dataset
 from hypogoal.evaluation.page import Material
 from hypogoal.evaluation.questions import render
 from hypogoal.evaluation.run import fitting, read_evaluation
-from hypogoal.learners.episodes import EPISODE_COLUMNS
-from hypogoal.options.recording import CHOICE_COLUMNS
+from hypogoal.options.tables import Choices, Episodes
 from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.stages.report import draw_figures, report
@@ -99,7 +98,7 @@ def write_states(path, *, rooms):
 
 def write_agent(folder):
     rows = [(end, 20, 1, 1, 1) for end in range(20, 4_001, 20)]
-    write_table(folder / "episodes.csv", EPISODE_COLUMNS, rows)
+    write_table(folder / "episodes.csv", Episodes.names(), rows)
     facts = {"layout_seed": 100, "shortest_path": 10, "random_success": 0.1, "random_episodes": 20}
     (folder / "layout.json").write_text(json.dumps(facts), encoding="utf-8")
 
@@ -111,7 +110,7 @@ def write_meta(out, source):
     with create_artefact(out, kind="meta", config=config, seed=0, inputs=[source]) as folder:
         write_agent(folder)
         rows = [(end, option, 9, 3 + option, 2.5, 1, 8) for end in (2_000, 4_000) for option in (0, 1)]
-        write_table(folder / "choices.csv", CHOICE_COLUMNS, rows)
+        write_table(folder / "choices.csv", Choices.names(), rows)
         with create_hdf5(folder / "terminations.h5") as file:
             file["0"] = heldout().observations[:3]
         fill(folder, "meta", config)

@@ -7,17 +7,16 @@ from corridor import Corridor
 
 from hypogoal.core.files import write_table
 from hypogoal.domains.base import Step, step_of
-from hypogoal.evaluation.run import read_episodes
-from hypogoal.learners.episodes import EPISODE_COLUMNS, Episodes
-from hypogoal.stages import train_meta
+from hypogoal.learners.episodes import EpisodeRecorder
+from hypogoal.options.tables import Episodes
 
 YES, NO = np.ones(3, np.bool_), np.zeros(3, np.bool_)
 REWARDS = np.array([1, 0, -1], np.float32)
 
 
-def played(succeeded: np.ndarray | None) -> Episodes:
+def played(succeeded: np.ndarray | None) -> EpisodeRecorder:
     """Three environments end their episodes; then they are cut, all with a reward."""
-    episodes = Episodes(3)
+    episodes = EpisodeRecorder(3)
     episodes.see(Step(np.arange(3), REWARDS, NO, NO, None if succeeded is None else NO))
     episodes.see(Step(np.arange(3), REWARDS, YES, NO, succeeded))
     episodes.see(Step(np.arange(3), np.abs(REWARDS) + 1, NO, YES, None if succeeded is None else ~succeeded))
@@ -40,7 +39,7 @@ def test_steps_of_before_are_steps() -> None:
         def step(self, actions: np.ndarray) -> Step:
             return Step(*super().step(actions)[:4])
 
-    engine, episodes = Old(1), Episodes(1)
+    engine, episodes = Old(1), EpisodeRecorder(1)
     for _ in range(3):
         episodes.see(step_of(engine, np.array([1])))
     assert episodes == [(3, 3, 1.0, 1, 1)]
@@ -49,15 +48,15 @@ def test_steps_of_before_are_steps() -> None:
 def test_tables_and_checkpoints_keep_it_and_older_tables_are_read(tmp_path: Path) -> None:
     """Spec G1: those from before the column have the success that they were told to have."""
     for told, episodes in ((True, played(np.array([False, True, True]))), (False, played(None))):
-        episodes.write(tmp_path)
-        found = read_episodes(tmp_path / "episodes.csv")
+        Episodes.of_rows(episodes).write(tmp_path)
+        found = Episodes.read(tmp_path / "episodes.csv")
         assert found.succeeded.tolist() == [bool(row[4]) for row in episodes]
         assert found.last(2).succeeded.tolist() == found.succeeded[-2:].tolist()
-        assert train_meta.read_episodes(tmp_path / "episodes.csv") == list(episodes)
-        again = Episodes(3)
+        assert found.rows() == list(episodes)
+        again = EpisodeRecorder(3)
         again.restore(episodes.snapshot())
         assert again == episodes and again.steps == 9
         if not told:
-            write_table(tmp_path / "episodes.csv", EPISODE_COLUMNS[:4], [row[:4] for row in episodes])
-            old = read_episodes(tmp_path / "episodes.csv")
+            write_table(tmp_path / "episodes.csv", Episodes.names()[:4], [row[:4] for row in episodes])
+            old = Episodes.read(tmp_path / "episodes.csv")
             assert old.succeeded.tolist() == found.succeeded.tolist() and old.succeeded.dtype == np.bool_

@@ -1,10 +1,20 @@
 """Transitions over several steps (Spec D2)."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from hypogoal.learners.double_dqn import double_q_targets
-from hypogoal.learners.replay import StepsAhead
+from hypogoal.learners.replay import Steps, StepsAhead
+
+
+@dataclass(frozen=True)
+class Ended(Steps):
+    """Whether the sequence ended."""
+
+    end: NDArray[np.bool_]
 
 
 def test_transitions_reach_n_steps_on_but_not_beyond_the_end() -> None:
@@ -14,11 +24,11 @@ def test_transitions_reach_n_steps_on_but_not_beyond_the_end() -> None:
     for t in range(4):
         s, following = np.array([10 + t, 20 + t]), np.array([11 + t, 21 + t])
         ended = np.array([t == 3, False])
-        rows.append(ahead.add(s, np.array([t, 10 + t]), following, ended, end=ended))
-    assert [len(row["s"]) for row in rows] == [0, 0, 2, 4]
+        rows.append(ahead.add(Ended(s, np.array([t, 10 + t]), following, np.ones(2, int), ended), ended))
+    assert [len(row) for row in rows] == [0, 0, 2, 4]
 
     def listed(row):
-        columns = (row[name].tolist() for name in ("s", "a", "next", "steps", "end"))
+        columns = (values.tolist() for values in vars(row).values())
         return list(zip(*columns, strict=True))
 
     assert listed(rows[2]) == [(10, 0, 13, 3, False), (20, 10, 23, 3, False)]
@@ -29,8 +39,9 @@ def test_transitions_reach_n_steps_on_but_not_beyond_the_end() -> None:
         (21, 11, 24, 3, False),
     ]
     # The next sequence begins empty: nothing is joined to what came before.
-    again = ahead.add(np.array([30, 24]), np.array([0, 14]), np.array([31, 25]), np.array([True, True]))
-    assert sorted(zip(again["s"].tolist(), again["next"].tolist(), again["steps"].tolist(), strict=True)) == [
+    both = np.array([True, True])
+    again = ahead.add(Ended(np.array([30, 24]), np.array([0, 14]), np.array([31, 25]), np.ones(2, int), both), both)
+    assert sorted(zip(again.state.tolist(), again.next_state.tolist(), again.steps.tolist(), strict=True)) == [
         (22, 25, 3),
         (23, 25, 2),
         (24, 25, 1),
@@ -40,10 +51,10 @@ def test_transitions_reach_n_steps_on_but_not_beyond_the_end() -> None:
 
 def test_one_step_ahead_is_the_plain_transition() -> None:
     """Spec D2: n = 1 changes nothing."""
-    s, a, following = np.array([4, 7]), np.array([1, 0]), np.array([5, 8])
-    rows = StepsAhead(2, 1).add(s, a, following, np.array([False, True]), option=np.array([3, 2]))
-    for name, values in {"s": s, "a": a, "next": following, "steps": [1, 1], "option": [3, 2]}.items():
-        np.testing.assert_array_equal(rows[name], values)
+    ended = np.array([False, True])
+    steps = Ended(np.array([4, 7]), np.array([1, 0]), np.array([5, 8]), np.ones(2, int), ended)
+    for name, values in vars(StepsAhead(2, 1).add(steps, ended)).items():
+        np.testing.assert_array_equal(values, getattr(steps, name))
 
 
 def test_targets_over_several_steps_by_hand() -> None:

@@ -1,10 +1,21 @@
 """Prioritised replay and Double-DQN targets (Spec D2, D3)."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from hypogoal.core.columns import Columns
 from hypogoal.learners.double_dqn import double_q_targets, follow, linear_epsilon
 from hypogoal.learners.replay import PrioritisedReplay, SumTree
+
+
+@dataclass(frozen=True)
+class Numbers(Columns):
+    """What is stored here."""
+
+    x: NDArray[np.int32]
 
 
 def test_sum_tree_finds_the_leaf_of_a_prefix_sum_like_the_plain_search() -> None:
@@ -37,8 +48,8 @@ def test_sum_tree_stays_right_under_many_overwrites() -> None:
 
 def test_sampling_follows_priorities_and_weights_correct_for_it() -> None:
     """Spec D2 (Schaul et al. 2015): with alpha 1 a transition is drawn in proportion to its priority."""
-    replay = PrioritisedReplay(4, {"x": np.int32}, alpha=1.0, beta=1.0)
-    indices = replay.add(x=np.arange(4))
+    replay = PrioritisedReplay(4, Numbers, alpha=1.0, beta=1.0)
+    indices = replay.add(Numbers(np.arange(4)))
     replay.set_priorities(indices, np.array([1.0, 2.0, 3.0, 4.0]))
     rng = np.random.default_rng(0)
     drawn, weights = replay.sample(10_000, rng)
@@ -51,18 +62,18 @@ def test_sampling_follows_priorities_and_weights_correct_for_it() -> None:
 
 def test_what_is_new_has_the_largest_priority_seen() -> None:
     """Spec D2: to the power alpha, as those that were learned from."""
-    replay = PrioritisedReplay(4, {"x": np.int32}, alpha=0.5, beta=0.4)
-    replay.set_priorities(replay.add(x=np.arange(2)), np.array([1.0, 9.0]))
-    np.testing.assert_allclose(replay.tree.get(replay.add(x=np.array([2]))), [3.0], rtol=1e-3)
+    replay = PrioritisedReplay(4, Numbers, alpha=0.5, beta=0.4)
+    replay.set_priorities(replay.add(Numbers(np.arange(2))), np.array([1.0, 9.0]))
+    np.testing.assert_allclose(replay.tree.get(replay.add(Numbers(np.array([2])))), [3.0], rtol=1e-3)
     np.testing.assert_allclose(replay.tree.get(np.arange(2)), [1.0, 3.0], rtol=1e-3)
 
 
 def test_the_ring_forgets_the_oldest() -> None:
     """Spec D3: capacity transitions are kept."""
-    replay = PrioritisedReplay(3, {"x": np.int32}, alpha=0.6, beta=0.4)
-    replay.add(x=np.array([1, 2]))
-    replay.add(x=np.array([3, 4]))
-    assert sorted(replay.data["x"]) == [2, 3, 4]
+    replay = PrioritisedReplay(3, Numbers, alpha=0.6, beta=0.4)
+    replay.add(Numbers(np.array([1, 2])))
+    replay.add(Numbers(np.array([3, 4])))
+    assert sorted(replay.data.x) == [2, 3, 4]
     assert replay.size == 3
 
 

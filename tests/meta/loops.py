@@ -11,12 +11,12 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains import doorkey
 from hypogoal.domains.base import Layouts
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
-from hypogoal.meta import training
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.ppo import MetaPolicy
 from hypogoal.options.choosers import Chooser, EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.initiation import Initiation
+from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
@@ -63,7 +63,7 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
     config = OptionConfig(**{"option_timeout": 10, **QUICK, **changes})  # type: ignore[arg-type]
     engine = engine_class(3)
     verdicts = oracle_terminations(engine, (0, 1))
-    learner = training.LEARNERS[network](engine, verdicts, config, seed=1, device=device)
+    learner = load_learner(network)(engine, verdicts, config, seed=1, device=device)
     chooser: Chooser = RandomChooser(rng_for(0, "choice"))
     if chooser_name == "even":
         chooser = EvenChooser(2, rng_for(0, "choice"))

@@ -95,7 +95,7 @@ def test_an_embedding_by_name_goes_through_both_stages(
     assert main(meta) == 2
     assert "trained with embedding=tiles, not auto" in capsys.readouterr().err
     assert main([*meta, *named]) == 0
-    assert main([*meta[:2], "--out", str(tmp_path / "other"), *named, "--set", "network=planned", *few]) == 2
+    assert main([*meta[:2], "--out", str(tmp_path / "other"), *named, "--set", "network=planned"]) == 2
     assert "only the light network has an embedding" in capsys.readouterr().err
 
 
@@ -149,8 +149,8 @@ def test_replays_keep_any_action() -> None:
     learner = learner_of(LightLearner)
     own = learner_of(RecurrentLearner, experience="own", mask_reached=False)
     for data in (learner.replay.data, own.members[0].replay.data):
-        data["a"][0] = 300
-        assert data["a"][0] == 300
+        data.action[0] = 300
+        assert data.action[0] == 300
 
 
 @pytest.mark.parametrize("shape", [(84, 84, 4), (45, 45, 3), (60, 60, 3), (7, 7, 3)])

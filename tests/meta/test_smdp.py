@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork
-from hypogoal.meta.ppo import clipped_surrogate, scaled_advantages, smdp_advantages
+from hypogoal.meta.ppo import clipped_surrogate, scaled_advantages
+from hypogoal.meta.smdp import smdp_advantages
 
 
 def test_advantages_by_hand() -> None:

@@ -17,7 +17,7 @@ from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.hypotheses.localisers import LearnedLocaliser
 from hypogoal.hypotheses.views import AgentView, cut_windows
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.options.windows import SIDE, AgentWindows, HalfPictures, halved
+from hypogoal.options.policy_views import SIDE, AgentCrop, HalfPixels, Viewed, halved
 from hypogoal.stages.train_options import train_options
 
 SHAPE = DOMAIN.observation_shape
@@ -60,12 +60,13 @@ def test_the_agent_is_looked_for_once_in_each_state() -> None:
         engine.step(rng.integers(engine.n_actions, size=2))
     ids = rng.integers(engine.n_states, size=30)
     localiser = LearnedLocaliser(SHAPE)
-    seen = AgentWindows(engine, localiser)
+    seen = Viewed(engine, [AgentCrop(SHAPE, localiser)])
     expected = cut_windows(engine.images(ids), localiser.locate(engine.images(ids)), SIDE, SIDE)
     np.testing.assert_array_equal(seen.images(ids), expected)
-    again, out = AgentWindows(engine, LearnedLocaliser(SHAPE)), np.zeros((30, *seen.observation_shape), np.uint8)
+    again = Viewed(engine, [AgentCrop(SHAPE, LearnedLocaliser(SHAPE))])
+    out = np.zeros((30, *seen.observation_shape), np.uint8)
     again.restore(seen.snapshot())
-    again.localiser.locate = None  # type: ignore[assignment,method-assign]
+    again.views[0].localiser.locate = None  # type: ignore[attr-defined]
     np.testing.assert_array_equal(again.images(ids, out), expected)
     np.testing.assert_array_equal(out, expected)
 
@@ -132,7 +133,7 @@ def test_options_of_half_pictures(tmp_path: Path) -> None:
     """They are trained, go on and play as saved; also of windows. Not beside those of whole pictures."""
     engine = MontezumaEngine("1L", 2)
     ids, out = np.array([3, 0, 5]), np.zeros((3, 42, 42, 4), np.uint8)
-    seen = HalfPictures(engine)
+    seen = Viewed(engine, [HalfPixels(engine.observation_shape)])
     assert seen.observation_shape == (42, 42, 4)
     np.testing.assert_array_equal(seen.images(ids), halved(engine.images(ids)))
     assert seen.images(ids[:2], out[:2]) is not None and (out[:2] == halved(engine.images(ids[:2]))).all()

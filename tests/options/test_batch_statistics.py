@@ -40,7 +40,7 @@ def learner() -> RecurrentLearner:
 def executions(learner: RecurrentLearner, indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """The states of the execution up to each of the steps, and the one after it."""
     data = learner.members[0].replay.data
-    return [np.append(data["s"][row - data["place"][row] : row + 1], data["next"][row]) for row in indices.tolist()]
+    return [np.append(data.state[row - data.place[row] : row + 1], data.next_state[row]) for row in indices.tolist()]
 
 
 def unrolled(

@@ -18,7 +18,7 @@ from hypogoal.core.own_code import TRUST
 from hypogoal.domains.base import Domain
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.meta.config import TrainOptionsConfig
-from hypogoal.options.recording import EXECUTION_COLUMNS
+from hypogoal.options.tables import Executions
 from hypogoal.stages.train_options import train_options
 
 BEGIN = {"restart_options": True, "mask_reached": False, "experience": "own", "environments": 4, "warm_up": 60}
@@ -81,7 +81,7 @@ class TallDomain:
 def rows_of(folder: Path) -> list[dict[str, int]]:
     with (folder / "executions.csv").open(newline="") as file:
         reader = csv.DictReader(file)
-        assert tuple(reader.fieldnames) == EXECUTION_COLUMNS
+        assert tuple(reader.fieldnames) == Executions.names()
         return [{name: int(value) for name, value in row.items()} for row in reader]
 
 

@@ -9,12 +9,13 @@ from corridor import Corridor
 
 from hypogoal.core.seeding import rng_for
 from hypogoal.learners.double_dqn import double_q_targets
-from hypogoal.meta.training import LEARNERS
+from hypogoal.learners.episodes import LAST
 from hypogoal.options import light, recurrent
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.learner import load_learner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.recording import EXECUTIONS_KEPT, Recorder
+from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import Terminations
 
 QUICK: dict[str, Any] = {
@@ -42,7 +43,7 @@ def learned(network: str, **changes: Any) -> tuple[OptionLoop, dict[str, torch.T
     """Options whose sub-goals never hold, after some updates, and their weights."""
     engine, config = Endless(3), OptionConfig(**{**QUICK, **changes})
     never = Terminations(lambda ids: np.zeros((len(ids), 2), np.bool_), 2)
-    learner = LEARNERS[network](engine, never, config, seed=1, device="cpu")
+    learner = load_learner(network)(engine, never, config, seed=1, device="cpu")
     loop = OptionLoop(
         engine, never, learner, RandomChooser(rng_for(0, "choice")), Recorder(2, engine, 100), config, gamma=0.9
     )
@@ -84,4 +85,4 @@ def test_after_a_break_no_more_executions_are_kept_than_before() -> None:
     """Spec F3: the last of each option; also when they were read back."""
     loop, _ = learned("light")
     loop.recorder.restore(loop.recorder.snapshot())
-    assert [kept.maxlen for kept in loop.recorder.executions] == [EXECUTIONS_KEPT] * 2
+    assert [kept.maxlen for kept in loop.recorder.executions] == [LAST] * 2

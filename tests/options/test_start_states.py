@@ -11,14 +11,16 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
+from hypogoal.learners.episodes import LAST
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork, PictureEmbedding, Pixels
 from hypogoal.options.policies import make_policies
-from hypogoal.options.recording import EXECUTION_COLUMNS, EXECUTIONS_KEPT, Recorder
+from hypogoal.options.recording import Recorder
 from hypogoal.options.recurrent import RecurrentLearner
+from hypogoal.options.tables import Executions
 from hypogoal.options.termination import oracle_terminations
 
 LEFT, RIGHT, STAY = 2, 3, 0
@@ -73,7 +75,7 @@ def play(engine, actions, options, **changes):
 def columns(folder: Path) -> list[dict[str, int]]:
     with (folder / "executions.csv").open(newline="") as file:
         reader = csv.DictReader(file)
-        assert tuple(reader.fieldnames) == EXECUTION_COLUMNS
+        assert tuple(reader.fieldnames) == Executions.names()
         return [{name: int(value) for name, value in row.items()} for row in reader]
 
 
@@ -126,7 +128,7 @@ def test_executions_that_begin_on_the_way_are_no_executions_of_figure_4(tmp_path
     assert 0.4 < proper / len(chooser.began) < 0.6
     recorder.write_executions(tmp_path, lambda positions: positions[:, 1])
     rows = columns(tmp_path)
-    assert len(rows) == EXECUTIONS_KEPT < proper
+    assert len(rows) == LAST < proper
     assert {row["duration"] for row in rows} == {2}, "from the cell on the way it takes one"
     assert [row["step"] for row in rows] == sorted(row["step"] for row in rows)
     assert rows[-1]["step"] > steps - 20
@@ -228,9 +230,9 @@ def test_forgotten_states_are_not_learned_from() -> None:
     learner.act = lambda ids, options, age, **_: np.zeros(len(ids), np.int64)  # from now on nothing is reached
     for _ in range(150):
         loop.step()
-    assert not engine.remembers(learner.positive["next"][learner.positive["next"] > 0]).any()
+    assert not engine.remembers(learner.positive.next_state[learner.positive.next_state > 0]).any()
     batch, indices, weights = learner._batch()
-    assert engine.remembers(batch["s"]).all() and engine.remembers(batch["next"]).all()
+    assert engine.remembers(batch.state).all() and engine.remembers(batch.next_state).all()
     assert len(indices) == len(weights) == config.option_batch, "all of it from the replay"
 
 

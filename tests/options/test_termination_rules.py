@@ -143,8 +143,8 @@ def test_what_dwelling_teaches_is_the_last_yes(learner: type[LightLearner] | typ
     for _ in range(200):
         loop.advance()
     replay = loop.learner.replay if isinstance(loop.learner, LightLearner) else loop.learner.members[0].replay
-    data = {name: values[: replay.size] for name, values in replay.data.items()}
-    assert 0 < data["reached"].sum() < (LOG_ODDS[data["next"], 0] > 1.5).sum()
+    data = {name: values[: replay.size] for name, values in vars(replay.data).items()}
+    assert 0 < data["reached"].sum() < (LOG_ODDS[data["next_state"], 0] > 1.5).sum()
     count = loop.learner.positives
     assert count[0] == data["reached"].sum() and count[1] == 0
 

@@ -10,8 +10,8 @@ from toy_data import fill, reseal
 from hypogoal.cli import main
 from hypogoal.core.artefacts import create_artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
+from hypogoal.core.files import write_table
 from hypogoal.evaluation.compare import labels_of
-from hypogoal.options.recording import write_table
 from hypogoal.stages.compare import compare
 from hypogoal.stages.evaluate import evaluate
 

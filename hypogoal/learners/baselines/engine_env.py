@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.dataset import PICTURE, Observations, standardised
 from hypogoal.domains.base import Engine, Step, step_of
-from hypogoal.learners.episodes import Episodes
+from hypogoal.learners.episodes import EpisodeRecorder
 
 
 class Bonus(Resumable):
@@ -70,7 +70,7 @@ class EngineEnv(VecEnv):
         low, high = (0, 255) if first.dtype == PICTURE else (-math.inf, math.inf)
         space: Any = spaces.Box(low, high, first.shape[1:], first.dtype.type)
         super().__init__(engine.count, space, spaces.Discrete(engine.n_actions))
-        self.episodes = Episodes(engine.count)
+        self.episodes = EpisodeRecorder(engine.count)
         self._actions = np.zeros(engine.count, dtype=np.int64)
 
     def _observe(self, ids: NDArray[np.int64]) -> Observations:
@@ -105,8 +105,8 @@ class EngineEnv(VecEnv):
 
     def snapshot(self) -> dict[str, Any]:
         """What a resumed run needs to go on exactly; of engines that have a ``snapshot``."""
-        own = {"engine": self.engine.kept(), "episodes": self.episodes.snapshot()}
-        return {**own, "bonus": self.bonus.snapshot()} if self.bonus else own
+        state = {"engine": self.engine.kept(), "episodes": self.episodes.snapshot()}
+        return {**state, "bonus": self.bonus.snapshot()} if self.bonus else state
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of environments made with the same arguments."""

@@ -1,0 +1,41 @@
+"""Returns and advantages of decisions that last several steps (Spec E1)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def smdp_advantages(
+    returns: NDArray[np.float64],
+    discounts: NDArray[np.float64],
+    values: NDArray[np.float64],
+    next_values: NDArray[np.float64],
+    terminated: NDArray[np.bool_],
+    ended: NDArray[np.bool_],
+    trace: float,
+) -> NDArray[np.float64]:
+    """Spec E1: generalised advantages of consecutive decisions of one environment.
+
+    delta_t = R_t + gamma^tau_t (1 - terminated_t) V(s'_t) - V(s_t);
+    A_t = delta_t + gamma^tau_t lambda (1 - ended_t) A_{t+1}.
+
+    Args:
+        returns: R_t, rewards inside the option, discounted from its start, (T,).
+        discounts: gamma ** tau_t, (T,).
+        values: V(s_t), (T,).
+        next_values: V of the state reached, (T,).
+        terminated: nothing follows the state reached, (T,).
+        ended: the episode ended there, for whatever reason, (T,).
+        trace: lambda.
+
+    Returns:
+        A_t, (T,).
+
+    Source: Schulman et al. 2016 (GAE) with the SMDP discount of Sutton, Precup and Singh 1999.
+    """
+    advantages = np.zeros(len(returns))
+    following = 0.0
+    for t in reversed(range(len(returns))):
+        delta = returns[t] + discounts[t] * (not terminated[t]) * next_values[t] - values[t]
+        following = delta + discounts[t] * trace * (not ended[t]) * following
+        advantages[t] = following
+    return advantages

@@ -1,0 +1,38 @@
+"""Parts of an agent that a setting names: choosers, learners, policy views, termination rules."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypeVar
+
+from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.errors import UserError
+from hypogoal.core.own_code import load_own
+from hypogoal.options.config import OptionConfig
+
+if TYPE_CHECKING:
+    from hypogoal.domains.base import Engine
+
+
+class Part(Resumable):
+    """A part of an agent. Its class knows which settings and engines it works with."""
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
+
+
+Kind = TypeVar("Kind", bound=Part)
+
+
+def load_part(name: str, kind: str, base: type[Kind], built_in: Mapping[str, str]) -> type[Kind]:
+    """The subclass of ``base`` called ``name``: built-in, an installed entry point, or ``module:Class``.
+
+    Entry points of choosers are in the group ``hypogoal.choosers``, and so on. Anything else, and code that the user
+    did not allow, is a ``UserError`` that says which ``kind`` of part is meant.
+    """
+    part = load_own(name, kind, f"hypogoal.{kind.replace(' ', '_')}s", built_in)
+    if not (inspect.isclass(part) and issubclass(part, base)):
+        raise UserError(f"this is no {kind}", name, f"Give a subclass of {base.__module__}.{base.__name__}.")
+    return part

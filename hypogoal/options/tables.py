@@ -1,0 +1,174 @@
+"""The tables of trained agents and options, each one class that writes and reads its CSV file (Spec E5, F3, F5, H5)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hypogoal.core.columns import Columns
+from hypogoal.core.errors import UserError
+from hypogoal.core.files import read_text, write_table
+from hypogoal.learners.episodes import LAST
+
+AGAIN = "Evaluate the run again."
+MAX_TABLE_BYTES = 2**30
+MAX_INTEGER = 2**53  # integers that a float holds exactly
+MAX_OPTIONS = 2**16
+BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
+
+
+@dataclass(frozen=True)
+class Table(Columns):
+    """Columns (n,) of a file; it may lack one that has a default."""
+
+    FILE: ClassVar[str]
+
+    @classmethod
+    def of_rows(cls, rows: Iterable[Sequence[float]]) -> Self:
+        """A table of rows, each with a number for every column."""
+        listed = list(rows)
+        columns = zip(*listed, strict=True) if listed else [()] * len(cls.names())
+        return cls.cast(*columns)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The table in a file; a ``UserError`` where it is missing or damaged, see :func:`read_table`."""
+        optional = [field.name for field in fields(cls) if field.default is not MISSING]
+        required = [name for name in cls.names() if name not in optional]
+        columns, types = read_table(path, required, optional), cls.types()
+        return cls(**{name: values.astype(types[name]) for name, values in columns.items()})
+
+    def write(self, folder: Path) -> None:
+        """The file of this table into ``folder``; a NaN is an empty cell."""
+        rows = [["" if value != value else value for value in row] for row in self.rows()]
+        write_table(folder / self.FILE, self.names(), rows)
+
+    def rows(self) -> list[tuple[Any, ...]]:
+        """Plain numbers, row by row; truth values are 0 and 1."""
+        columns = [getattr(self, name) for name in self.names()]
+        lists = [(values.astype(np.int64) if values.dtype == np.bool_ else values).tolist() for values in columns]
+        return list(zip(*lists, strict=True))
+
+
+@dataclass(frozen=True)
+class Episodes(Table):
+    """Training episodes in the order in which they ended."""
+
+    FILE = "episodes.csv"
+
+    step: NDArray[np.int64]  # environment steps when it ended, summed over parallel environments and stages
+    length: NDArray[np.int64]  # steps
+    reward: NDArray[np.float64]  # undiscounted
+    terminated: NDArray[np.bool_]  # it reached a terminal state; else it was cut at the cap
+    # Spec F5: as its domain says; else, and in older tables without this column, terminated with a reward: an agent
+    # that dies reaches a terminal state too.
+    succeeded: NDArray[np.bool_] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.succeeded is None:
+            object.__setattr__(self, "succeeded", self.terminated & (self.reward > 0))  # type: ignore[unreachable]
+
+    def last(self, count: int = LAST) -> Episodes:
+        """The last ``count`` episodes, or all where there are fewer."""
+        return self.at(slice(max(0, len(self.step) - count), None))
+
+
+@dataclass(frozen=True)
+class Choices(Table):
+    """Choices of options: one row per option and window of steps that ends at ``step``."""
+
+    FILE = "choices.csv"
+
+    step: NDArray[np.int64]
+    option: NDArray[np.int64]  # g*K + k
+    offered: NDArray[np.int64]  # decisions in which it was offered
+    chosen: NDArray[np.int64]  # decisions for it
+    expected: NDArray[np.float64]  # decisions for it under uniform-random choice
+    reached: NDArray[np.int64]  # executions that reached its sub-goal
+    duration: NDArray[np.int64]  # steps of its executions
+
+    def total(self, name: str, options: int) -> NDArray[np.float64]:
+        """The sum of column ``name`` over all windows, (O,)."""
+        return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Executions(Table):
+    """The last executions of each option, in the order in which they ended."""
+
+    FILE = "executions.csv"
+
+    step: NDArray[np.int64]  # environment steps when it ended
+    option: NDArray[np.int64]  # g*K + k
+    duration: NDArray[np.int64]  # steps
+    reached: NDArray[np.bool_]  # its own termination classifier ended it
+    inside_at_start: NDArray[np.bool_]  # that classifier's prediction was positive where it began
+    terminated: NDArray[np.bool_]  # the episode ended in a terminal state: the agent died
+    room: NDArray[np.int64]  # where it stopped; x and y too
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    distance: NDArray[np.int64]  # from there to the nearest true sub-goal, in the domain's units
+
+    def of(self, option: int, last: int = LAST) -> Executions:
+        """The last executions of one option."""
+        return self.at(np.flatnonzero(self.option == option)[-last:])
+
+    def positions(self) -> NDArray[np.int64]:
+        """Where they stopped, (n, 3)."""
+        return np.stack([self.room, self.x, self.y], axis=1)
+
+
+@dataclass(frozen=True)
+class Exploits(Table):
+    """Of the same executions, how sure their own classifiers were at most."""
+
+    FILE = "exploits.csv"
+
+    step: NDArray[np.int64]  # environment steps when it ended
+    option: NDArray[np.int64]  # g*K + k
+    reached: NDArray[np.bool_]  # its own termination classifier ended it
+    near: NDArray[np.bool_]  # that was near its true sub-goal
+    best_near: NDArray[np.float64]  # highest log-odds near the true sub-goal; NaN where it did not come near
+    best_far: NDArray[np.float64]  # highest log-odds far from it; NaN where it always was near
+
+
+def read_table(
+    path: Path, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
+) -> dict[str, NDArray[np.float64]]:
+    """Columns of a table of numbers, a CSV file with a header; float (n,) each.
+
+    ``columns`` are required, None for all that the file has; ``optional`` ones are read where the file has them. A file
+    that is missing, too large, no table, or has other cells than finite numbers of at most 2^53 (or, in a ``BLANK``
+    column, nothing) is a ``UserError``.
+    """
+    text = read_text(path, "the table is", AGAIN, MAX_TABLE_BYTES)
+    try:
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        header = list(reader.fieldnames or ())
+        columns = header if columns is None else [*columns, *(name for name in optional if name in header)]
+        if not set(columns) <= set(header):
+            raise KeyError(path)
+        rows = [[_number(row[name], name) for name in columns] for row in reader]
+    except (ValueError, KeyError, TypeError, csv.Error):
+        raise UserError("the table is damaged", path, AGAIN) from None
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(columns))
+    # A NaN elsewhere is no number, and an integer column must not lose digits.
+    if not ((np.abs(values) < MAX_INTEGER) | (np.isnan(values) & np.isin(columns, BLANK))).all():
+        raise UserError("a number in the table is missing or too large", path, AGAIN)
+    table = {name: values[:, index] for index, name in enumerate(columns)}
+    options = table.get("option", np.zeros(0))
+    if not ((options >= 0) & (options < MAX_OPTIONS)).all():
+        raise UserError("an option in the table has an impossible number", path, AGAIN)
+    return table
+
+
+def _number(cell: str, column: str) -> float:
+    return math.nan if cell == "" and column in BLANK else float(cell)

@@ -1,0 +1,183 @@
+"""A chooser, a learner, a policy view and a termination rule of one's own: one class each, and no other file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hypogoal.cli import main
+from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
+from hypogoal.domains.base import Engine
+from hypogoal.meta.episodes import agent_of, play_episode
+from hypogoal.options.choosers import Chooser, Ids, Offered
+from hypogoal.options.config import OptionConfig
+from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.policy_views import Pictures, PolicyView
+from hypogoal.options.tables import Choices
+from hypogoal.options.termination import Terminations
+from hypogoal.stages import train_meta, train_options
+
+FEW = ["--set", "steps=300", "--set", "environments=4", "--set", "random_episodes=5", "-q"]
+
+
+class FirstOffered(Chooser):
+    """It takes the first option offered."""
+
+    def choose(self, environments: Ids, ids: Ids, offered: Offered) -> Ids:
+        return offered.argmax(1)
+
+
+class Straight(Learner):
+    """Every option plays its number modulo the actions; it counts the steps and learns nothing."""
+
+    @classmethod
+    def refuse(cls, config: OptionConfig, engine: Engine) -> None:
+        super().refuse(config, engine)
+        if config.experience != "shared":
+            raise UserError("straight options have no experience", f"experience={config.experience}", "Leave it out.")
+
+    def build(self, config: OptionConfig, seed: int) -> None:
+        self.preferred = np.arange(self.options) % len(self.actions)
+
+    @staticmethod
+    def reach(config: OptionConfig, options: int) -> int:
+        return 0
+
+    def greedy(self, ids: Ids, options: Ids, age: Ids) -> Ids:
+        return self.preferred[options]
+
+    def observe(self, moved: Transitions) -> None:
+        self.count(moved.options)
+
+    def learn(self) -> dict[str, float]:
+        return {}
+
+    def weights(self) -> dict[str, Tensor]:
+        return {}
+
+    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
+        pass
+
+
+class UpperHalf(PolicyView):
+    """The upper half of the picture."""
+
+    def __init__(self, shape: tuple[int, ...]):
+        self.shape = (shape[0] // 2, *shape[1:])
+
+    def see(self, pictures: Pictures, ids: NDArray[np.int64] | None = None) -> Pictures:
+        return pictures[:, : self.shape[0]]
+
+
+class AtLeast(Terminations):
+    """No execution reaches its sub-goal in its first ``length`` steps."""
+
+    LENGTH = "STEPS"
+
+    def reached(self, ids: NDArray[np.int64], options: NDArray[np.int64], age: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return self.of_running(ids, options) & (age >= self.length)
+
+
+@pytest.fixture(scope="module")
+def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("own-parts")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+        data = str(folder / "data.h5")
+        assert main(["collect", "corridor_env:DOMAIN", "--out", data, "-q"]) == 0
+        few = ["--set", "steps=5", "--set", "members=2", "--set", "workers=1", "-q"]
+        assert main(["train-ensemble", data, "--out", str(folder / "ensemble"), *few]) == 0
+    return folder / "ensemble"
+
+
+@pytest.fixture(autouse=True)
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
+
+
+def train(stage: str, ensemble: Path, out: Path, *settings: str) -> dict[str, Any]:
+    """The configuration of what a stage makes with these settings."""
+    words = [word for setting in settings for word in ("--set", setting)]
+    assert main([stage, str(ensemble), "--out", str(out), *FEW, *words]) == 0
+    return open_artefact(out).whole().config
+
+
+OWN = {"chooser": "FirstOffered", "network": "Straight", "policy_view": "UpperHalf", "termination": "AtLeast:3"}
+
+
+@pytest.mark.parametrize("stage", ["train-options", "train-meta"])
+@pytest.mark.parametrize("setting", OWN)
+def test_one_file_is_enough(setting: str, stage: str, ensemble: Path, tmp_path: Path) -> None:
+    """Spec A3, A4, G2: the setting names the class; what is trained is played again where the user allows it."""
+    name = f"{__name__}:{OWN[setting]}"
+    assert train(stage, ensemble, tmp_path / "made", f"{setting}={name}")[setting] == name
+    if setting == "chooser":
+        choices = Choices.read(tmp_path / "made" / "choices.csv")
+        np.testing.assert_array_equal(choices.total("chosen", 1)[0], choices.total("offered", 1)[0])
+    if stage == "train-meta":
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("HYPOGOAL_TRUST", f"corridor_env:DOMAIN,{name}")
+            assert len(play_episode(agent_of(open_artefact(tmp_path / "made"), seed=0))) > 1
+        with pytest.raises(UserError, match="names code of its own"):
+            agent_of(open_artefact(tmp_path / "made"), seed=0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        (["network={}:Straight", "experience=own"], "straight options have no experience: experience=own"),
+        (["chooser={}:Straight"], "this is no chooser"),
+        (["chooser={}:Missing"], "the chooser cannot be loaded"),
+        (["termination={}:AtLeast"], "unknown termination"),
+        (["network={}:Straight", "policy_view={}:UpperHalf"], "only the light network sees windows"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(
+    settings: list[str], fault: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G2: exit code 2, nothing written."""
+    words = [word for setting in settings for word in ("--set", setting.format(__name__))]
+    assert main(["train-options", str(ensemble), "--out", str(tmp_path / "out"), *FEW, *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert fault in line and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        (["entropy=0.1", "chooser=random"], "does nothing with chooser=random: entropy=0.1"),
+        (["persistence=3"], "does nothing with exploration=independent: persistence=3.0"),
+        (["initiation_ignored=0.2"], "does nothing with initiation=anywhere: initiation_ignored=0.2"),
+        (["replay=500", "network=planned"], "does nothing with network=planned: replay=500"),
+    ],
+)
+def test_settings_that_do_nothing_are_refused(
+    settings: list[str], fault: str, ensemble: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Spec G2: where they were given; those of a preset, or of an experiment for all its cells, pass."""
+    words = [word for setting in settings for word in ("--set", setting)]
+    command = ["train-meta", str(ensemble), "--out", str(tmp_path / "out"), *FEW]
+    assert main([*command, *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert fault in line and not any(tmp_path.iterdir())
+    preset = tmp_path / "all.toml"
+    preset.write_text("[train-meta]\nentropy = 0.1\n")
+    assert main([*command, "--preset", str(preset), "--set", "chooser=random"]) == 0
+
+
+@pytest.mark.parametrize("stage", [train_options, train_meta])
+def test_what_is_complete_is_not_built_again(
+    stage: Any, ensemble: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spec A6, G1: ``--resume`` looks at the manifest, and makes neither engine nor networks."""
+    command = [stage.__name__.rpartition(".")[2].replace("_", "-"), str(ensemble), "--out", str(tmp_path / "out"), *FEW]
+    assert main(command) == 0
+    monkeypatch.setattr(stage, "assemble", None)
+    assert main([*command, "--resume"]) == 0
