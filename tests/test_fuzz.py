@@ -31,7 +31,7 @@ def test_every_case_is_read_or_refused(box: Sandbox, name: str) -> None:
 def test_a_crash_would_be_seen(box: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
     """The harness itself: an exception that is no UserError escapes."""
     box.fresh()
-    monkeypatch.setattr("hypogoal.evaluation.run.read_text", lambda *_: [][0])
+    monkeypatch.setattr("hypogoal.options.tables.read_text", lambda *_: [][0])
     with pytest.raises(IndexError):
         FORMATS["tables"](box, random.Random(1), 1)
 

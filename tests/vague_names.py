@@ -14,7 +14,7 @@ VAGUE = frozenset((
     "told", "found", "about", "given", "here", "there", "own", "of", "made", "known", "said", "asked", "what", "one",
     "yes", "chance",
 ))  # fmt: skip
-LIMIT = 0.2
+LIMIT = 0.02
 WORST = 10
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

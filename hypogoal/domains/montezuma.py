@@ -90,7 +90,7 @@ class MontezumaConfig:
     unlabelled_from: str = setting(
         "expert",
         "who plays in the unlabelled rooms: the labelled states' expert, or uniform-random actions from their sides",
-        source="expert: own choice; random: the paper's suggestion (B7)",
+        source="expert: own choice; random: the paper's suggestion",
         choices=PLAYS,
     )
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)

@@ -134,7 +134,7 @@ def _goal(material: Material, source: Entry, sub_goal: str) -> dict[str, Any]:
                 ("balanced accuracy, held-out", page.fixed(member["balanced_accuracy"], 3)),
                 ("precision", page.fixed(member["precision"], 3)),
                 ("recall", page.fixed(member["recall"], 3)),
-                ("says yes, unlabelled states", page.percent(member["says_yes_unlabelled"])),
+                ("positive, unlabelled states", page.percent(member["says_yes_unlabelled"])),
             ],
             "options": _options(material, source["path"], sub_goal, member["member"]),
         }
@@ -189,7 +189,7 @@ def _chosen(material: Material, run: Entry, goal: Entry, member: int, settings: 
         "note": f"{notes[0]} preferred of its sub-goal" if notes else "",
         "facts": [
             ("chosen", f"{option['chosen']:,} of {option['offered']:,} offers"),
-            ("preference", f"{page.fixed(option['preference'], 2)} (1: as by chance)"),
+            ("preference", f"{page.fixed(option['preference'], 2)} (1: as in uniform-random choice)"),
             ("its classifier ended it", f"{option['reached']:,} times"),
             ("mean steps", page.fixed(option["duration"], 1)),
             ("match on this layout", page.fixed(option["match"], 2)),

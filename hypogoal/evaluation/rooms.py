@@ -248,7 +248,7 @@ def _table(rows: Sequence[Entry]) -> Block:
 
 
 def _never(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What accuracy on all rooms is worth here: that of a member that never says yes, by N."""
+    """What accuracy on all rooms is worth here: that of a member that is never positive, by N."""
     accuracies = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
     every = sorted(accuracies.items(), key=str)
     texts = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]

@@ -121,7 +121,7 @@ class OnLayout(NamedTuple):
     """The members of an ensemble, as options, on the states of layouts.
 
     ``match``, float (G*K,), is their balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal,
-    which the user's own labels told: its truth there is not known. ``sets`` has of options that say yes anywhere how it
+    which the user's own labels told: its truth there is not known. ``sets`` has, of options that are positive anywhere, how it
     looks there, an :func:`overlay`, and in how many states; of pictures only.
     """
 
@@ -259,7 +259,7 @@ def choices_section(material: Material, agent: Entry) -> Block:
         f"for the random chooser if there is one. '{choosing.TITLE}' says what the choices gain."
     )
     stops = (
-        "A picture lays over each other all states of the layout in which a member says yes, where its option ends: "
+        "A picture lays over each other all states of the layout in which a member is positive, where its option ends: "
         "what all of them share is sharp, what few of them show is dim. For each sub-goal it shows the member that the "
         "agent prefers most and the one that it prefers least."
     )
@@ -293,7 +293,7 @@ def figures(material: Material) -> Iterator[Drawn]:
         caption = (
             f"{title} of the paper: overlaid termination states of {goal['sub_goal']}, of the member that the agent "
             f"prefers most and of the one it prefers least ({run['path']}, {where}): all states of the layout that are "
-            "known and in which the member says yes. Preference: chosen / expected under uniform "
+            "known and in which the member is positive. Preference: chosen / expected under uniform "
             f"choice; match: balanced accuracy on that layout. {which(agent, selection) if agent else ''}"
         ).rstrip()
         drawn = termination_states([(f"{title}\n{note}", image) for title, note, image in sides])
@@ -303,13 +303,13 @@ def figures(material: Material) -> Iterator[Drawn]:
 def termination_states(sides: Sequence[tuple[str, NDArray[np.uint8] | None]]) -> Figure:
     """Figures 7 and 8: overlaid termination states of some members, the most preferred first.
 
-    A side is a title and an overlay uint8 (H, W, C), None where the member says yes nowhere.
+    A side is a title and an overlay uint8 (H, W, C), None where the member is positive nowhere.
     """
     figure, places = grid_of_pictures(1, max(2, len(sides)), PICTURE_TITLE)
     for place, (title, image) in zip(places, sides, strict=False):
         if image is None:
             place.set_title(title, fontsize=9)
-            place.text(0.5, 0.5, "says yes\nnowhere", ha="center", va="center", color=GREY)
+            place.text(0.5, 0.5, "positive\nnowhere", ha="center", va="center", color=GREY)
         else:
             show_picture(place, image, title)
     return figure

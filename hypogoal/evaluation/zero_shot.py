@@ -1,6 +1,6 @@
 """Trained agents, and each of their options alone, on layouts that they are given: nothing is learned there (Spec H6).
 
-What limits an agent, its options tell: they stop where their members are wrong (a wrong yes), or get nowhere in time.
+What limits an agent, its options tell: they stop at a false positive of their member, or get nowhere in time.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def shortest_ways(engine: Engine) -> NDArray[np.float64]:
 
 
 def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64]) -> Played:
-    """``OF_OPTIONS`` of an option, begun where episodes begin and again when its time is up, till its member says yes.
+    """``OF_OPTIONS`` of an option, begun where episodes begin and again when its time is up, until its member is positive.
 
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
@@ -179,7 +179,7 @@ OPTIONS = (
     page.label("sub-goal", "sub_goal", once=lambda entry: (entry["agent"], entry["sub_goal"])),
     page.number("member", "member"),
     *SCORES,
-    page.number("wrong yes, %", "wrong_yes", page.interval, 0, 100),
+    page.number("false positives, %", "wrong_yes", page.interval, 0, 100),
 )
 
 
@@ -202,10 +202,10 @@ def sections(material: Material) -> list[Block]:
     layouts = zero_shot["layouts"]
     text = (
         f"Trained agents play {len(layouts)} layouts ({layouts[0]} to {layouts[-1]}), {EPISODES} episodes each, and "
-        "nothing is learned: options are greedy, choices drawn as in training; so does chance among the same options. "
+        "nothing is learned: options are greedy, choices drawn as in training; so are uniform-random choices among the same options. "
         "Each option also plays alone, from where episodes begin and again when its time is up, until its own member "
-        f"says yes or {PATIENCE} times its timeout is over. It succeeds where its true sub-goal holds then; elsewhere "
-        "it was a wrong yes, and what is left of 100 % never got a yes."
+        f"is positive or {PATIENCE} times its timeout is over. It succeeds where its true sub-goal holds then; elsewhere "
+        "it was a false positive; the rest of 100 % never had a positive prediction."
     )
     caption = f"Over layouts. Trained on: how many of these layouts its training drew from, too. {page.INTERVALS}"
     tables = [page.table(AGENTS, zero_shot["agents"], caption=caption.format(units="layouts"))]
@@ -224,6 +224,6 @@ QUESTION = Question(
             "share (scope zero-shot) that succeeded within twice the shortest path: of an agent's episodes on a layout "
             "that it was given, or an option's that began there, to its true sub-goal; near: within 1.5 of it",
         ),
-        "wrong_yes": ("fraction", "share of an option's executions alone whose member says yes elsewhere"),
+        "wrong_yes": ("fraction", "share of an option's executions alone that end at a false positive"),
     },
 )

@@ -87,7 +87,7 @@ def play_episode(loop: OptionLoop) -> list[Frame]:
         )
         frames.append(Frame(before[0], step, option, before[1], left + 1, ""))
         if moved.ended[0]:
-            why = "its classifier says yes" if after[1] else "the episode is cut"
+            why = "its classifier is positive" if after[1] else "the episode is cut"
             why = "the task is over" if moved.terminated[0] else "its time is up" if moved.timed_out[0] else why
             frames.append(Frame(after[0], step + 1, option, after[1], left, why))
     return frames

@@ -95,7 +95,7 @@ class Options:
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A Gymnasium environment whose actions are options (Spec E1): ``Discrete(G*K)``.
 
-    One step runs an option until its classifier says yes, its time is up or the episode ends. The reward is the sum
+    One step runs an option until its classifier is positive, its time is up or the episode ends. The reward is the sum
     of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so that an agent can bootstrap with
     gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached, ``info["option"]`` its name.
 

@@ -46,7 +46,7 @@ def train_baseline(
     if ensemble and not config.bonus:
         raise UserError("an ensemble without a bonus changes nothing", ensemble, "Give --set bonus=0.1 too.")
     if config.bonus and not ensemble:
-        what = "a bonus is paid where an ensemble's members say yes"
+        what = "a bonus is paid where an ensemble's members are positive"
         raise UserError(what, f"bonus={config.bonus:g}", "Give --ensemble too, or leave bonus out.")
     taught = open_artefact(ensemble, "ensemble").whole() if ensemble else None
     if taught and taught.config["domain"] != domain:

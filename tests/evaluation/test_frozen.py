@@ -124,7 +124,7 @@ def test_play_teaches_nothing() -> None:
     config = TrainMetaConfig(network="planned")
     truth = planted(engine)
     patience = Patience(truth.classify, 15, None, None, engine.count, 3)
-    learner = PlannedLearner(engine, patience, config, seed=0)
+    learner = PlannedLearner(engine, truth, config, seed=0)
     initiation = Initiation(engine, 15, config, 0)
     chooser = ThompsonChooser(15, 16, np.random.default_rng(0))
     patience.thresholds = np.full(15, 0.5, np.float32)

@@ -46,7 +46,7 @@ def test_figures_7_and_8_say_where_a_classifier_never_ended_an_option():
     drawn = termination_states([("most preferred: member 1", overlay), ("least preferred: member 0", None)])
     assert pictures(drawn) == 1
     svg = to_svg(drawn, "a")
-    assert "most preferred: member 1" in svg and "says yes" in svg
+    assert "most preferred: member 1" in svg and "positive" in svg
 
 
 @pytest.mark.parametrize(("kind", "start"), [("svg", b"<svg"), ("pdf", b"%PDF"), ("png", b"\x89PNG")])

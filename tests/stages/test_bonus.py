@@ -117,7 +117,7 @@ def test_a_bonus_and_an_ensemble_belong_together(corridor: Path, capsys: pytest.
     """One line that says what to give; an ensemble of another domain is refused, too."""
     out, ensemble = str(corridor / "refused"), ["--ensemble", str(corridor / "ensemble")]
     cases = (
-        ([NAME, "--set", "bonus=.1"], "a bonus is paid where an ensemble's members say yes: bonus=0.1."),
+        ([NAME, "--set", "bonus=.1"], "a bonus is paid where an ensemble's members are positive: bonus=0.1."),
         ([NAME, *ensemble], "an ensemble without a bonus changes nothing"),
         (["doorkey", *ensemble, "--set", "bonus=.1"], "this ensemble is for 'own_domain:DOMAIN', not for 'doorkey'"),
     )

@@ -73,7 +73,7 @@ def test_an_episode_is_whole(frames):
     for frame in frames:
         if frame.ended == "its time is up":
             assert frame.left == 0 and not frame.says_yes
-        if frame.ended == "its classifier says yes":
+        if frame.ended == "its classifier is positive":
             assert frame.says_yes
 
 

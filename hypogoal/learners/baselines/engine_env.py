@@ -21,7 +21,7 @@ class Bonus(Resumable):
     The state in which an episode begins is not judged, the one in which it ends is.
 
     Args:
-        verdicts: state ids (n,) -> whether the O members say yes, bool (n, O).
+        verdicts: state ids (n,) -> whether the O members are positive, bool (n, O).
         members: O, of all sub-goals together.
         environments: E.
         size: reward for each first yes.

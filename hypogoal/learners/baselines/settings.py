@@ -93,7 +93,7 @@ class BaselineConfig:
     )
     bonus: float = setting(
         0.0,
-        "reward for the first time in an episode that a member of --ensemble says yes; 0 for none",
+        "reward for the first time in an episode that a member of --ensemble is positive; 0 for none",
         source="ours: a flat agent with the same knowledge",
         low=0.0,
     )
