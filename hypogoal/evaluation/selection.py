@@ -120,9 +120,9 @@ def selection_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
 class OnLayout(NamedTuple):
     """The members of an ensemble, as options, on the states of layouts.
 
-    ``match``, float (G*K,), is their balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal,
-    which the user's own labels told: its truth there is not known. ``sets`` has, of options that are positive anywhere, how it
-    looks there, an :func:`overlay`, and in how many states; of pictures only.
+    ``match``, float (G*K,), is their balanced accuracy (Spec F6), NaN where the domain does not have the sub-goal but
+    the user's own labels do: its truth is unknown there. ``sets``, of pictures only, has for options that are positive
+    anywhere an :func:`overlay` of the states in which they are, and their number.
     """
 
     match: NDArray[np.float64]

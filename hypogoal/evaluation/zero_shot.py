@@ -53,7 +53,7 @@ def shortest_ways(engine: Engine) -> NDArray[np.float64]:
 
 
 def alone(loop: OptionLoop, option: int, goal: int, shortest: NDArray[np.float64]) -> Played:
-    """``OF_OPTIONS`` of an option, begun where episodes begin and again when its time is up, until its member is positive.
+    """``OF_OPTIONS`` of an option, begun where episodes begin and anew at each timeout until its member is positive.
 
     It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
     the beginning.
@@ -201,11 +201,11 @@ def sections(material: Material) -> list[Block]:
         return []
     layouts = zero_shot["layouts"]
     text = (
-        f"Trained agents play {len(layouts)} layouts ({layouts[0]} to {layouts[-1]}), {EPISODES} episodes each, and "
-        "nothing is learned: options are greedy, choices drawn as in training; so are uniform-random choices among the same options. "
-        "Each option also plays alone, from where episodes begin and again when its time is up, until its own member "
-        f"is positive or {PATIENCE} times its timeout is over. It succeeds where its true sub-goal holds then; elsewhere "
-        "it was a false positive; the rest of 100 % never had a positive prediction."
+        f"Trained agents play {len(layouts)} layouts ({layouts[0]} to {layouts[-1]}), {EPISODES} episodes each, "
+        "without learning: options are greedy, choices drawn as in training. Uniform-random choice among the same options "
+        "plays them, too. Each option also plays alone, from where episodes begin and anew at each timeout, until its member "
+        f"is positive or for {PATIENCE} timeouts. It succeeds if its true sub-goal holds then; if not, its member's "
+        "prediction was a false positive. The rest of 100 % never had a positive prediction."
     )
     caption = f"Over layouts. Trained on: how many of these layouts its training drew from, too. {page.INTERVALS}"
     tables = [page.table(AGENTS, zero_shot["agents"], caption=caption.format(units="layouts"))]
