@@ -204,8 +204,8 @@ def sections(material: Material) -> list[Block]:
         f"Trained agents play {len(layouts)} layouts ({layouts[0]} to {layouts[-1]}), {EPISODES} episodes each, "
         "without learning: options are greedy, choices drawn as in training. Uniform-random choice among the same "
         "options plays them, too. Each option also plays alone, from where episodes begin and anew at each timeout, "
-        f"until its member is positive or for {PATIENCE} timeouts. It succeeds if its true sub-goal holds then; if not, its member's "
-        "prediction was a false positive. The rest of 100 % never had a positive prediction."
+        f"until its member is positive or for {PATIENCE} timeouts. It succeeds if its true sub-goal holds then; "
+        "if not, its member's prediction was a false positive. The rest of 100 % never had a positive prediction."
     )
     caption = f"Over layouts. Trained on: how many of these layouts its training drew from, too. {page.INTERVALS}"
     tables = [page.table(AGENTS, zero_shot["agents"], caption=caption.format(units="layouts"))]
