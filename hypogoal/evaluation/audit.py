@@ -1,7 +1,8 @@
 """How often policies fool a success classifier, and where (Spec H5).
 
-A classifier can be right on nearly all states that are met, and wrong where a policy stops that was trained to have it
-say yes. So options are learned that end where it does, and of their executions the truth is asked.
+A classifier can be right in nearly all states that are met, and wrong where a policy stops that was trained to reach
+its positive predictions. So options are learned that end at these, and the truth of each of their executions is looked
+up.
 """
 
 from __future__ import annotations
