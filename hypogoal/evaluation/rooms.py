@@ -242,7 +242,7 @@ def _table(rows: Sequence[Entry]) -> Block:
         tight=True,
         caption="Balanced accuracy on held-out states of unseen rooms of the best, the validated, the mean and the "
         "worst member; accuracy (acc.) of the best one on those of all rooms; the share of states on which two "
-        "members' verdicts differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
+        "members' predictions differ, mean over pairs: mean over ensemble seeds ± standard deviation over them. "
         f"{_never(rows)}{_why_dashes(rows)}{PAPER}",
     )
 
@@ -252,7 +252,7 @@ def _never(rows: Sequence[Mapping[str, Any]]) -> str:
     accuracies = {entry["groups"]: entry["always_no"]["all"] for entry in rows if entry["always_no"]["all"] is not None}
     every = sorted(accuracies.items(), key=str)
     texts = [f"{never:.2f}{'' if groups is None else f' (N={groups})'}" for groups, never in every]
-    return f"Never saying yes has accuracy {page.listed(texts)}. " if texts else ""
+    return f"A member that is never positive has accuracy {page.listed(texts)}. " if texts else ""
 
 
 def _why_dashes(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -279,7 +279,7 @@ def figures(material: Material) -> Iterator[Drawn]:
             "Figure 3 of the paper (top left) and what it leaves out: balanced accuracy on unseen rooms of the best "
             "member, of the validated one, which alone can be had without labels from the rooms it is for, and of the "
             f"mean one; mean over ensemble seeds, {bands(rows)}: ± one standard deviation over seeds, as in the paper. "
-            f"Dotted: never saying yes. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. "
+            f"Dotted: never positive. Ensemble seed{'s' if len(seeds) > 1 else ''} {page.listed(seeds)}. "
             f"{_why_dashes(rows)}{PAPER}"
         )
         nothing = "Its data do not say how many ladder groups have labels (setting 'groups')."
