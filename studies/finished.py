@@ -54,8 +54,8 @@ def simulate() -> Iterator[tuple[str, ...]]:
                     old = ended[ended[:, 0] <= step - ENVIRONMENTS * cap]
                     old = old[np.argsort(old[:, 0], kind="stable")][-LAST:]
                     begun += [old[:, 2].mean()] if len(old) else []
-                told = (f"{np.mean(values):.4f}" if values else "" for values in (counts, finished, begun))
-                yield str(cap), str(before), str(after), str(step), *told
+                shares = (f"{np.mean(values):.4f}" if values else "" for values in (counts, finished, begun))
+                yield str(cap), str(before), str(after), str(step), *shares
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -63,8 +63,8 @@ def tables(path: Path) -> Iterator[str]:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     for changes, steps in ((False, LOOKS), (True, AFTER)):
-        what = f"steps after the share changed, at {CHANGE:,}" if changes else "steps since the beginning"
-        yield f"Told of the last {LAST} that ended / of the last {LAST} begun a cap ago or longer, by {what}:"
+        axis = f"steps after the share changed, at {CHANGE:,}" if changes else "steps since the beginning"
+        yield f"Share solved of the last {LAST} that ended / of the last {LAST} begun a cap ago or longer, by {axis}:"
         yield ""
         lines = []
         for cap in CAPS:

@@ -1,6 +1,6 @@
 """What a run holds: which artefacts are evaluated, their tables, and the evaluation as read back (Spec A5, A8).
 
-Each damaged file is told in one line (Spec G2).
+A damaged file is refused in one line (Spec G2).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hypogoal.options.tables import read_table as read_table
 
 WINDOW = LAST  # episodes at the end of training by which an agent is judged; executions of an option that count
 FORMAT = 2  # of ``metrics.json``: 1 until 0.15
-PARTS = (  # of it
+PARTS = (  # of ``metrics.json``
     *("agents", "layouts", "rooms", "distance", "exploits", "hypotheses", "ranking", "explorer", "saliency"),
     *("selection", "choosing", "ensembles", "settings", "missing", "provenance", "quantities", "comparisons"),
 )
