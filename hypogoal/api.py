@@ -26,7 +26,7 @@ from hypogoal.inspection import describe_path, lines, numbers_in, outcome
 from hypogoal.options.env import OptionEnv, Options
 from hypogoal.options.initiation import NAME as INITIATION
 from hypogoal.options.initiation import Narrowed
-from hypogoal.options.policies import make_policies
+from hypogoal.options.learner import make_policies
 from hypogoal.options.termination import rule_of
 
 __all__ = ["GymnasiumDomain", "OptionEnv", "SubgoalReward", "SubgoalTermination", "load_ensemble", "load_options"]
@@ -174,7 +174,7 @@ def load_options(path: str | Path, ensemble: str | Path | None = None) -> Option
     initiation = None
     if INITIATION in artefact.manifest["files"]:
         learned, shape = load_tensors(artefact.path / INITIATION), tuple(source.config["observation_shape"])
-        initiation = Narrowed(learned, shape, len(goals) * members, config["initiation_threshold"])
+        initiation = Narrowed(learned, shape, len(goals) * members)
     return Options(
         goals,
         members,

@@ -116,7 +116,7 @@ def test_a_loss_or_gradient_that_is_no_number_stops_the_papers_options() -> None
 
 def test_a_loss_or_gradient_that_is_no_number_stops_the_initiation_sets() -> None:
     """Spec G3."""
-    initiation = Initiation(Corridor(4), 2, OptionConfig(), seed=0)
+    initiation = Initiation(Corridor(4), 2, seed=0)
     weight = next(initiation.network.parameters())
     reached = np.array([True, False])
     initiation.record(np.array([1, 2]), np.array([0, 1]), reached)

@@ -77,10 +77,10 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
     """A ring of transitions (Tables 2 and 4: 1e5), sampled in proportion to priority ** alpha.
 
     ``kind`` is the class of what is stored, ``data``. An ``alpha`` of 0 samples uniformly, 1 in full proportion;
-    ``beta`` is the strength of the importance weights that correct for it.
+    ``beta`` is the strength of the importance weights that correct for it. Source of both: Schaul et al. 2015.
     """
 
-    def __init__(self, capacity: int, kind: type[Rows], *, alpha: float, beta: float):
+    def __init__(self, capacity: int, kind: type[Rows], *, alpha: float = 0.6, beta: float = 0.4):
         self.capacity, self.alpha, self.beta = capacity, alpha, beta
         self.data = kind.zeros(capacity)
         self.tree = SumTree(capacity)

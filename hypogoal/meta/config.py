@@ -20,7 +20,7 @@ class MetaConfig:
         ("chooser=random", "chooser=thompson"),
         (
             *("meta_network", "head", "gae_lambda", "decisions", "epochs", "meta_batch"),
-            *("meta_learning_rate", "clip", "entropy", "value_weight", "advantage_floor"),
+            *("meta_learning_rate", "clip", "entropy", "advantage_floor"),
         ),
     )
 
@@ -45,7 +45,6 @@ class MetaConfig:
     meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
     clip: float = setting(0.2, "PPO's clipping range", source="Schulman et al. 2017", low=0.0)
     entropy: float = setting(0.01, "weight of the entropy bonus", source="Table 5", low=0.0)
-    value_weight: float = setting(0.5, "weight of the value loss", source="Schulman et al. 2017", low=0.0)
     advantage_floor: float = setting(
         0.1,
         "advantages are divided by their standard deviation, or by this if it is larger",
@@ -62,13 +61,6 @@ class PlayConfig(OptionConfig):
         "",
         "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
         source="paper, policy learning; several: ours",
-    )
-    along: float = setting(
-        0.0,
-        "share of episodes that begin somewhere on the way from 'start'",
-        source="a curriculum, ours",
-        low=0.0,
-        high=1.0,
     )
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     layouts: str = setting(

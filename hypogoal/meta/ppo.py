@@ -28,6 +28,7 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
+VALUE_WEIGHT = 0.5  # of the value loss: Schulman et al. 2017
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class MetaPolicy(Chooser):
                 out = self._outputs(states[rows])
                 log_prob, entropy = self.head.log_prob(out[:, :-1], offered[pick], drawn[pick])
                 loss = clipped_surrogate(log_prob, old[pick], scaled[pick], config.clip)
-                loss = loss + config.value_weight * (out[:, -1] - goal[pick]).square().mean()
+                loss = loss + VALUE_WEIGHT * (out[:, -1] - goal[pick]).square().mean()
                 loss = loss - config.entropy * entropy.mean()
                 self._step(loss, f"in update {self.updates}, epoch {epoch}, batch {begin // config.meta_batch}")
                 entropy_seen = float(entropy.mean().detach())

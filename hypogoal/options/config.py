@@ -18,12 +18,9 @@ class OptionConfig:
         "network=planned": (
             *("bootstrap_timeout", "bounded_values", "option_gamma", "replay", "warm_up", "update_interval"),
             *("option_batch", "positives", "option_learning_rate", "target_interval", "target_tau", "n_step"),
-            *("exploration", "persistence", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
-            *("priority_alpha", "priority_beta"),
+            *("exploration", "actions", "epsilon_steps", "epsilon_final", "epsilon_from"),
         ),
         "network=paper": ("positives",),
-        "exploration=independent": ("persistence",),
-        "initiation=anywhere": ("initiation_threshold", "initiation_ignored"),
     }
 
     network: str = setting(
@@ -65,15 +62,6 @@ class OptionConfig:
         "where options may start: anywhere, or where experience says that they reach their sub-goal in time",
         source="ours; anywhere: paper",
         choices=("anywhere", "learned"),
-    )
-    initiation_threshold: float = setting(
-        0.05,
-        "options less likely to succeed are held back (initiation=learned)",
-        low=0.0,
-        high=1.0,
-    )
-    initiation_ignored: float = setting(
-        0.1, "share of choices in which no option is held back (initiation=learned)", low=0.0, high=1.0
     )
     bootstrap_timeout: bool = setting(
         True, "do not treat an option's timeout as a terminal state", source="paper, appendix; light: ours"
@@ -119,13 +107,6 @@ class OptionConfig:
         source="persistent: Dabney et al. 2020",
         choices=("independent", "persistent"),
     )
-    persistence: float = setting(
-        2.0,
-        "exponent x of how long a random action lasts, P(n) ~ n^-x (exploration=persistent)",
-        source="Dabney et al. 2020",
-        low=1.1,
-        high=10.0,
-    )
     actions: str = setting(
         "all",
         "the primitive actions: all, or a set that the domain's engine names",
@@ -138,8 +119,4 @@ class OptionConfig:
         "when a member's epsilon begins to fall",
         source="paper: start",
         choices=("start", "first-positive"),
-    )
-    priority_alpha: float = setting(0.6, "strength of prioritisation", source="Schaul et al. 2015", low=0.0, high=1.0)
-    priority_beta: float = setting(
-        0.4, "strength of importance weights", source="Schaul et al. 2015", low=0.0, high=1.0
     )

@@ -18,8 +18,8 @@ from hypogoal.domains.gymnasium_engine import begun, stepped
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.wrappers import require_observations
 from hypogoal.options.initiation import Narrowing
+from hypogoal.options.learner import Policies
 from hypogoal.options.loop import offered_options
-from hypogoal.options.policies import Policies
 
 MASKED = ("warn", "run", "raise")  # what OptionEnv does when it is given an option that is masked
 

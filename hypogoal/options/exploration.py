@@ -12,7 +12,7 @@ from hypogoal.domains.base import Engine
 from hypogoal.options.config import OptionConfig
 
 ALL = "all"
-LONGEST = 10_000  # steps that a random action is kept at most: Dabney et al. 2020
+EXPONENT, LONGEST = 2.0, 10_000  # of how long a random action lasts, P(n) ~ n^-2, at most so many steps
 
 
 def action_set(engine: Engine, name: str) -> NDArray[np.int64]:
@@ -33,9 +33,8 @@ def actions_of(state: Mapping[str, Tensor], outputs: int) -> NDArray[np.int64]:
 class Exploration(Resumable):
     """Random actions, of A, in place of a policy's own, for each of E environments.
 
-    ``independent``: at each step with chance epsilon, one action for one step. ``persistent``: epsilon-z-greedy
-    exploration; with chance epsilon a random action is begun and kept for n steps, P(n) proportional to n **
-    -persistence, but not beyond its execution's end.
+    ``independent``: at each step with probability epsilon, one action for one step. ``persistent``: epsilon-z-greedy
+    exploration; with probability epsilon a random action begins and lasts n steps, but not beyond its execution's end.
 
     Source: Dabney, Ostrovski and Barreto 2020, Temporally-Extended epsilon-Greedy Exploration.
     """
@@ -44,7 +43,7 @@ class Exploration(Resumable):
 
     def __init__(self, config: OptionConfig, environments: int, actions: int, rng: np.random.Generator):
         self.actions, self.rng = actions, rng
-        self.persistent, self.exponent = config.exploration == "persistent", config.persistence
+        self.persistent = config.exploration == "persistent"
         self._kept = np.zeros(environments, dtype=np.int64)
         self._left = np.zeros(environments, dtype=np.int64)
 
@@ -60,7 +59,7 @@ class Exploration(Resumable):
         self._left[age == 0] = 0
         begins &= self._left == 0
         self._kept[begins] = drawn[begins]
-        self._left[begins] = np.minimum(self.rng.zipf(self.exponent, size=count), LONGEST)[begins]
+        self._left[begins] = np.minimum(self.rng.zipf(EXPONENT, size=count), LONGEST)[begins]
         random = self._left > 0
         self._left[random] -= 1
         return np.where(random, self._kept, policy)

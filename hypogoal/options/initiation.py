@@ -20,62 +20,59 @@ from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.learners.double_dqn import backward_of, descend
-from hypogoal.options.config import OptionConfig
 from hypogoal.options.networks import LightQNetwork, apply_to_states, standard_in
 
 NAME, PREFIX = "initiation.safetensors", "network."
 KEPT = 8_192  # last executions; options change while they learn, so older ones are forgotten
 FEWEST = 100  # executions of an option before it is ever held back
+THRESHOLD = 0.05  # options less likely to succeed are held back
+IGNORED = 0.1  # share of choices in which no option is held back: so it shows if one has learned since
 BATCH, EXECUTIONS_PER_UPDATE, LEARNING_RATE = 128, 32, 1e-3
 
 # From an observation (*obs) and what is offered in it, bool (O,), to what may start there.
 Narrowing = Callable[[Observations, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
-def _narrowed(
-    offered: NDArray[np.bool_], chances: NDArray[np.float32], executions: NDArray[np.int64], threshold: float
+def narrowed(
+    offered: NDArray[np.bool_], probabilities: NDArray[np.float32], executions: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    narrowed = offered & ((chances >= threshold) | (executions < FEWEST))
-    none_left = ~narrowed.any(1)
-    narrowed[none_left] = offered[none_left]
-    return narrowed
+    """Of the options offered, bool (n, O), those that probably succeed; all of them where none would be left."""
+    likely = offered & ((probabilities >= THRESHOLD) | (executions < FEWEST))
+    return np.where(likely.any(1, keepdims=True), likely, offered)
 
 
 class Narrowed:
-    """What an artefact's initiation sets leave of the options offered in an observation; all, where that is none.
+    """What an artefact's initiation sets leave of the options offered in an observation.
 
     ``state`` is the tensors of ``initiation.safetensors``, a ``UserError`` where they are not of so many options on
-    observations of this shape; an option is held back where its chance is below ``threshold``.
+    observations of this shape.
     """
 
-    def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int, threshold: float):
+    def __init__(self, state: Mapping[str, Tensor], shape: tuple[int, ...], options: int):
         weights = below(PREFIX, state)
         make = partial(LightQNetwork, shape, options, 1, standard_in(weights, shape))
         self.network = load_fitting(make, weights, NAME)
         others = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
         check_fit({"executions": torch.zeros(options, dtype=torch.int64)}, others, NAME, AGAIN)
-        self.executions, self.threshold = state["executions"].numpy(), threshold
+        self.executions = state["executions"].numpy()
 
     @torch.no_grad()
     def __call__(self, observation: Observations, offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Of what is offered in an observation (*shape), bool (O,), a part."""
-        chances = self.network(torch.from_numpy(observation[None]))[:, :, 0].sigmoid().numpy()
-        return _narrowed(offered[None], chances, self.executions, self.threshold)[0]
+        probabilities = self.network(torch.from_numpy(observation[None]))[:, :, 0].sigmoid().numpy()
+        return narrowed(offered[None], probabilities, self.executions)[0]
 
 
 class Initiation(Resumable):
     """The probability that an option reaches its sub-goal before its time is up, and which options it lets start.
 
-    Of ``config`` it asks ``initiation_threshold`` and ``initiation_ignored``; ``seed`` is of weights and draws.
+    ``seed`` is of weights and draws.
     """
 
     CHANGING = ("network", "optimiser", "rng", "states", "option", "reached", "executions", "count", "_due")
 
-    def __init__(
-        self, engine: Engine, options: int, config: OptionConfig, seed: int, device: torch.device | str = "cpu"
-    ):
-        self.engine, self.options, self.config = engine, options, config
-        self.device = torch.device(device)
+    def __init__(self, engine: Engine, options: int, seed: int, device: torch.device | str = "cpu"):
+        self.engine, self.options, self.device = engine, options, torch.device(device)
         self.rng = rng_for(seed, "initiation")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_for(seed, "initiation-weights"))
@@ -86,23 +83,18 @@ class Initiation(Resumable):
         self.executions = np.zeros(options, dtype=np.int64)
         self.count = self._due = 0
 
-    def chances(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
+    def probabilities(self, ids: NDArray[np.int64]) -> NDArray[np.float32]:
         """P(sub-goal reached before the timeout | state, option), float32 (n, O)."""
         with torch.no_grad():
             logits = apply_to_states(self.network, self.engine, ids)[:, :, 0].cpu()
-        chances: NDArray[np.float32] = logits.sigmoid().numpy()
-        return chances
+        probabilities: NDArray[np.float32] = logits.sigmoid().numpy()
+        return probabilities
 
     def narrow(self, ids: NDArray[np.int64], offered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Of the options offered, bool (n, O), in states (n,), those that will probably get there; all where none would
-        be left.
-
-        For a share of the states all are left, so that an option that has learned since is found out.
-        """
-        narrowed = _narrowed(offered, self.chances(ids), self.executions, self.config.initiation_threshold)
-        ignored = self.rng.random(len(ids)) < self.config.initiation_ignored
-        narrowed[ignored] = offered[ignored]
-        return narrowed
+        """See :func:`narrowed`, in states (n,); in a share ``IGNORED`` of them all options are left."""
+        likely = narrowed(offered, self.probabilities(ids), self.executions)
+        ignored = self.rng.random(len(ids)) < IGNORED
+        return np.where(ignored[:, None], offered, likely)
 
     def record(self, ids: NDArray[np.int64], options: NDArray[np.int64], reached: NDArray[np.bool_]) -> None:
         """Executions that ended, (n,) each: where they began, of which options, whether these got there."""

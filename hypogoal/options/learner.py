@@ -25,7 +25,7 @@ from hypogoal.options.exploration import Exploration, action_set, actions_of
 from hypogoal.options.networks import Pictures
 from hypogoal.options.parts import Part, load_part
 from hypogoal.options.policy_views import Viewed
-from hypogoal.options.termination import Terminations
+from hypogoal.options.termination import ORACLE, Terminations
 
 COUNTERS = ("option_steps", "steps_since_positive")
 LEARNERS = {
@@ -36,6 +36,32 @@ LEARNERS = {
 
 # Starts an execution of an option: gives a function from an observation (*obs) to the action.
 Policies = Callable[[int], Callable[[Observations], int]]
+
+
+@dataclass(frozen=True)
+class SavedOptions:
+    """An artefact's options, on observations of this ``shape``; ``ensemble`` reads the first of their ensembles."""
+
+    config: Mapping[str, Any]
+    weights: Mapping[str, Tensor]
+    shape: tuple[int, ...]
+    ensemble: Callable[[], Ensemble]
+
+    @property
+    def count(self) -> int:
+        """How many options there are."""
+        return len(self.config["sub_goals"]) * self.config["members"]
+
+    def actions(self, layer: str, heads: int) -> NDArray[np.int64]:
+        """The actions, int64 (A,), to choose among, if the weights' last ``layer`` has so many heads of A outputs.
+
+        A ``UserError`` where the weights are not those of so many options.
+        """
+        outputs = len(self.weights[layer]) // heads if layer in self.weights else 0
+        actions = actions_of(self.weights, outputs)
+        if not outputs or actions.shape != (outputs,):
+            raise UserError("the weights do not fit the manifest", f"{self.count} options", AGAIN)
+        return actions
 
 
 @dataclass(frozen=True)
@@ -58,7 +84,7 @@ class Learner(Part, ABC):
 
     Attributes:
         FILE: what an artefact calls the file of its :meth:`state`.
-        TAKES_VIEWS: whether it heeds the settings ``embedding``, ``policy_view`` and ``policy_pixels``.
+        NEEDS: settings that must have this value.
         actions: the engine's actions that the policies choose among, int64 (A,).
         option_steps: int64 (O,), the steps that each learned from.
         positives: int64 (O,), those of them at whose end its sub-goal was reached.
@@ -69,7 +95,7 @@ class Learner(Part, ABC):
     """
 
     FILE: ClassVar[str] = "options.safetensors"
-    TAKES_VIEWS: ClassVar[bool] = False
+    NEEDS: ClassVar[Mapping[str, Any]] = {"embedding": AUTO, "policy_view": FULL, "policy_pixels": "all"}
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", "view", *COUNTERS)
 
     def __init__(
@@ -103,30 +129,16 @@ class Learner(Part, ABC):
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Raise a ``UserError`` where it cannot learn with these settings in this engine."""
-        if cls.TAKES_VIEWS:
-            return
-        for name, default, what in (
-            ("embedding", AUTO, "only the light network has an embedding"),
-            ("policy_view", FULL, "only the light network sees windows"),
-            ("policy_pixels", "all", "only the light network can see half the pixels"),
-        ):
-            if (value := getattr(config, name)) != default:
-                raise UserError(what, f"{name}={value}, network={config.network}", "Give --set network=light.")
+        for name, value in cls.NEEDS.items():
+            if getattr(config, name) != value:
+                what = f"network={config.network} needs {name}={value}"
+                raise UserError(what, f"{name}={getattr(config, name)}", f"Give --set {name}={value}.")
 
     @classmethod
-    def policies(
-        cls,
-        config: Mapping[str, Any],
-        weights: Mapping[str, Tensor],
-        shape: tuple[int, ...],
-        ensemble: Callable[[], Ensemble],
-    ) -> Policies:
-        """Greedy policies from an artefact's configuration and weights, for observations of this shape.
-
-        ``ensemble`` reads the first of the options' ensembles. Where policies need an engine it is a ``UserError``.
-        """
+    def policies(cls, saved: SavedOptions) -> Policies:
+        """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
         what = "these options need their domain's engine, which is not in the artefact"
-        raise UserError(what, f"network={config['network']}", "Load options of the light or the paper's network.")
+        raise UserError(what, f"network={saved.config['network']}", "Load options of the light or the paper's network.")
 
     @abstractmethod
     def build(self, config: OptionConfig, seed: int) -> None:
@@ -204,3 +216,25 @@ class Learner(Part, ABC):
 def load_learner(name: str) -> type[Learner]:
     """The class that the setting ``network`` names; a ``UserError`` where it names none."""
     return load_part(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]
+
+
+def make_policies(
+    config: Mapping[str, Any],
+    weights: Mapping[str, Tensor],
+    ensemble_config: Mapping[str, Any],
+    ensemble: Ensemble | None = None,
+) -> Policies:
+    """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration.
+
+    Policies that see the window around the agent also need the first ensemble.
+    """
+    if config["termination"] == ORACLE:
+        what = "these options end at the true sub-goals, which only the domain's engine can see"
+        raise UserError(what, "termination=oracle", "Load options that were trained with learned members.")
+
+    def first_ensemble() -> Ensemble:
+        assert ensemble is not None
+        return ensemble
+
+    shape = tuple(ensemble_config.get("observation_shape", ()))
+    return load_learner(config["network"]).policies(SavedOptions(config, weights, shape, first_ensemble))

@@ -10,7 +10,7 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,18 +19,25 @@ from torch import Tensor
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.tensors import AGAIN, below, check_fit
+from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
+from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.ensemble import Ensemble
-from hypogoal.hypotheses.networks import AUTO
+from hypogoal.hypotheses.networks import AUTO, NETWORKS
 from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tensors
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import FULL, STACK, OptionConfig
-from hypogoal.options.learner import Learner, Policies, Transitions
-from hypogoal.options.networks import LightQNetwork, PictureEmbedding, Pixels, apply_all_to_states, apply_to_states
-from hypogoal.options.policies import LightPolicies, saved_actions
+from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
+from hypogoal.options.networks import (
+    GRID,
+    LightQNetwork,
+    PictureEmbedding,
+    Pixels,
+    apply_all_to_states,
+    apply_to_states,
+    standard_in,
+)
 from hypogoal.options.policy_views import create_views, views_in
 
 POSITIVES_KEPT = 512  # per member
@@ -55,32 +62,19 @@ class LightLearner(Learner):
         *("online", "target", "optimiser", "replay", "ahead", "positive", "steps", "updates", "_due"),
     )
 
-    TAKES_VIEWS = True
+    NEEDS: ClassVar[Mapping[str, Any]] = {}
 
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
         """Other members' sub-goals may lie between the first and the last of several steps."""
-        super().refuse(config, engine)
         if config.n_step > 1 and config.experience != "own":
-            raise UserError(
-                "several steps at once are for an option's own member: others' sub-goals may lie among them",
-                f"n_step={config.n_step}, experience={config.experience}",
-                "Give --set experience=own or --set n_step=1.",
-            )
+            what = "several steps at once are for an option's own member: others' sub-goals may lie among them"
+            setting = f"n_step={config.n_step}, experience={config.experience}"
+            raise UserError(what, setting, "Give --set experience=own or --set n_step=1.")
 
     @classmethod
-    def policies(
-        cls,
-        config: Mapping[str, Any],
-        weights: Mapping[str, Tensor],
-        shape: tuple[int, ...],
-        ensemble: Callable[[], Ensemble],
-    ) -> Policies:
-        options = len(config["sub_goals"]) * config["members"]
-        actions = saved_actions(weights, "online.heads.weight", options, options)
-        kinds = views_in(config.get("policy_view", FULL), config.get("policy_pixels", "all"))
-        views = create_views(kinds, shape, ensemble)
-        return LightPolicies(weights, shape, options, actions, views, config.get("embedding", AUTO))
+    def policies(cls, saved: SavedOptions) -> Policies:
+        return LightPolicies(saved)
 
     def build(self, config: OptionConfig, seed: int) -> None:
         self.running_only = config.experience == "own"
@@ -95,7 +89,7 @@ class LightLearner(Learner):
         self.pixels = Pixels(self.pictures, 2 * config.option_batch, self.device) if pictures else None
         self._flat, self._flat_target = FlatParameters(self.online), FlatParameters(self.target, learning=False)
         self.optimiser = torch.optim.Adam([self._flat.vector], lr=config.option_learning_rate, fused=True)
-        self.replay = PrioritisedReplay(config.replay, Lessons, alpha=config.priority_alpha, beta=config.priority_beta)
+        self.replay = PrioritisedReplay(config.replay, Lessons)
         self.positive = Lessons.zeros(self.options, POSITIVES_KEPT)
         self.steps = self.updates = self._due = 0
 
@@ -238,3 +232,29 @@ class LightLearner(Learner):
         check_fit(self.online.state_dict(), weights, "options.safetensors", AGAIN)
         self.online.load_state_dict(weights)
         self.target.load_state_dict(weights)
+
+
+class LightPolicies:
+    """Greedy policies of saved options that share one network (Spec D8)."""
+
+    def __init__(self, saved: SavedOptions):
+        config, weights = saved.config, below("online.", saved.weights)
+        kinds = views_in(config.get("policy_view", FULL), config.get("policy_pixels", "all"))
+        self.views = create_views(kinds, saved.shape, saved.ensemble)
+        self.actions = saved.actions("online.heads.weight", saved.count)
+        shape, embedding = self.views[-1].shape if self.views else saved.shape, config.get("embedding", AUTO)
+        standard = standard_in(weights, shape)
+        make = partial(LightQNetwork, shape, saved.count, len(self.actions), standard, embedding)
+        custom = embedding not in (AUTO, GRID, *NETWORKS)
+        self.network = load_fitting(make, weights, "options.safetensors", custom=custom)
+
+    def __call__(self, option: int) -> Callable[[Observations], int]:
+        """Start an execution."""
+        return partial(self._act, option)
+
+    @torch.no_grad()
+    def _act(self, option: int, observation: Any) -> int:
+        for view in self.views:
+            observation = view.see(observation[None])[0]
+        values = self.network(torch.from_numpy(np.ascontiguousarray(observation[None])))[0, option]
+        return int(self.actions[int(values.argmax())])

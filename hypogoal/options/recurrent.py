@@ -8,7 +8,8 @@ BatchNorm sees a batch's distinct images, see DEV-51.
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,17 +20,15 @@ from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.columns import Columns
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import seed_for
-from hypogoal.core.tensors import AGAIN, below, check_fit
-from hypogoal.dataset import PICTURE
+from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
+from hypogoal.dataset import PICTURE, Observations
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.learners.double_dqn import backward_of, descend, double_q_targets, follow
 from hypogoal.learners.replay import PrioritisedReplay
 from hypogoal.options.choosers import Ids
 from hypogoal.options.config import STACK, OptionConfig
-from hypogoal.options.learner import Learner, Policies, Transitions
+from hypogoal.options.learner import Learner, Policies, SavedOptions, Transitions
 from hypogoal.options.networks import PaperQNetwork
-from hypogoal.options.policies import PaperPolicies, saved_actions
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Member(Resumable):
             self.online = PaperQNetwork(engine.observation_shape, actions).to(device)
         self.target = copy.deepcopy(self.online).requires_grad_(False).eval()
         self.optimiser = torch.optim.Adam(self.online.parameters(), lr=config.option_learning_rate, fused=True)
-        self.replay = PrioritisedReplay(config.replay, Rows, alpha=config.priority_alpha, beta=config.priority_beta)
+        self.replay = PrioritisedReplay(config.replay, Rows)
         self.updates = self.due = self.executions = 0
 
 
@@ -67,6 +66,7 @@ class RecurrentLearner(Learner):
     """The intra-option policies of all O options, each on its own; arguments as of :class:`Learner`."""
 
     CHANGING = (*Learner.CHANGING, "members", "hidden", "running")
+    NEEDS: ClassVar[Mapping[str, Any]] = {**Learner.NEEDS, "experience": "own", "n_step": 1}
 
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
@@ -74,27 +74,10 @@ class RecurrentLearner(Learner):
         super().refuse(config, engine)
         if engine.observation_dtype != PICTURE:
             raise UserError("the paper's networks see pictures only", "network=paper", "Give --set network=light.")
-        if config.experience != "own":
-            raise UserError(
-                "the paper's network learns from its member's own executions only",
-                f"experience={config.experience}",
-                "Give --set experience=own.",
-            )
-        if config.n_step > 1:
-            raise UserError(
-                "the paper's network learns one step ahead only", f"n_step={config.n_step}", "Give --set n_step=1."
-            )
 
     @classmethod
-    def policies(
-        cls,
-        config: Mapping[str, Any],
-        weights: Mapping[str, Tensor],
-        shape: tuple[int, ...],
-        ensemble: Callable[[], Ensemble],
-    ) -> Policies:
-        options = len(config["sub_goals"]) * config["members"]
-        return PaperPolicies(weights, shape, options, saved_actions(weights, "0.values.2.bias", 1, options))
+    def policies(cls, saved: SavedOptions) -> Policies:
+        return PaperPolicies(saved)
 
     def build(self, config: OptionConfig, seed: int) -> None:
         count = len(self.actions)
@@ -224,3 +207,41 @@ class RecurrentLearner(Learner):
             check_fit(member.online.state_dict(), of_option, f"option {option} of options.safetensors", AGAIN)
             member.online.load_state_dict(of_option)
             member.target.load_state_dict(of_option)
+
+
+class PaperPolicies:
+    """Greedy policies of saved options that have a network each (Spec D2, D8), made when it is first played."""
+
+    def __init__(self, saved: SavedOptions):
+        self.weights, self.shape = dict(saved.weights), saved.shape
+        self.actions = saved.actions("0.values.2.bias", 1)
+        self._networks: dict[int, PaperQNetwork] = {}
+
+    def network(self, option: int) -> PaperQNetwork:
+        """An option's network."""
+        if option not in self._networks:
+            make, weights = partial(PaperQNetwork, self.shape, len(self.actions)), below(f"{option}.", self.weights)
+            self._networks[option] = load_fitting(make, weights, "options.safetensors").eval()
+        return self._networks[option]
+
+    def __call__(self, option: int) -> Callable[[Observations], int]:
+        """Start an execution."""
+        return _Execution(self.network(option), self.actions)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the networks, which are the weights again."""
+        return {**self.__dict__, "_networks": {}}
+
+
+class _Execution:
+    """One execution of an option, which its network remembers from its first step on."""
+
+    def __init__(self, network: PaperQNetwork, actions: NDArray[np.int64]):
+        self.network, self.actions = network, actions
+        self.hidden: Tensor | None = None
+
+    @torch.no_grad()
+    def __call__(self, observation: Observations) -> int:
+        image = torch.from_numpy(np.ascontiguousarray(observation[None]))
+        values, self.hidden = self.network(self.network.embed(image)[:, None], self.hidden)
+        return int(self.actions[int(values[0, 0].argmax())])

@@ -125,7 +125,7 @@ def test_play_teaches_nothing() -> None:
     truth = planted(engine)
     patience = Patience(truth.classify, 15, None, None, engine.count, 3)
     learner = PlannedLearner(engine, truth, config, seed=0)
-    initiation = Initiation(engine, 15, config, 0)
+    initiation = Initiation(engine, 15, 0)
     chooser = ThompsonChooser(15, 16, np.random.default_rng(0))
     patience.thresholds = np.full(15, 0.5, np.float32)
     loop = OptionLoop(
@@ -152,7 +152,7 @@ def test_a_bandit_begins_anew() -> None:
     bandit.begin_anew()
     chosen = bandit.choose(places, places, everything)
     no, yes, one = np.zeros(2, np.bool_), np.ones(2, np.bool_), np.ones(2)
-    bandit.record(Outcome(places, chosen, places, no, no, yes, one, places, one, places, yes, no))
+    bandit.record(Outcome(places, chosen, places, no, no, one, places, one, places, yes, no))
     bandit.learn()
     assert bandit.credit[0].sum() == 2
 

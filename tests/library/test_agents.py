@@ -152,7 +152,7 @@ def test_options_are_held_back_by_what_was_learned_of_them(run: Path, options: O
         patch.syspath_prepend(str(TESTS))
         patch.setenv("HYPOGOAL_TRUST", "corridor_env:DOMAIN")
         play = settings("steps=600", "environments=4", "warm_up=100", "layout_seed=0", "max_episode_steps=30")
-        learned = settings("initiation=learned", "initiation_threshold=1", "random_episodes=0", "option_batch=32")
+        learned = settings("initiation=learned", "random_episodes=0", "option_batch=32")
         out = str(run / "narrowed")
         assert main(["train-options", str(run / "ensemble"), "--out", out, "-q", *play, *learned]) == 0
     narrowed = hypogoal.load_options(out)
@@ -236,7 +236,6 @@ def test_options_go_to_another_process(run: Path, options: Options) -> None:
         | {"executions": torch.full((4,), 1_000)},
         (48, 48, 3),
         4,
-        0.5,
     )
     for known in (options, replace(options, initiation=learned)):
         sent = pickle.loads(pickle.dumps(known))  # noqa: S301 - our own

@@ -73,7 +73,7 @@ def loop_of(case: str, device: str = "cpu") -> OptionLoop:
         head = "gaussian" if chooser_name == "gaussian" else "categorical"
         meta = MetaConfig(head=head, decisions=16, meta_batch=8)
         chooser = MetaPolicy(engine, 2, meta, 2, device)
-    initiation = Initiation(engine, 2, config, seed=3, device=device) if config.initiation == "learned" else None
+    initiation = Initiation(engine, 2, seed=3, device=device) if config.initiation == "learned" else None
     return OptionLoop(
         engine, verdicts, learner, chooser, Recorder(2, engine, 100), config, gamma=0.9, initiation=initiation
     )

@@ -96,7 +96,7 @@ def test_an_embedding_by_name_goes_through_both_stages(
     assert "trained with embedding=tiles, not auto" in capsys.readouterr().err
     assert main([*meta, *named]) == 0
     assert main([*meta[:2], "--out", str(tmp_path / "other"), *named, "--set", "network=planned"]) == 2
-    assert "only the light network has an embedding" in capsys.readouterr().err
+    assert "needs embedding=auto" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("small_gru")

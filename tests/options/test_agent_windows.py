@@ -109,7 +109,7 @@ def test_windows_need_someone_who_finds_the_agent(tmp_path: Path) -> None:
     whole = ensemble_in(tmp_path / "whole", view="full", network="montezuma")
     for ensemble, changes, line in (
         (whole, {}, "the agent's place in an observation is not known"),
-        (ensemble_in(tmp_path / "crop"), {"network": "paper", "n_step": 1}, "only the light network sees windows"),
+        (ensemble_in(tmp_path / "crop"), {"network": "paper", "n_step": 1}, "network=paper needs policy_view=full"),
     ):
         with pytest.raises(UserError, match=line):
             train(ensemble, tmp_path / "out", policy_view="agent-crop", **changes)
@@ -148,5 +148,5 @@ def test_options_of_half_pictures(tmp_path: Path) -> None:
         assert 0 <= act(engine.images(ids)[0]) < 18
         with pytest.raises(UserError, match="trained with policy_pixels=half, not all"):
             train(ensemble, tmp_path / "other", tmp_path / view, policy_view=view)
-    with pytest.raises(UserError, match="only the light network can see half the pixels"):
+    with pytest.raises(UserError, match="network=paper needs policy_pixels=all"):
         train(ensemble, tmp_path / "other", policy_pixels="half", network="paper", n_step=1)

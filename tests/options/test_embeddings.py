@@ -13,10 +13,10 @@ from hypogoal.core.tensors import below
 from hypogoal.domains.doorkey_engine import DoorKeyEngine
 from hypogoal.options.choosers import RandomChooser
 from hypogoal.options.config import OptionConfig
+from hypogoal.options.learner import make_policies
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.networks import LightQNetwork, OwnEmbedding, PictureEmbedding, embedding_for
-from hypogoal.options.policies import make_policies
 from hypogoal.options.recording import Recorder
 from hypogoal.options.termination import oracle_terminations
 

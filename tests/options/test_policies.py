@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from hypogoal.core.errors import UserError
+from hypogoal.options.learner import Policies, make_policies
 from hypogoal.options.networks import LightQNetwork, PaperQNetwork
-from hypogoal.options.policies import Policies, make_policies
 
 SHAPE, OPTIONS, ACTIONS = (24, 24, 3), 2, 5
 

@@ -136,7 +136,7 @@ def test_one_file_is_enough(setting: str, stage: str, ensemble: Path, tmp_path: 
         (["chooser={}:Straight"], "this is no chooser"),
         (["chooser={}:Missing"], "the chooser cannot be loaded"),
         (["termination={}:AtLeast"], "unknown termination"),
-        (["network={}:Straight", "policy_view={}:UpperHalf"], "only the light network sees windows"),
+        (["network={}:Straight", "policy_view={}:UpperHalf"], ":Straight needs policy_view=full"),
     ],
 )
 def test_what_does_not_fit_is_one_line(
@@ -153,8 +153,6 @@ def test_what_does_not_fit_is_one_line(
     ("settings", "fault"),
     [
         (["entropy=0.1", "chooser=random"], "does nothing with chooser=random: entropy=0.1"),
-        (["persistence=3"], "does nothing with exploration=independent: persistence=3.0"),
-        (["initiation_ignored=0.2"], "does nothing with initiation=anywhere: initiation_ignored=0.2"),
         (["replay=500", "network=planned"], "does nothing with network=planned: replay=500"),
     ],
 )
