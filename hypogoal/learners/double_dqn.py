@@ -1,6 +1,6 @@
 """Double Q-learning targets (Van Hasselt, Guez and Silver 2016), target copies, exploration schedules, and steps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -25,11 +25,10 @@ def double_q_targets(
     Args:
         rewards: float (...,).
         terminal: bool (...,), True where nothing follows s'.
-        next_online: float (..., A), the online network at s'.
-        next_target: float (..., A), the target network at s'.
+        next_online, next_target: float (..., A), the networks at s'.
         gamma: discount of s', float or (...,): per step, or to the power n where s' is n steps on.
-        bounded: clip the targets to 0..1, the range of an option's return: 1, discounted, where it ends at its
-            sub-goal, else 0. Bootstrapped values that feed on themselves cannot grow beyond that.
+        bounded: clip the targets to 0..1, the range of an option's return: bootstrapped values that feed on themselves
+            cannot grow beyond that.
 
     Returns:
         float (...,).
@@ -43,20 +42,13 @@ def double_q_targets(
 
 
 @torch.no_grad()
-def follow(target: nn.Module, online: nn.Module, tau: float) -> None:
-    """Move every parameter and buffer of ``target`` towards ``online`` by ``tau``; 1 copies the whole network."""
-    follow_tensors(list(target.state_dict().values()), list(online.state_dict().values()), tau)
-
-
-@torch.no_grad()
-def follow_tensors(ours: Sequence[Tensor], theirs: Sequence[Tensor], tau: float) -> None:
-    """As :func:`follow`, for the networks' tensors in the same order, where gathering them each time is too dear."""
-    moving = [(a, b) for a, b in zip(ours, theirs, strict=True) if a.is_floating_point() and tau < 1]
-    if moving:
-        torch._foreach_lerp_([a for a, _ in moving], [b for _, b in moving], tau)
-    for a, b in zip(ours, theirs, strict=True):
-        if tau >= 1 or not a.is_floating_point():
-            a.copy_(b)
+def follow(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
+    """Move a target network's tensors towards the online network's by ``tau``; integers, and all at 1, are copied."""
+    for ours, theirs in zip(target, online, strict=True):
+        if tau < 1 and ours.is_floating_point():
+            ours.lerp_(theirs, tau)
+        else:
+            ours.copy_(theirs)
 
 
 def descend(
@@ -64,8 +56,7 @@ def descend(
 ) -> None:
     """Spec G3: a step of ``optimiser`` down a loss; ``backward`` fills the gradients and returns their norm, ().
 
-    Where the loss or a gradient is NaN or Inf it is a ``NumericalError`` that says ``whose`` and ``where``, and the
-    weights stay as they are.
+    A loss or gradient with NaN or Inf is a ``NumericalError`` that names ``owner`` and ``where``; the weights stay.
     """
     if not torch.isfinite(loss):
         raise NumericalError(f"the loss of {owner} is {float(loss.detach())} {where}")

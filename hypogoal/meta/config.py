@@ -9,6 +9,7 @@ from typing import ClassVar
 
 from hypogoal.core.config import MAX_RANGE, fixed, parse_integers, setting
 from hypogoal.core.errors import UserError
+from hypogoal.learners.config import WorldConfig
 from hypogoal.options.config import FULL, OptionConfig
 
 
@@ -54,33 +55,18 @@ class MetaConfig:
 
 
 @dataclass(frozen=True)
-class PlayConfig(OptionConfig):
-    """Where options are played, and for how long."""
+class PlayConfig(OptionConfig, WorldConfig):
+    """Where options are played."""
 
     start: str = setting(
         "",
         "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
         source="paper, policy learning; several: ours",
     )
-    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     layouts: str = setting(
         "",
         "layouts to draw episodes from: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: that one",
         source="ours: the paper lives on one",
-    )
-    max_episode_steps: int = setting(
-        500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
-    )
-    cap: float = setting(
-        0.0,
-        "an episode is cut after this many times the layout's shortest path; 0 for max_episode_steps",
-        source="ours: a task in which choosing decides",
-        low=0.0,
-    )
-    world: tuple[str, ...] = setting(
-        (),
-        "changes to the world that the states were collected in: settings of the domain as name=value",
-        source="ours: a task in which choosing decides",
     )
     save_visited: int = setting(
         0,
@@ -88,7 +74,6 @@ class PlayConfig(OptionConfig):
         source="the paper's suggestion",
         low=0,
     )
-    random_episodes: int = setting(200, "episodes of random play: how hard the layout is", source="ours", low=0)
 
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:

@@ -1,9 +1,8 @@
 """Light option learning: one trunk, a head per member, every step a lesson for every member (Spec D1, D2, D8).
 
-Double DQN with prioritised replay over state ids. With ``experience=shared`` each stored transition carries each
-member's own reward, by that member's verdict on s'; a member's loss leaves out transitions that start inside its
-sub-goal. With ``experience=own`` (the paper) only the member whose option was running learns from a transition, and
-only its verdicts are asked for; then a transition may reach several steps ahead within its execution.
+Double DQN with prioritised replay over state ids. With ``experience=shared`` every member learns from each transition,
+with its own reward, unless the transition starts inside its sub-goal. With ``experience=own`` (the paper) only the
+member whose option was running learns, and a transition may reach several steps ahead within its execution.
 """
 
 import copy
@@ -23,7 +22,7 @@ from hypogoal.core.tensors import AGAIN, below, check_fit, load_fitting
 from hypogoal.dataset import Observations
 from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, NETWORKS
-from hypogoal.learners.double_dqn import descend, double_q_targets, follow_tensors
+from hypogoal.learners.double_dqn import descend, double_q_targets, follow
 from hypogoal.learners.flat import FlatParameters
 from hypogoal.learners.replay import PrioritisedReplay, Steps, StepsAhead
 from hypogoal.options.choosers import Ids
@@ -95,7 +94,7 @@ class LightLearner(Learner):
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
-        """How many states back the replay may hold: a transition waits n steps, and its turn in the ring n more."""
+        """A transition waits n steps, and its turn in the ring n more."""
         return config.replay + (2 * config.n_step + STACK) * config.environments
 
     @torch.no_grad()
@@ -104,17 +103,9 @@ class LightLearner(Learner):
         return values[np.arange(len(ids)), options].argmax(1)
 
     def observe(self, moved: Transitions) -> None:
-        steps = Lessons.cast(
-            moved.ids,
-            self._index[moved.actions],
-            moved.next_ids,
-            np.ones(len(moved.ids), np.int64),
-            moved.options,
-            moved.terminated,
-            moved.timed_out,
-            moved.reached,
-        )
-        rows = self.ahead.add(steps, moved.ended)
+        actions, ones = self._index[moved.actions], np.ones(len(moved.ids), np.int64)
+        outcome = moved.options, moved.terminated, moved.timed_out, moved.reached
+        rows = self.ahead.add(Lessons.cast(moved.ids, actions, moved.next_ids, ones, *outcome), moved.ended)
         self.replay.add(rows)
         inside, reached = self._judged(rows)
         for row, option in zip(*np.nonzero(reached & ~inside), strict=True):
@@ -138,22 +129,20 @@ class LightLearner(Learner):
         return owner & inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
-        numbers: dict[str, float] = {}
         if self.steps < self.config.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
             self._due = 0
-            return numbers
+        numbers: dict[str, float] = {}
         while self._due >= self.config.update_interval:
             self._due -= self.config.update_interval
             numbers = self._update()
         return numbers
 
     def _batch(self) -> tuple[Lessons, NDArray[np.int64], NDArray[np.float32]]:
-        counts = np.minimum(self.positives, POSITIVES_KEPT)
-        kept: NDArray[np.bool_] | None = None  # where the engine forgets: the slots of states that it remembers
+        """Transitions, the first of them drawn from the replay at indices int64 (m,), and weights float32 (n,)."""
+        kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
         if self.engine.memory is not None:
-            kept = np.arange(POSITIVES_KEPT) < counts[:, None]
             kept &= self.engine.remembers(self.positive.state) & self.engine.remembers(self.positive.next_state)
-            counts = kept.sum(1)
+        counts = kept.sum(1)
         have = np.flatnonzero(counts)
         extra = round(self.config.option_batch * self.config.positives) if len(have) else 0
         extra = min(extra, self.config.option_batch - 1)  # priorities need one drawn by them
@@ -162,7 +151,7 @@ class LightLearner(Learner):
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
             slots = (self.rng.random(extra) * counts[options]).astype(np.int64)
-            if kept is not None:
+            if self.engine.memory is not None:  # of those that it remembers
                 slots = (np.cumsum(kept, axis=1)[options] <= slots[:, None]).sum(1)
             batch = Lessons.joined([batch, self.positive.at((options, slots))])
             weights = np.concatenate([weights, np.ones(extra, np.float32)])
@@ -215,14 +204,14 @@ class LightLearner(Learner):
         return values.index_select(0, now), next_online, next_target
 
     def _step(self, loss: Tensor, errors: Tensor) -> None:
-        """Follow the loss's gradient; ``errors`` (n, O) name the options where it is NaN or Inf."""
+        """Follow the loss's gradient; ``errors`` (n, O) tell the options where it is NaN or Inf."""
         finite = bool(torch.isfinite(loss))
         owner = "the options" if finite else f"options {(~errors.isfinite()).any(0).nonzero().flatten().tolist()}"
         where = f"in the batch of update {self.updates}, step {self.steps}"
         descend(loss, partial(self._flat.backward, largest=GRADIENT_NORM), self.optimiser, owner, where)
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
-            follow_tensors([self._flat_target.vector], [self._flat.vector], self.config.target_tau)
+            follow([self._flat_target.vector], [self._flat.vector], self.config.target_tau)
 
     def weights(self) -> dict[str, Tensor]:
         return {f"online.{name}": value for name, value in self.online.state_dict().items()}

@@ -25,9 +25,8 @@ SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
 class CellEmbedding(nn.Module):
     """A convolution whose kernel and stride are one cell (8 pixels), to ``channels`` features each, then ReLU.
 
-    Where an image is made of few distinct tiles, the same function is a look-up: convolve each tile once, then gather
-    by tile code. Both ways give the same values and gradients (a test asserts it). An image that whole cells do not
-    fill is continued in black.
+    Images made of few distinct tiles are looked up: each tile is convolved once, its features gathered by tile code.
+    The values and gradients are the same. An image that whole cells do not fill is continued in black.
     """
 
     def __init__(self, observation_shape: tuple[int, ...], channels: int = 8):
@@ -44,7 +43,7 @@ class CellEmbedding(nn.Module):
         if any(self._more):
             images = nn.functional.pad(images, self._more)
         pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1)
+        return self.across(torch.relu(self.conv(pixels)).permute(0, 2, 3, 1).flatten(1))
 
     def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
         """The same from tile codes, integers (N, cells), and the tiles uint8 (T, 8, 8, C) that they stand for."""
@@ -54,14 +53,17 @@ class CellEmbedding(nn.Module):
             self._pixels = pixels.permute(0, 3, 1, 2).flatten(1).float() / 255.0
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
         # index_select, not embedding: the same, and its gradient takes a sixth of the time.
-        return table.index_select(0, codes.flatten().long()).view(len(codes), -1)
+        return self.across(table.index_select(0, codes.flatten().long()).view(len(codes), -1))
+
+    def across(self, features: Tensor) -> Tensor:
+        """Further layers over all cells' features (N, features); none by default."""
+        return features
 
 
 class GridEmbedding(CellEmbedding):
-    """Whole cells, and ``LAYERS`` residual convolutions of 3 x 3 over what each is: the same rule in every place.
+    """Whole cells, and ``LAYERS`` residual convolutions of 3 x 3 over their features: the same rule in every place.
 
-    For options that meet many layouts. The dense layers alone have to learn anew in each place what a key beside the
-    agent is worth: docs/results/many-layouts.md.
+    For options that meet many layouts: docs/results/many-layouts.md.
     """
 
     CHANNELS, LAYERS = 16, 2
@@ -71,15 +73,7 @@ class GridEmbedding(CellEmbedding):
         self._cells = (observation_shape[0] // CELL, observation_shape[1] // CELL, self.CHANNELS)
         self.layers = nn.ModuleList(nn.Conv2d(self.CHANNELS, self.CHANNELS, 3, padding=1) for _ in range(self.LAYERS))
 
-    def forward(self, images: Tensor) -> Tensor:
-        """As of :class:`CellEmbedding`."""
-        return self._around(super().forward(images))
-
-    def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
-        """As of :class:`CellEmbedding`."""
-        return self._around(super().from_codes(codes, tiles))
-
-    def _around(self, features: Tensor) -> Tensor:
+    def across(self, features: Tensor) -> Tensor:
         # Channels stay last in memory, where the look-up puts them: of 256 states a layer takes half the time.
         grid = features.view(-1, *self._cells).permute(0, 3, 1, 2)
         for layer in self.layers:
@@ -90,11 +84,8 @@ class GridEmbedding(CellEmbedding):
 class PictureEmbedding(nn.Module):
     """Two convolutions with ReLU, for pictures that are not made of cells.
 
-    Chosen by measurement, for (84, 84, 4) in one thread: with kernels 6x6/6 and 3x3/2 an update with 32 transitions
-    takes 10 ms and acting for 8 environments 0.8 ms; with the usual 8x8/4 and 4x4/2 it is 19 and 1.2 ms.
-
-    Where strides would not reach the last pixels, there is a margin of zeros, of the least width with which they do.
-    With 84 pixels, where the second layer has it, an update takes 4 to 11 % more; pixels padded instead, 24 to 58 %.
+    For (84, 84, 4), in one thread, an update with these kernels takes half the time of the usual 8x8/4 and 4x4/2.
+    Where strides would not reach the last pixels, there is a margin of zeros, which costs less than to pad the pixels.
     """
 
     def __init__(self, observation_shape: tuple[int, ...]):
@@ -109,8 +100,8 @@ class PictureEmbedding(nn.Module):
         """uint8 or float32 (N, H, W, C), 0 to 255 -> float32 (N, features)."""
         pixels = images.permute(0, 3, 1, 2).float()
         # The first weights are scaled instead of the pixels: the same function, on a thousandth of the numbers.
-        scaled, layer = self.first.weight / 255.0, self.first
-        first = nn.functional.conv2d(pixels, scaled, layer.bias, layer.stride, layer.padding)
+        layer = self.first
+        first = nn.functional.conv2d(pixels, layer.weight / 255.0, layer.bias, layer.stride, layer.padding)
         return torch.relu(self.second(torch.relu(first))).flatten(1)
 
 
@@ -155,10 +146,8 @@ Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
 
 
 def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None = None, name: str = AUTO) -> Embedding:
-    """The one of this ``name``; by itself, numbers where they have a ``standard``, else cells where whole ones fill the
-    image, or convolutions over it.
-
-    Where that is too small it is a ``UserError``.
+    """The embedding of this ``name``; ``auto`` is numbers where there is a ``standard``, else cells, or convolutions
+    where whole cells do not fill the image. One too small for these is a ``UserError``.
     """
     if name == GRID:
         if standard is not None or any(side % CELL for side in observation_shape[:2]):
@@ -178,7 +167,7 @@ def embedding_for(observation_shape: tuple[int, ...], standard: Standard | None 
 
 
 class LightNetwork(nn.Module):
-    """An embedding of what is seen and two dense layers; where that is made of cells, it takes tile codes as well."""
+    """An embedding and two dense layers; with cells it takes tile codes as well."""
 
     def __init__(self, cells: Embedding):
         super().__init__()
@@ -191,7 +180,7 @@ class LightNetwork(nn.Module):
 
     def from_codes(self, codes: Tensor, tiles: NDArray[np.uint8]) -> Tensor:
         """The same from tile codes; see :meth:`CellEmbedding.from_codes`."""
-        assert isinstance(self.cells, CellEmbedding), "pictures have no tiles"
+        assert isinstance(self.cells, CellEmbedding)
         return self.head(self.trunk(self.cells.from_codes(codes, tiles)))
 
     def head(self, features: Tensor) -> Tensor:
@@ -222,9 +211,8 @@ class LightQNetwork(LightNetwork):
 class PaperQNetwork(nn.Module):
     """The paper's network of one member: two of (conv, BatchNorm, ReLU, MaxPool), a GRU, two dense layers.
 
-    The paper gives no sizes. Channels 16 and 32 with kernel 3 are those of the authors' public code
-    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``); GRU 512 gives the 10.5 M parameters measured there.
-    ReLU stands after MaxPool: the same function, on a quarter of the values.
+    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
+    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands after MaxPool: the same function, cheaper.
     """
 
     HIDDEN = 512
@@ -246,16 +234,15 @@ class PaperQNetwork(nn.Module):
     def embed(self, images: Tensor) -> Tensor:
         """uint8 (N, H, W, C) -> float32 (N, 3 * 512): what the GRU's gates get from an image alone.
 
-        Nearly all of the network's arithmetic is in here, so that an image of several executions is looked at once.
+        Nearly all of the arithmetic is in here, so that an image of several executions is computed once.
         """
-        features = self.features(images.permute(0, 3, 1, 2).float() / 255.0)
-        return self._gates(features, "ih")
+        return self._gates(self.features(images.permute(0, 3, 1, 2).float() / 255.0), "ih")
 
     def forward(self, embedded: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Unroll the GRU over an option's own steps, float32 (N, T, 3 * 512), from :meth:`embed`.
 
-        Gives values float32 (N, T, actions) and the state after the last step (1, N, 512), ``hidden`` of the next call.
-        The equations are those of ``nn.GRU``, which would compute an image's part anew for every execution it is in.
+        Returns values float32 (N, T, actions) and the last state (1, N, 512), ``hidden`` of the next call.
+        The equations are those of ``nn.GRU``, which would embed an image anew for every execution it is in.
         """
         state = embedded.new_zeros(len(embedded), self.HIDDEN) if hidden is None else hidden[0]
         states = []
@@ -296,10 +283,9 @@ def apply_all_to_states(networks: Sequence[nn.Module], engine: Pictures, ids: ND
 
 
 class Pixels:
-    """Pictures of states as float32, ready for :class:`PictureEmbedding`, on the CPU always in the same memory.
+    """At most ``most`` pictures of states as float32, on the CPU always in the same memory.
 
-    To convert them once for several networks, and into memory that is in use already, is a third of an update's time.
-    There are ``most`` of them at once.
+    To convert them once for several networks, into memory in use already, saves a third of an update's time.
     """
 
     def __init__(self, engine: Pictures, most: int, device: torch.device):

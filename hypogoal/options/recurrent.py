@@ -193,7 +193,8 @@ class RecurrentLearner(Learner):
         descend(loss, backward_of(member.online), member.optimiser, f"option {option}", where)
         member.updates += 1
         if member.updates % config.target_interval == 0:
-            follow(member.target, member.online, config.target_tau)
+            target, online = member.target.state_dict(), member.online.state_dict()
+            follow(target.values(), online.values(), config.target_tau)
         member.replay.set_priorities(indices, error.detach().abs().cpu().numpy())
         return float(loss.detach())
 

@@ -99,9 +99,9 @@ def test_follow_moves_or_copies_everything() -> None:
     target = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))
     online(torch.randn(8, 2, generator=torch.Generator().manual_seed(0)))
     before = target[0].weight.clone()
-    follow(target, online, 0.25)
+    follow(target.state_dict().values(), online.state_dict().values(), 0.25)
     torch.testing.assert_close(target[0].weight, 0.75 * before + 0.25 * online[0].weight)
-    follow(target, online, 1.0)
+    follow(target.state_dict().values(), online.state_dict().values(), 1.0)
     for mine, theirs in zip(target.state_dict().values(), online.state_dict().values(), strict=True):
         torch.testing.assert_close(mine, theirs)
 

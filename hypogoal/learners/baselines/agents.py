@@ -64,7 +64,7 @@ class _Watch(BaseCallback):
         super().__init__()
         self.env, self.checkpoints, self.log, self.progress = env, checkpoints, log, progress
         self.first_goal: int | None = None
-        self._seen, self._next = 0, LOG_INTERVAL
+        self._next = LOG_INTERVAL
 
     def _on_rollout_start(self) -> None:
         self.checkpoints.offer(lambda: self.snapshot(self.model))
@@ -72,22 +72,19 @@ class _Watch(BaseCallback):
     def snapshot(self, agent: BaseAlgorithm) -> dict[str, Any]:
         """Where this is, where the agent is, and how much is logged."""
         log = self.log.snapshot() if self.log else 0
-        watch = [self.first_goal, self._seen, self._next]
-        return {"agent": agent_snapshot(agent, self.env), "watch": watch, "log": log}
+        return {"agent": agent_snapshot(agent, self.env), "watch": [self.first_goal, self._next], "log": log}
 
     def restore(self, agent: BaseAlgorithm, snapshot: Mapping[str, Any]) -> None:
         """Continue with ``agent`` from a ``snapshot`` of the same training."""
         restore_agent(agent, self.env, snapshot["agent"])
-        self.first_goal, self._seen, self._next = snapshot["watch"]
+        self.first_goal, self._next = snapshot["watch"]
         if self.progress:
             self.progress.resume(min(self.env.episodes.steps, self.progress.total))
 
     def _on_step(self) -> bool:
         episodes = self.env.episodes
-        for row in episodes[self._seen :]:
-            if row[4] and self.first_goal is None:
-                self.first_goal = row[0]
-        self._seen = len(episodes)
+        if self.first_goal is None:  # those that ended before did not succeed
+            self.first_goal = next((row[0] for row in episodes[-self.env.num_envs :] if row[4]), None)
         if episodes.steps >= self._next:
             self._next += LOG_INTERVAL
             check_finite(self.model, episodes.steps)
@@ -236,7 +233,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> dict[str, Any]:
 
 
 def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, Any]) -> None:
-    """Continue from an ``agent_snapshot`` of an agent made with the same arguments."""
+    """Continue from an ``agent_snapshot`` of such an agent."""
     agent.policy.load_state_dict(snapshot["policy"])
     restore_optimiser(agent.policy.optimizer, snapshot["optimiser"])
     for name, value in snapshot["counts"].items():

@@ -7,6 +7,7 @@ read the two tables as theirs too. Where it is silent the value is stable-baseli
 from dataclasses import dataclass
 
 from hypogoal.core.config import setting
+from hypogoal.learners.config import WorldConfig
 
 
 @dataclass(frozen=True)
@@ -68,36 +69,20 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 
 
 @dataclass(frozen=True)
-class BaselineConfig:
-    """Which agent, on which layout, for how long; 'setting' chooses the hyperparameters."""
+class BaselineConfig(WorldConfig):
+    """Which agent, and for how long; 'setting' chooses the hyperparameters."""
 
     agent: str = setting("ppo", "the algorithm", source="paper, Figure 6", choices=("ppo", "dqn"))
     steps: int = setting(
         300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
     )
-    layout_seed: int = setting(100, "the layout to learn on", source="paper, Figure 6", low=0)
     environments: int = setting(0, "environments stepped together; 0 for the setting's own", low=0, high=4096)
-    max_episode_steps: int = setting(
-        500, "an episode is cut after this many steps", unit="steps", source="paper, MiniGrid experiment", low=1
-    )
-    cap: float = setting(
-        0.0,
-        "an episode is cut after this many times the layout's shortest path; 0 for max_episode_steps",
-        source="ours: a task in which choosing decides",
-        low=0.0,
-    )
-    world: tuple[str, ...] = setting(
-        (),
-        "changes to the world of the data, or to the default world: settings of the domain as name=value",
-        source="ours: a task in which choosing decides",
-    )
     bonus: float = setting(
         0.0,
         "reward for the first time in an episode that a member of --ensemble is positive; 0 for none",
         source="ours: a flat agent with the same knowledge",
         low=0.0,
     )
-    random_episodes: int = setting(200, "episodes of random play: how hard the layout is", source="ours", low=0)
     # Last, because from here on the name means this field.
     setting: str = setting(
         "tuned",
