@@ -25,7 +25,8 @@ def double_q_targets(
     Args:
         rewards: float (...,).
         terminal: bool (...,), True where nothing follows s'.
-        next_online, next_target: float (..., A), the networks at s'.
+        next_online: float (..., A), the online network at s'.
+        next_target: float (..., A), the target network at s'.
         gamma: discount of s', float or (...,): per step, or to the power n where s' is n steps on.
         bounded: clip the targets to 0..1, the range of an option's return: bootstrapped values that feed on themselves
             cannot grow beyond that.

@@ -59,7 +59,13 @@ def assemble(
     first = partial(read_ensemble, ensemble, dict(ensemble_config), ensemble_config["sub_goals"][0])
     learner, chooser = load_learner(config.network), load_chooser(config.chooser)
     views = views_in(config.policy_view, config.policy_pixels)
-    engine = engine_for(domain, ensemble_config, config, seed, layouts)
+    if config.termination == ORACLE:
+        columns_of(domain, ensemble_config["sub_goals"])
+    world = domain.world(played_world(domain, ensemble_config["domain_config"], config.world))
+    world |= start_arguments(domain, config, options_of(ensemble_config, config), seed)
+    world |= {"layouts": layouts} if layouts else {}
+    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **world)
+    cut(engine, config.cap)
     rules = [] if config.termination == ORACLE else [rule_of(config.termination)[0]]
     parts: list[type[Part]] = [learner, chooser, *views, *rules]
     for part in parts:
@@ -83,21 +89,6 @@ def assemble(
     if near := nearness(domain, engine, ensemble_config, config):
         near(np.repeat(engine.ids[:1], options), np.arange(options))  # so that a user's labels fail before training
     return loop
-
-
-def engine_for(
-    domain: Domain, ensemble_config: Mapping[str, Any], config: PlayConfig, seed: int, layouts: Layouts | None = None
-) -> Engine:
-    """The environments in which options of an ensemble are played; arguments as of :func:`assemble`."""
-    if config.termination == ORACLE:
-        columns_of(domain, ensemble_config["sub_goals"])
-    world = domain.world(played_world(domain, ensemble_config["domain_config"], config.world))
-    arguments = world | start_arguments(domain, config, options_of(ensemble_config, config), seed)
-    if layouts:
-        arguments["layouts"] = layouts
-    engine = domain.make_engine(config.layout_seed, config.environments, config.max_episode_steps, **arguments)
-    cut(engine, config.cap)
-    return engine
 
 
 def terminations_for(

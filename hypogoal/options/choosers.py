@@ -101,10 +101,9 @@ class RandomChooser(Chooser):
 
 
 class EvenChooser(RandomChooser):
-    """Spec D4: the offered option that has had the fewest steps so far, so that each gets as many as another.
+    """Spec D4: the offered option that has had the fewest steps so far, ties broken by ``rng``.
 
     Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
-    Ties are broken by ``rng``.
     """
 
     CHANGING = ("rng", "steps")

@@ -100,8 +100,8 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was reached, ``info["option"]`` its name.
 
     sb3-contrib's MaskablePPO calls ``action_masks()``; for a ``gymnasium.vector.SyncVectorEnv``, use
-    ``envs.call("action_masks")``. A masked option runs all the same, since agents without masks (stable-baselines3's
-    PPO) and Gymnasium's ``check_env`` draw from all of ``action_space``; ``info["masked"]`` says so.
+    ``envs.call("action_masks")``. A masked option runs all the same, for agents without masks; ``info["masked"]`` says
+    so.
 
     Args:
         env: an environment with the observations that the options were trained on.

@@ -104,14 +104,12 @@ class Recorder(Resumable):
         if not restarted:
             episodes = self.episodes
             return {"success": episodes.success(), "length": episodes.length()} if episodes else {}
-        rows = [row for option in self.executions for row in option]
-        if not rows:
-            return {}
-        return {
-            "reached": sum(row.reached for row in rows) / len(rows),
-            "terminated": sum(row.terminated for row in rows) / len(rows),
-            "duration": sum(row.duration for row in rows) / len(rows),
-        }
+        rows = self._executions()
+        names = ("reached", "terminated", "duration") if rows else ()
+        return {name: sum(getattr(row, name) for row in rows) / len(rows) for name in names}
+
+    def _executions(self) -> list[Execution]:
+        return [execution for option in self.executions for execution in option]
 
     def flush(self) -> None:
         """Close the current window of choices."""
@@ -142,7 +140,7 @@ class Recorder(Resumable):
 
         ``distance`` is of positions (n, 3) from where the sub-goal truly holds, int (n,).
         """
-        executions = [execution for option in self.executions for execution in option]
+        executions = self._executions()
         stops = np.array([execution.states[-1] for execution in executions], dtype=np.int64)
         places = self.engine.positions(stops)
         Executions.of_rows(
@@ -162,7 +160,7 @@ class Recorder(Resumable):
         there, or nearly, ``log_odds`` how sure their classifiers are. A cell is empty where there was no such state.
         """
         rows = []
-        for run in (run for option in self.executions for run in option):
+        for run in self._executions():
             states = np.array(run.states, dtype=np.int64)
             options = np.full_like(states, run.option)
             is_near, sure = near(states, options), log_odds(states, options)

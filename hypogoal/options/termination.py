@@ -37,8 +37,7 @@ class Terminations(Part):
 
     Args:
         classify: state ids (n,) -> log-odds float32 (n, O), or predictions, bool (n, O).
-        classify_group: state ids (n,) and the first option of a group -> log-odds (n, ``group``); None where to
-            classify for some options costs as much as for all.
+        classify_group: state ids (n,) and the first option of a group -> log-odds (n, ``group``); None: classify all.
         group: how many consecutive options it classifies for.
         thresholds: float32 (O,), log-odds above which a prediction is positive; None: 0, which fits predictions, too.
         environments: E.
@@ -281,14 +280,14 @@ def learned_terminations(
     members = len(ensembles[0])
     shared = ensembles[0].trunk is not None  # all members cost little more than one
 
-    def look_at(ids: NDArray[np.int64], needs_positions: bool) -> tuple[Observations, NDArray[np.int64] | None]:
-        if needs_positions and not engine.position_names:
+    def look_at(ids: NDArray[np.int64]) -> tuple[Observations, NDArray[np.int64] | None]:
+        if stacked.needs_positions and not engine.position_names:
             what = "the ensemble needs the agent's positions (localiser=ram)"
             raise UserError(what, None, "Train it with localiser=learned.")
-        return engine.images(ids), engine.positions(ids) if needs_positions else None
+        return engine.images(ids), engine.positions(ids) if stacked.needs_positions else None
 
     def classify(ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        states = look_at(ids, stacked.needs_positions)
+        states = look_at(ids)
         if len(ids) < MANY:
             return stacked.log_odds(*states)
         return np.concatenate([ensemble.log_odds(*states) for ensemble in ensembles], axis=1)
@@ -296,8 +295,8 @@ def learned_terminations(
     def classify_group(ids: NDArray[np.int64], option: int) -> NDArray[np.float32]:
         ensemble = ensembles[option // members]
         if shared:
-            return ensemble.log_odds(*look_at(ids, ensemble.needs_positions))
-        views = ensemble.see(*look_at(ids, ensemble.needs_positions))
+            return ensemble.log_odds(*look_at(ids))
+        views = ensemble.see(*look_at(ids))
         with torch.inference_mode():
             logits = networks[option](as_input(tensor(views, ensemble.thresholds.device)))
             log_odds: NDArray[np.float32] = (logits[:, 1] - logits[:, 0]).cpu().numpy()
