@@ -437,7 +437,7 @@ OBJECTIVES = [
     (_naive, "finite at extreme logits"),
     (_as_printed, "disagreement lowers it"),
     (_distance, "gradient does not vanish"),
-    (_one_sided, "finite at extreme logits"),
+    (_one_sided, "gradient does not vanish"),
     (lambda a, b: dbat.pair_loss(a, b).mean(), "shape"),
     (lambda a, b: dbat.pair_loss(a, b) * a.shape[-2] / a.shape[-2], "empty sets"),
     (lambda a, b: dbat.pair_loss(a, b) + 0.1 * a.square().sum((-2, -1)), "order does not matter"),
