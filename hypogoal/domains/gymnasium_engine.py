@@ -2,18 +2,16 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import deepcopy
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import ANEW, Unlike, growing
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode, layers
+from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 from hypogoal.domains.observations import Reading, reading_of, resized_picture
@@ -22,7 +20,6 @@ MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
-RESETS = 5  # a wrapper that drops the seed is unlikely to begin alike that often
 MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 
@@ -154,13 +151,8 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
     """``env.reset(**arguments)``: an observation, see :class:`Reader`, and a dict; ``UserError`` if malformed."""
     with UsersCode("the environment's reset", env, "reset") as code:
-        try:
-            result: Any = env.reset(**arguments)
-        except Exception:
-            code.target = _bad_reset(env, arguments)
-            raise
+        result: Any = env.reset(**arguments)
         if not _well_formed(result, 2):
-            code.target = _bad_reset(env, arguments)
             code.refuse(f"gave {_types(result)}", "Give (observation, info), info a dict.")
         return result[0], result[1]
 
@@ -168,13 +160,8 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """``env.step(action)``: an observation, see :class:`Reader`, and the rest; ``UserError`` if malformed."""
     with UsersCode("the environment's step", env, "step") as code:
-        try:
-            result: Any = env.step(action)
-        except Exception:
-            code.target = _bad_step(env, action)
-            raise
+        result: Any = env.step(action)
         if not _well_formed(result, 5):
-            code.target = _bad_step(env, action)
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_types(result)}", do)
         reward, terminated = code.number(result[1], "the reward"), code.truth(result[2], "terminated")
@@ -194,48 +181,14 @@ class Starts:
         start = digest(self.reader.read(env, observation, "reset"), repr(_generator(env)).encode())
         if self._digests.setdefault(seed, start) != start:
             do = "Pass the seed on: super().reset(seed=seed), in a wrapper self.env.reset(seed=seed, options=options)."
-            layer = culprit(env, lambda layer: not _repeats(layer, seed))
-            code = UsersCode("the environment's reset", layer, "reset")
+            code = UsersCode("the environment's reset", env, "reset")
             code.refuse(f"began two different episodes with seed={seed}", do)
         return observation
-
-
-def culprit(env: gymnasium.Env, broken: Callable[[gymnasium.Env], bool]) -> Any:
-    """The class of the innermost wrapper that is ``broken``; the whole environment if none shows the fault.
-
-    Wrappers around a broken one are broken, too.
-    """
-    return next((type(layer) for layer in reversed(layers(env)) if broken(layer)), env)
-
-
-def _bad_reset(env: gymnasium.Env, arguments: Mapping[str, Any]) -> Any:
-    return culprit(env, lambda layer: _malformed(lambda: layer.reset(**arguments), 2))
-
-
-def _bad_step(env: gymnasium.Env, action: int) -> Any:
-    return culprit(env, lambda layer: _malformed(lambda: (layer.reset(), layer.step(action))[1], 5))
 
 
 def _well_formed(result: Any, size: int) -> bool:
     """Whether ``reset`` (2 parts) or ``step`` (5 parts) returned a tuple that ends in a dictionary."""
     return isinstance(result, tuple | list) and len(result) == size and isinstance(result[-1], dict)
-
-
-def _malformed(call: Callable[[], Any], size: int) -> bool:
-    """Whether a call of ``reset`` or ``step`` fails or returns something malformed."""
-    try:
-        return not _well_formed(call(), size)
-    except Exception:  # noqa: BLE001 - whatever own code raises
-        return True
-
-
-def _repeats(env: gymnasium.Env, seed: int) -> bool:
-    """Whether ``RESETS`` episodes of one seed begin alike."""
-    try:
-        starts = [(deepcopy(env.reset(seed=seed)[0]), _generator(env)) for _ in range(RESETS)]
-    except Exception:  # noqa: BLE001 - whatever own code raises
-        return False
-    return all(data_equivalence(start, starts[0], exact=True) for start in starts)
 
 
 def _generator(env: gymnasium.Env) -> Any:

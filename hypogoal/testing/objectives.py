@@ -163,4 +163,3 @@ def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
     if not loss.requires_grad:
         return [torch.zeros_like(leaf) for leaf in leaves]
     return list(torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True))
-
