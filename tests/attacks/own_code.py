@@ -1,8 +1,8 @@
 """Spec B6, G2: random stacks of wrappers with a bad one, and random words of commands that are printed.
 
 ``python -m tests.attacks.own_code --cases 400`` prints a row for each family. A bad wrapper's case fails where
-``collect`` does not end as one line with the wrapper's file and line or method; a command's where ``sh`` gets other words than
-were printed.
+``collect`` does not end as one line that names its file and line, or its method; a command's where ``sh`` gets other
+words than were printed.
 """
 
 from __future__ import annotations

@@ -258,21 +258,16 @@ class Slow:
     ("step", "reset", "minutes"), [(0.051, 0.0, 2), (0.051, 0.0, 5), (0.002, 0.5, 2), (0.4, 0.4, 2), (1.0, 0.0, 2)]
 )
 def test_a_slow_domain_takes_no_longer_than_it_may(
-    step: float, reset: float, minutes: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    step: float, reset: float, minutes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Spec B6: it is timed, less is played, and all is looked at; what all would take is said before it is begun."""
+    """Spec B6: it is timed, less is played, and all is looked at."""
     clock = Slow(monkeypatch)
-    with Progress("check", total=1) as progress:
-        verdicts = list(check_domain(clock.domain(step, reset), seconds=60 * minutes, progress=progress))
+    verdicts = list(check_domain(clock.domain(step, reset), seconds=60 * minutes))
     require(verdicts)
     assert verdicts[-1].name == "collected again" and verdicts[-1].text == "the same states for the same seed"
     assert 30 * minutes < clock.now < 66 * minutes, "seconds"
     (told,) = (verdict.warnings for verdict in verdicts if verdict.name == "collection")
     assert re.match(r"played [\d,]+ of the 39,000 steps that 'collect' plays, for want of time: --minutes", told[0])
-    said = re.search(
-        r"^check: a step takes .* for .* steps of 7\d,\d+; --minutes (\d+) plays all$", capsys.readouterr().err, re.M
-    )
-    assert said and 78_000 * step / 60 < int(said[1]) < 4 * 78_000 * (step + reset) / 60
 
 
 def test_what_there_is_no_time_for_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,16 +280,15 @@ def test_what_there_is_no_time_for_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         assert last.warnings[1].startswith("not looked at: ") and last.warnings[1].endswith("collected again")
 
 
-def test_a_quick_domain_is_looked_at_whole(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_quick_domain_is_looked_at_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spec B6."""
     clock = Slow(monkeypatch)
     few = GymnasiumConfig(steps=500, heldout_seeds=(4, 5))
     with Progress("check", total=1) as progress:
         verdicts = list(check_domain(clock.domain(0.01), few, progress=progress))
     require(verdicts)
-    assert "check: a step takes 10 ms: about 61 s for 6,080 steps\n" in capsys.readouterr().err
     assert [verdict.name for verdict in verdicts if verdict.warnings] == ["classes"]
-    assert progress.done == progress.total
+    assert progress.done == progress.total == 5_720
 
 
 @pytest.mark.parametrize(("domain", "goal", "word"), [(NEVER, "on-the-moon", "no"), (ALWAYS, "somewhere", "every")])
