@@ -102,8 +102,7 @@ class Engine(ABC):
         ids: int64 (E,), the current state of each environment.
         elapsed: int64 (E,), steps since its episode began.
         memory: it can draw at least this many of the latest states, and forgets older frames. None: it can draw all.
-        starts: its start states, with ids 0 .. S - 1, never forgotten, each with ``on_the_way``; empty where all
-            episodes begin alike.
+        starts: its start states, with ids 0 .. S - 1, never forgotten; empty where all episodes begin alike.
         action_sets: by name, sets of actions to which a policy may be restricted.
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.

@@ -7,7 +7,6 @@ the frames of older ones are forgotten.
 import json
 from collections.abc import Mapping
 from itertools import chain
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.base import TurnEngine
-from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, draw_start, labels_of, make_starts
+from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import ladder_named
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
@@ -49,7 +48,6 @@ class MontezumaEngine(TurnEngine):
         *,
         max_steps: int = MAX_STEPS,
         start_states: int = START_STATES,
-        along: float = 0.0,
         end_at_death: bool = True,
         memory: int = MEMORY,
         seed: int = 0,
@@ -57,15 +55,12 @@ class MontezumaEngine(TurnEngine):
         if memory < count or count < 1:
             do = "Give one environment or more, and memory for each."
             raise UserError("no such engine", f"count={count}, memory={memory}", do)
-        self.count, self.max_steps, self.along, self.end_at_death = count, max_steps, along, end_at_death
+        self.count, self.max_steps, self.end_at_death = count, max_steps, end_at_death
         self.memory: int = memory
         self._emulators = [game.Emulator(seed + number) for number in range(count)]
-        of_ladders = [
-            make_starts(self._emulators[0], ladder_named(name), start_states, seed, along=along)
-            for name in start.split(",")
-        ]
-        # draw_start expects those at the top first.
-        self.starts: list[Start] = sorted(chain(*of_ladders), key=attrgetter("on_the_way"))
+        ladders = map(ladder_named, start.split(","))
+        starts = [make_starts(self._emulators[0], ladder, start_states, seed) for ladder in ladders]
+        self.starts: list[Start] = [*chain(*starts)]
         self._rng = rng_for(seed, "start-of-episode")
         self._seen: list[game.Frames] = []  # a ring; four states' stacks share a frame in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
@@ -81,7 +76,7 @@ class MontezumaEngine(TurnEngine):
         return self.n_states - len(self._seen)
 
     def _begin(self, number: int) -> int:
-        begin = draw_start(self.starts, self.along, self._rng)
+        begin = int(self._rng.integers(len(self.starts)))
         self._emulators[number].restore(self.starts[begin].snapshot)
         return begin
 

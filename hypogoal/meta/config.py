@@ -63,13 +63,7 @@ class PlayConfig(OptionConfig):
         "where episodes begin, in a domain that names several places; several, comma-separated, are equally likely",
         source="paper, policy learning; several: ours",
     )
-    along: float = setting(
-        0.0,
-        "share of episodes that begin somewhere on the way from 'start'",
-        source="a curriculum, ours",
-        low=0.0,
-        high=1.0,
-    )
+    along: float = fixed(0.0)  # a setting up to 0.15: the share of episodes that began on the way down a ladder
     layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
     layouts: str = setting(
         "",

@@ -183,16 +183,15 @@ def start_arguments(domain: Domain, config: PlayConfig, options: int, seed: int)
         seeds = layout_seeds(config.layouts, config.layout_seed)
         layouts["layouts"] = Layouts(seeds, rng_for(seed, "layouts") if len(seeds) > 1 else None)
     if not domain.starts:
-        if config.start or config.along:
-            setting = f"start={config.start}" if config.start else f"along={config.along}"
-            raise UserError(f"{domain.name} has no named starts", setting, "Leave it out.")
+        if config.start:
+            raise UserError(f"{domain.name} has no named starts", f"start={config.start}", "Leave it out.")
         return layouts
     for start in config.start.split(",") if domain.many_starts else [config.start]:
         if start not in domain.starts:
             what = "unknown start" if start else "where are episodes to begin?"
             raise UserError(what, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
     memory = frames_kept(config, options)
-    return {"start": config.start, "along": config.along, "memory": memory, "seed": seed, **layouts}
+    return {"start": config.start, "memory": memory, "seed": seed, **layouts}
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:

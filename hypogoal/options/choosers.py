@@ -39,7 +39,6 @@ class Outcome:
     began: NDArray[np.int64]  # the states in which these were chosen
     reached: NDArray[np.bool_]  # the options' own classifiers ended them
     inside: NDArray[np.bool_]  # these said yes already where they began
-    counted: NDArray[np.bool_]  # they began where the domain says that they should (Spec D4)
     returns: NDArray[np.float64]  # the environment's rewards inside the option, discounted from its start
     durations: NDArray[np.int64]  # tau, the options' steps
     discounts: NDArray[np.float64]  # gamma ** tau, for the state reached

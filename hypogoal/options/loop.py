@@ -44,7 +44,7 @@ class OptionLoop(Resumable):
 
     CHANGING = (
         *("terminations", "learner", "chooser", "recorder", "initiation", "visited"),
-        *("option", "began", "age", "inside", "returns", "counted"),
+        *("option", "began", "age", "inside", "returns"),
     )
 
     def __init__(
@@ -74,9 +74,6 @@ class OptionLoop(Resumable):
         self.age = np.zeros(count, dtype=np.int64)
         self.inside = np.zeros(count, dtype=np.bool_)  # the running option's own sub-goal held where it began
         self.returns = np.zeros(count)
-        # Spec D4: executions are counted that begin at the start proper, not on the way from there.
-        self.on_the_way = np.array([start.on_the_way for start in engine.starts], dtype=np.bool_)
-        self.counted = np.ones(count, dtype=np.bool_)
         engine.reset()
 
     def step(self) -> dict[str, float]:
@@ -127,8 +124,6 @@ class OptionLoop(Resumable):
             offered = self.initiation.narrow(ids, offered)
         chosen = self.chooser.choose(free, ids, offered)
         self.option[free], self.began[free] = chosen, ids
-        if self.config.restart_options and len(self.on_the_way):
-            self.counted[free] = ~self.on_the_way[ids]
         self.inside[free] = self.terminations.of_running(ids, chosen)
         self.age[free] = 0
         self.returns[free] = 0.0
@@ -146,7 +141,6 @@ class OptionLoop(Resumable):
             began=self.began[done],
             reached=reached[done],
             inside=self.inside[done],
-            counted=self.counted[done],
             returns=self.returns[done],
             durations=self.age[done],
             discounts=np.power(self.gamma, self.age[done], dtype=np.float64),

@@ -82,14 +82,13 @@ class Recorder(Resumable):
         self._window[:, 2] += (offered / offered.sum(1, keepdims=True)).sum(0)
 
     def finished(self, outcome: Outcome) -> None:
-        """Executions that ended; of those that are not ``counted`` none is kept in ``executions``."""
+        """Executions that ended."""
         options, reached, ids = outcome.options, outcome.reached, outcome.next_ids
         np.add.at(self._window[:, 3], options, reached)
         np.add.at(self._window[:, 4], options, outcome.durations)
         columns = (options, outcome.durations, reached, outcome.inside, outcome.terminated)
-        states = [self._states[place] for place in outcome.environments[outcome.counted].tolist()]
-        began = outcome.began[outcome.counted].tolist()
-        for row in zip(*(values[outcome.counted].tolist() for values in columns), states, began, strict=True):
+        states = [self._states[place] for place in outcome.environments.tolist()]
+        for row in zip(*(values.tolist() for values in columns), states, outcome.began.tolist(), strict=True):
             self.executions[row[0]].append(Execution(self.steps, *row))
         for place in outcome.environments.tolist():
             self._states[place] = []

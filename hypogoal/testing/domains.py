@@ -139,7 +139,7 @@ class _Contract:
 
     def make_engine(self) -> Engine:
         starts = self.domain.starts
-        arguments = {"start": starts[0], "along": 0.0, "memory": 10_000, "seed": self.seed} if starts else {}
+        arguments = {"start": starts[0], "memory": 10_000, "seed": self.seed} if starts else {}
         return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **arguments)
 
     def engine(self) -> str:

@@ -34,7 +34,7 @@ WHILE_WRITING = 0.4  # share of the kills that wait until a checkpoint is being 
 QUICK = ("warm_up=100", "max_episode_steps=60", "random_episodes=5")
 DOORKEY = ("heldout_layouts=1", "unlabelled_seeds=1")
 ROOMS = ("groups=1", "states_per_room=60", "unlabelled_per_room=30", "heldout_per_room=6")
-DESCENT = ("start=1L", "warm_up=60", "replay=300", "environments=3", "along=0.3")
+DESCENT = ("start=1L", "warm_up=60", "replay=300", "environments=3")
 
 
 def _set(*pairs: str) -> tuple[str, ...]:

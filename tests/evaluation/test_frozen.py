@@ -152,7 +152,7 @@ def test_a_bandit_begins_anew() -> None:
     bandit.begin_anew()
     chosen = bandit.choose(places, places, everything)
     no, yes, one = np.zeros(2, np.bool_), np.ones(2, np.bool_), np.ones(2)
-    bandit.record(Outcome(places, chosen, places, no, no, yes, one, places, one, places, yes, no))
+    bandit.record(Outcome(places, chosen, places, no, no, one, places, one, places, yes, no))
     bandit.learn()
     assert bandit.credit[0].sum() == 2
 

@@ -51,7 +51,7 @@ def ended(bandit: ThompsonChooser, returned: list[float], terminated: list[bool]
     """What the options that run in both environments came to."""
     no, one = np.zeros(2, np.bool_), np.ones(2)
     over = np.array(terminated), np.array(truncated)
-    bandit.record(Outcome(HERE, HERE, HERE, no, no, ~no, np.array(returned), HERE, one, HERE, *over))
+    bandit.record(Outcome(HERE, HERE, HERE, no, no, np.array(returned), HERE, one, HERE, *over))
 
 
 def test_a_domain_says_itself_what_is_solved() -> None:
@@ -59,7 +59,7 @@ def test_a_domain_says_itself_what_is_solved() -> None:
     bandit = ThompsonChooser(3, 2, np.random.default_rng(0))
     bandit.choose(HERE, HERE, only(0, 1))
     no, one, yes = np.zeros(2, np.bool_), np.ones(2), np.array([True, False])
-    bandit.record(Outcome(HERE, HERE, HERE, no, no, ~no, np.array([0.0, 1.0]), HERE, one, HERE, ~yes, yes, yes))
+    bandit.record(Outcome(HERE, HERE, HERE, no, no, np.array([0.0, 1.0]), HERE, one, HERE, ~yes, yes, yes))
     bandit.learn()
     assert bandit.credit.tolist() == [[1, 0, 0], [0, 1, 0]]
 

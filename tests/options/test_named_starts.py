@@ -108,8 +108,8 @@ def test_options_from_a_named_start(corridor: Path, tmp_path: Path) -> None:
 
 
 def test_same_seed_same_files(corridor: Path, tmp_path: Path) -> None:
-    """The project's rule: randomness is passed in; a curriculum's start states and kept actions are among it."""
-    every = {"start": "middle", "along": 0.3, "exploration": "persistent", "n_step": 3, "steps": 240}
+    """The project's rule: randomness is passed in; kept actions are among it."""
+    every = {"start": "middle", "exploration": "persistent", "n_step": 3, "steps": 240}
     for name, seed in (("one", 1), ("two", 1), ("other", 2)):
         train(corridor, tmp_path / name, seed=seed, **every)
     for path in (tmp_path / "one").iterdir():
@@ -140,9 +140,8 @@ def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
     from hypogoal.domains.doorkey import DOMAIN as doorkey
 
     ensemble = ensemble_of(tmp_path / "ensemble", doorkey, 1, "doorkey")
-    for changes in ({"start": "1L"}, {"along": 0.5}):
-        with pytest.raises(UserError, match="doorkey has no named starts"):
-            train_options(ensemble, TrainOptionsConfig(steps=10, **changes), tmp_path / "options", quiet=True)
+    with pytest.raises(UserError, match="doorkey has no named starts"):
+        train_options(ensemble, TrainOptionsConfig(steps=10, start="1L"), tmp_path / "options", quiet=True)
 
 
 def test_the_papers_number_of_steps_is_told() -> None:

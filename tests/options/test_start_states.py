@@ -11,7 +11,6 @@ import torch
 from corridor import Corridor, LongCorridor
 
 from hypogoal.core.errors import UserError
-from hypogoal.learners.episodes import LAST
 from hypogoal.options.choosers import EvenChooser, RandomChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
@@ -117,21 +116,6 @@ def test_an_option_that_begins_inside_its_sub_goal_runs_and_says_so(tmp_path: Pa
         (1, 1, 1, 0),
         (4, 0, 1, 4),
     ]
-
-
-def test_executions_that_begin_on_the_way_are_no_executions_of_figure_4(tmp_path: Path) -> None:
-    """Spec D4, F3: of a curriculum's executions those from the start proper count, and the last 100 of them."""
-    engine = LongCorridor(1, along=0.5)
-    steps = 900
-    chooser, recorder = play(engine, [LEFT] * steps, [0] * steps)
-    proper = sum(begin == 0 for begin in chooser.began)
-    assert 0.4 < proper / len(chooser.began) < 0.6
-    recorder.write_executions(tmp_path, lambda positions: positions[:, 1])
-    rows = columns(tmp_path)
-    assert len(rows) == LAST < proper
-    assert {row["duration"] for row in rows} == {2}, "from the cell on the way it takes one"
-    assert [row["step"] for row in rows] == sorted(row["step"] for row in rows)
-    assert rows[-1]["step"] > steps - 20
 
 
 def test_no_executions_no_rows(tmp_path: Path) -> None:
