@@ -386,7 +386,7 @@ NETWORKS: list[tuple[Callable[[int], Any], str]] = [
     (lambda channels: sys.exit(0), "raised SystemExit(0)"),
     (lambda channels: ([Leaves(lambda: sys.exit(0))], (8,)), "user code in test_own_code raised SystemExit(0)"),
     (lambda channels: ([Leaves(lambda: 7)], (8,)), "makes 7 of images, not a tensor"),
-    (lambda channels: ([convolution(channels).double()], (8,)), "takes no images of 3 channels"),
+    (lambda channels: ([convolution(channels).double()], (8,)), "does not take these observations"),
 ]
 
 

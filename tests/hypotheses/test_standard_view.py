@@ -87,7 +87,7 @@ def test_what_needs_pictures_is_refused(settings: dict[str, Any]) -> None:
 
 def test_a_network_for_pictures_is_refused() -> None:
     """Spec G2."""
-    with pytest.raises(UserError, match=r"'montezuma' takes images \(H, W, C\): .* Give --set network=mlp"):
+    with pytest.raises(UserError, match=r"'montezuma' does not take these observations: .* Give --set network=mlp"):
         trained(network="montezuma")
 
 

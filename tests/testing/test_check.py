@@ -506,7 +506,7 @@ def test_the_command_prints_a_line_a_check(monkeypatch: pytest.MonkeyPatch, caps
     assert "ok   images: float32 (11,)" in told and "FAIL" not in told and told.count("ok   builds") == 1
     assert main(["check", "corridor_env:SENSED", *small, "--network", "doorkey"]) == 2
     told = capsys.readouterr().out
-    assert "'doorkey' takes images (H, W, C): observation shape (11,). Give --set network=mlp" in told
+    assert "'doorkey' does not take these observations: observation shape (11,). Give --set network=mlp" in told
     assert main(["check", "corridor_env:WORDY"]) == 2
     assert "observations must be images" in capsys.readouterr().err
     assert main(["check"]) == 2
