@@ -257,8 +257,6 @@ class GymnasiumEngine(TurnEngine):
     each, see ``GymnasiumDomain``.
     """
 
-    alike = True
-
     def __init__(
         self,
         make: MakeEnv,
@@ -273,6 +271,7 @@ class GymnasiumEngine(TurnEngine):
         self.count, self.max_steps = count, max_steps
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self.memory: int = memory
+        self.room = 2 * memory
         self._envs = [make_checked(make) for _ in range(count)]
         self._labeller, self._success = labels, success
         self._earned, self._succeeded = [0.0] * count, [False] * count  # the episode so far; whether it just succeeded
@@ -289,10 +288,6 @@ class GymnasiumEngine(TurnEngine):
     @property
     def n_states(self) -> int:
         return len(self._labels) // max(1, len(self._labeller.names))
-
-    @property
-    def oldest(self) -> int:
-        return self.n_states - len(self._ring)
 
     def _begin(self, number: int) -> int:
         observation = self._starts.begin(self._envs[number], self.layouts.begin(number))
@@ -324,10 +319,7 @@ class GymnasiumEngine(TurnEngine):
         state = self._ids.get(look)
         if state is not None and state >= new - self.memory:
             return state
-        if len(self._ring) < 2 * self.memory:
-            self._ring.append(image)
-        else:
-            self._ring[new % (2 * self.memory)] = image
+        self._keep(new, image)
         self._labels += labels
         self._file(look, new)
         return new
@@ -340,11 +332,9 @@ class GymnasiumEngine(TurnEngine):
             self._ids.popitem(last=False)
 
     def images(self, ids: NDArray[np.int64], out: Observations | None = None) -> Observations:
-        if len(ids) and not self.oldest <= ids.min() <= ids.max() < self.n_states:
-            raise ValueError(f"states {self.oldest} to {self.n_states - 1} are kept, not {ids.min()} to {ids.max()}")
         out = self.room_for(len(ids), out)
-        for row, identity in enumerate(ids.tolist()):
-            out[row] = self._ring[identity % (2 * self.memory)]
+        for row, identity in enumerate(self._known(ids, kept=True).tolist()):
+            out[row] = self._ring[self._place(identity)]
         return out
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -356,12 +346,10 @@ class GymnasiumEngine(TurnEngine):
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
         return {
-            "ids": self.ids.copy(),
-            "elapsed": self.elapsed.copy(),
+            **super().snapshot(),
             "images": growing(np.stack(self._ring)),
             "labels": growing(np.frombuffer(self._labels, np.uint8).copy()),
             "played": [growing(actions, 0) for actions in self._played],
-            **({"layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -369,17 +357,16 @@ class GymnasiumEngine(TurnEngine):
 
         A ``UserError`` if they lead to other states: the environment is not deterministic.
         """
-        width, size = len(self._labeller.names), 2 * self.memory
+        super().restore(snapshot)
+        width = len(self._labeller.names)
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
-        if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, size):
+        if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, self.room):
             raise Unlike("at /loop/engine: its pictures and labels differ in number")
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
-            self._file(digest(self._ring[identity % size], labels), identity)
-        if self.layouts.many:
-            self.layouts.restore(snapshot["layouts"])
+            self._file(digest(self._ring[self._place(identity)], labels), identity)
         for number, actions in enumerate(snapshot["played"]):
             env, seed = self._envs[number], self.layouts.now[number]
             observation, _info = begun(env, seed=seed)
@@ -387,9 +374,8 @@ class GymnasiumEngine(TurnEngine):
             for action in actions:
                 observation, reward, *_ = stepped(env, action)
                 self._earned[number] += reward
-            state = int(snapshot["ids"][number])
-            if not np.array_equal(self.reader.read(env, observation), self._ring[state % size]):
+            kept = self._ring[self._place(int(self.ids[number]))]
+            if not np.array_equal(self.reader.read(env, observation), kept):
                 fault = "the environment does not repeat itself for the same seed, so this cannot be resumed"
                 raise UserError(fault, f"layout_seed={seed}", ANEW)
         self._played = [list(actions) for actions in snapshot["played"]]
-        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
