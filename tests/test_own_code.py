@@ -104,10 +104,10 @@ LIES: list[tuple[GymnasiumDomain, str]] = [
         (labelling_all({"left-end": True, "lie": value}), "the function of all labels gave the label of lie ")
         for value in [*ENDS, object()]
     ),
-    (labelling_all({"left-end": True}), "the function of all labels gave no label for lie: test_own_code.py, line "),
+    (labelling_all({"left-end": True}), "the function of all labels gave labels for left-end: test_own_code.py, line "),
     (
         labelling_all({"left-end": True, "lie": True, 3: 1}),
-        "gave a label for 3, which is not a sub-goal: test_own_code.py",
+        "gave labels for left-end, lie, 3: test_own_code.py",
     ),
     *((labelling_all(value), "the function of all labels gave a ") for value in (None, [True, True])),
     *(

@@ -392,10 +392,6 @@ class Domain(ABC):
         checked: Any = from_values(self.config_class, values, "collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
-    def small(self, config: Any) -> Any:
-        """The settings with which ``check`` collects: ``config`` with fewer states."""
-        return config
-
     def shortened(self, config: Any, steps: int) -> Any:
         """The settings with which ``check`` collects a slow domain in about ``steps``; needs ``collected_steps``."""
         return config

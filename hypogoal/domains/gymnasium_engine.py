@@ -234,15 +234,12 @@ class Labels:
     def _all(self, env: gymnasium.Env, together: LabelAll) -> NDArray[np.bool_]:
         with UsersCode("the function of all labels", together) as code:
             labels: Any = together(env)
-            do = f"Give a dictionary of {', '.join(self.names)}, each True or False."
-            if not isinstance(labels, Mapping):
-                code.refuse(f"gave a {type(labels).__name__}, not a dictionary", do)
-            for name in self.names:
-                if name not in labels:
-                    code.refuse(f"gave no label for {name}", do)
-            for name in labels:
-                if name not in self.names:
-                    code.refuse(f"gave a label for {name!r}, which is not a sub-goal", do)
+            names = {*labels} if isinstance(labels, Mapping) else None
+            if names != {*self.names}:
+                received = (
+                    f"a {type(labels).__name__}" if names is None else f"labels for {', '.join(map(str, labels))}"
+                )
+                code.refuse(f"gave {received}", f"Give a dictionary of {', '.join(self.names)}, each True or False.")
             return np.array([code.truth(labels[name], f"the label of {name}") for name in self.names], np.bool_)
 
 

@@ -245,7 +245,7 @@ class _Contract:
 
     def collect(self) -> Collected:
         try:
-            return self.domain.collect(self.small, self.seed, _Collecting(self))
+            return self.domain.collect(self.collected_with, self.seed, _Collecting(self))
         except Unmet as error:
             if error.collected is None:
                 raise
@@ -253,13 +253,13 @@ class _Contract:
             return error.collected
 
     def collection(self) -> str:
-        self.small = self.domain.small(self.config)
-        planned = self.domain.collected_steps(self.small)
+        self.collected_with = self.config
+        planned = self.domain.collected_steps(self.config)
         affordable = int(COLLECTING_SHARE * (self.end - monotonic()) / 2 / self.pace)
         self.hurried = planned > affordable
         if self.hurried:
-            self.small = self.domain.shortened(self.small, affordable)
-            steps = self.domain.collected_steps(self.small)
+            self.collected_with = self.domain.shortened(self.config, affordable)
+            steps = self.domain.collected_steps(self.collected_with)
             text = f"played {steps:,} of the {planned:,} steps that 'collect' plays, for want of time"
             warnings.warn(f"{text}: --minutes gives it more", stacklevel=2)
         self.collected = self.collect()
