@@ -33,6 +33,7 @@ def confident(*classes: int, gap: float = 6.0) -> Tensor:
 
 def shape_of_pairs(objective: Objective) -> str:
     """Leading axes are a batch."""
+    objective.losses(context_of())
     assert objective.pair_loss
     a, b = torch.randn(2, 5, 7, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     loss = objective.pair_loss(a, b)
