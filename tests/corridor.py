@@ -64,14 +64,13 @@ class Start:
     """Where an episode may begin."""
 
     cell: int
-    on_the_way: bool
 
 
 class LongCorridor(Corridor):
     """The corridor with what Montezuma's engine has: a new id at each step, the newest ``memory`` remembered.
 
-    Episodes begin at a named cell; a share ``along`` of them a cell nearer to the left end. Actions 2 and 3 go left and
-    right, 0 and 1 do nothing. The right end kills. Positions are (0, cell, 0).
+    Episodes begin at a named cell. Actions 2 and 3 go left and right, 0 and 1 do nothing. The right end kills.
+    Positions are (0, cell, 0).
     """
 
     n_actions = 4
@@ -87,13 +86,11 @@ class LongCorridor(Corridor):
         max_steps: int = 30,
         *,
         start: str = "middle",
-        along: float = 0.0,
         memory: int = 200_000,
         seed: int = 0,
     ):
-        self.memory, self.along, self.rng = memory, along, np.random.default_rng(seed)
-        cell = self.cells[start]
-        self.starts = [Start(cell, False), *([Start(cell - 1, True)] if along else [])]
+        self.memory = memory
+        self.starts = [Start(self.cells[start])]
         self.cell = [start.cell for start in self.starts]
         self.n_states = len(self.starts)
         self.count, self.max_steps = count, max_steps
@@ -111,8 +108,7 @@ class LongCorridor(Corridor):
         return self.ids.copy()
 
     def restart(self, where: np.ndarray) -> None:
-        way = self.rng.random(self.count) < self.along
-        self.ids = np.where(where, way.astype(np.int64), self.ids)
+        self.ids = np.where(where, 0, self.ids)
         self.elapsed = np.where(where, 0, self.elapsed)
 
     def step(self, actions: np.ndarray) -> Step:
@@ -129,11 +125,10 @@ class LongCorridor(Corridor):
         return Step(ids, np.zeros(self.count, np.float32), terminated, truncated)
 
     def snapshot(self) -> dict[str, Any]:
-        return {**super().snapshot(), "rng": self.rng.bit_generator.state, "cell": list(self.cell)}
+        return {**super().snapshot(), "cell": list(self.cell)}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         super().restore(snapshot)
-        self.rng.bit_generator.state = snapshot["rng"]
         self.cell = snapshot["cell"]
         self.n_states = len(self.cell)
 

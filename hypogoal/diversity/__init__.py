@@ -92,11 +92,21 @@ class Objective:
         import torch
 
         if self.ensemble_loss is not None:
-            return self.ensemble_loss(context)[None]
+            return self._checked(self.ensemble_loss, context)[None]
         assert self.pair_loss is not None
-        losses = [2.0 * self.pair_loss(first, second) for first, second in combinations(context.unlabelled, 2)]
-        losses += [self.pair_loss(old, member) for member in context.unlabelled for old in context.frozen]
-        return torch.stack(losses) if losses else context.unlabelled.new_zeros(0)
+        trained, frozen = context.unlabelled, context.frozen
+        losses = [2.0 * self._checked(self.pair_loss, *pair) for pair in combinations(trained, 2)]
+        losses += [self._checked(self.pair_loss, old, member) for member in trained for old in frozen]
+        return torch.stack(losses) if losses else trained.new_zeros(0)
+
+    def _checked(self, function: Callable[..., Tensor], *arguments: Any) -> Tensor:
+        """The loss, after a check of its shape; that it is finite is checked every few steps, or a GPU would wait."""
+        with UsersCode(f"the diversity objective {self.name}", function) as code:
+            loss: Any = function(*arguments)
+            if getattr(loss, "shape", None) != () or not loss.is_floating_point():
+                received = f"{loss.dtype} {tuple(loss.shape)}" if hasattr(loss, "dtype") else type(loss).__name__
+                code.refuse(f"gave {received}", "Give a float (): a mean over the states, axis -2.")
+            return loss
 
 
 def load_objective(name: str) -> Objective:
@@ -116,7 +126,7 @@ def load_objective(name: str) -> Objective:
     if not callable(function):
         do = "Give a pair_loss(logits_a, logits_b) or an ensemble_loss(context)."
         raise UserError("this is not a diversity objective", name, do)
-    return Objective(name, **{kind: function if name in OBJECTIVES else _watched(name, function)})
+    return Objective(name, **{kind: function})
 
 
 def _arguments(function: object) -> int:
@@ -127,24 +137,3 @@ def _arguments(function: object) -> int:
         return 0
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(parameter.kind in positional and parameter.default is parameter.empty for parameter in parameters)
-
-
-def _watched(name: str, objective: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A user's objective, with a check of its loss's shape.
-
-    Training checks every few steps whether it is finite, since each check makes a GPU wait.
-    """
-
-    def watched(*arguments: Any) -> Tensor:
-        with UsersCode(f"the diversity objective {name}", objective) as code:
-            loss = objective(*arguments)
-            logits = arguments[0].unlabelled if isinstance(arguments[0], Context) else arguments[0]
-            expected = () if isinstance(arguments[0], Context) else tuple(logits.shape[:-2])
-            shape = getattr(loss, "shape", None)
-            if shape != expected or not loss.is_floating_point():
-                kind = type(loss).__name__ if shape is None else f"{loss.dtype} {tuple(shape)}"
-                do = f"Give a float {expected}: a mean over the states, axis -2."
-                code.refuse(f"gave {kind} for logits {tuple(logits.shape)}", do)
-            return loss
-
-    return watched

@@ -102,8 +102,7 @@ class Engine(ABC):
         ids: int64 (E,), the current state of each environment.
         elapsed: int64 (E,), steps since its episode began.
         memory: it can draw at least this many of the latest states, and forgets older frames. None: it can draw all.
-        starts: its start states, with ids 0 .. S - 1, never forgotten, each with ``on_the_way``; empty where all
-            episodes begin alike.
+        starts: its start states, with ids 0 .. S - 1, never forgotten; empty where all episodes begin alike.
         action_sets: by name, sets of actions to which a policy may be restricted.
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
@@ -167,16 +166,23 @@ class Engine(ABC):
         raise UserError("this domain's engine cannot begin an episode on request", None, "Let its episodes end.")
 
     def snapshot(self) -> dict[str, Any]:
-        """Its whole state as nested dicts of arrays and JSON values; needs ``resumes``."""
-        raise UserError("this domain's engine cannot be saved", None, "Train on it without --resume.")
+        """Its whole state as nested dicts of arrays and JSON values, to be extended; needs ``resumes``."""
+        if not self.resumes:
+            raise UserError("this domain's engine cannot be saved", None, "Train on it without --resume.")
+        layouts = {"layouts": self.layouts.snapshot()} if self.layouts and self.layouts.many else {}
+        return {"ids": self.ids.copy(), "elapsed": self.elapsed.copy(), **layouts}
 
     def kept(self) -> dict[str, Any]:
         """Its snapshot for a checkpoint; on loading, ``alike`` ones are compared with a fresh snapshot."""
         return self.snapshot() if self.alike else Unknown(self.snapshot())
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments; needs ``resumes``."""
-        raise UserError("this domain's engine cannot be resumed", None, ANEW)
+        """Continue from a ``snapshot`` of an engine made with the same arguments, to be extended; needs ``resumes``."""
+        if not self.resumes:
+            raise UserError("this domain's engine cannot be resumed", None, ANEW)
+        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
+        if self.layouts and self.layouts.many:
+            self.layouts.restore(snapshot["layouts"])
 
     def take_back(self, kept: Mapping[str, Any]) -> None:
         """Continue from what :meth:`kept` returned; ``Unlike`` if an environment is in an unknown state."""
@@ -224,12 +230,41 @@ class Engine(ABC):
 
 
 class TurnEngine(Engine):
-    """An engine that steps its environments one after the other; subclasses begin an episode and play a step.
+    """An engine that steps its environments one after the other, and keeps what it saw in the newest states.
 
-    In plain Python, because NumPy's operations slow down an emulator's next frames, see ``montezuma_emulator``.
+    Subclasses begin an episode and play a step. In plain Python, because NumPy's operations slow down an emulator's
+    next frames, see ``montezuma_emulator``.
+
+    Attributes:
+        room: the number of states, besides start states, of which it keeps what it saw.
     """
 
-    restarts = resumes = True
+    restarts = resumes = alike = True
+    room: int
+    _ring: list[Any]
+
+    @property
+    def oldest(self) -> int:
+        return self.n_states - len(self._ring)
+
+    def _keep(self, state: int, seen: Any) -> None:
+        """Keep what was seen in a new state, in place of the oldest if the ring is full."""
+        if len(self._ring) < self.room:
+            self._ring.append(seen)
+        else:
+            self._ring[self._place(state)] = seen
+
+    def _place(self, state: int) -> int:
+        """A state's place in the ring."""
+        return (state - len(self.starts)) % self.room
+
+    def _known(self, ids: NDArray[np.int64], *, kept: bool = False) -> NDArray[np.int64]:
+        """The ids; ``ValueError`` if one is unknown or, where it must be ``kept``, forgotten."""
+        if len(ids) and not 0 <= ids.min() <= ids.max() < self.n_states:
+            raise ValueError(f"ids are 0 to {self.n_states - 1}, not {ids.min()} to {ids.max()}")
+        if kept and not (there := self.remembers(ids)).all():
+            raise ValueError(f"state {ids[~there][0]} is forgotten; the oldest kept is {self.oldest}")
+        return ids
 
     @abstractmethod
     def _begin(self, number: int) -> int:
@@ -356,10 +391,6 @@ class Domain(ABC):
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked: Any = from_values(self.config_class, values, "collect") if values else None
         return {name: getattr(checked, name) for name in values}
-
-    def small(self, config: Any) -> Any:
-        """The settings with which ``check`` collects: ``config`` with fewer states."""
-        return config
 
     def shortened(self, config: Any, steps: int) -> Any:
         """The settings with which ``check`` collects a slow domain in about ``steps``; needs ``collected_steps``."""

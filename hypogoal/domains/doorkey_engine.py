@@ -291,15 +291,10 @@ class DoorKeyEngine(Engine):
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs: each environment's state, and the ids assigned so far."""
         return {
-            "ids": self.ids.copy(),
-            "elapsed": self.elapsed.copy(),
+            **super().snapshot(),
             "configurations": growing(self._places[: len(self._rows)].copy()),
             "sites": growing(self._site[: self.n_states].copy()),
-            **(
-                {"seeds": growing(np.array(self._seeds)), "layouts": self.layouts.snapshot()}
-                if self.layouts.many
-                else {}
-            ),
+            **({"seeds": growing(np.array(self._seeds))} if self.layouts.many else {}),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -310,9 +305,7 @@ class DoorKeyEngine(Engine):
             self._number_of((seed, *configuration))
         for site in snapshot["sites"].tolist():
             self._new_id(site)
-        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
-        if self.layouts.many:
-            self.layouts.restore(snapshot["layouts"])
+        super().restore(snapshot)
 
     def _new_id(self, site: int) -> int:
         state = self._id_at.item(site)

@@ -2,18 +2,16 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import deepcopy
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 
 from hypogoal.core.checkpoints import ANEW, Unlike, growing
 from hypogoal.core.errors import UserError
-from hypogoal.core.own_code import UsersCode, layers
+from hypogoal.core.own_code import UsersCode
 from hypogoal.dataset import NUMBERS, PICTURE, Observations, digest
 from hypogoal.domains.base import Layouts, Step, TurnEngine
 from hypogoal.domains.observations import Reading, reading_of, resized_picture
@@ -22,7 +20,6 @@ MakeEnv = Callable[..., gymnasium.Env]
 Label = Callable[[gymnasium.Env], bool]
 LabelAll = Callable[[gymnasium.Env], Mapping[str, bool]]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
-RESETS = 5  # a wrapper that drops the seed is unlikely to begin alike that often
 MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 
@@ -154,13 +151,8 @@ def _parts(space: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
     """``env.reset(**arguments)``: an observation, see :class:`Reader`, and a dict; ``UserError`` if malformed."""
     with UsersCode("the environment's reset", env, "reset") as code:
-        try:
-            result: Any = env.reset(**arguments)
-        except Exception:
-            code.target = _bad_reset(env, arguments)
-            raise
+        result: Any = env.reset(**arguments)
         if not _well_formed(result, 2):
-            code.target = _bad_reset(env, arguments)
             code.refuse(f"gave {_types(result)}", "Give (observation, info), info a dict.")
         return result[0], result[1]
 
@@ -168,13 +160,8 @@ def begun(env: gymnasium.Env, **arguments: Any) -> tuple[Any, dict[str, Any]]:
 def stepped(env: gymnasium.Env, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """``env.step(action)``: an observation, see :class:`Reader`, and the rest; ``UserError`` if malformed."""
     with UsersCode("the environment's step", env, "step") as code:
-        try:
-            result: Any = env.step(action)
-        except Exception:
-            code.target = _bad_step(env, action)
-            raise
+        result: Any = env.step(action)
         if not _well_formed(result, 5):
-            code.target = _bad_step(env, action)
             do = "Give (observation, reward, terminated, truncated, info), info a dict."
             code.refuse(f"gave {_types(result)}", do)
         reward, terminated = code.number(result[1], "the reward"), code.truth(result[2], "terminated")
@@ -194,48 +181,14 @@ class Starts:
         start = digest(self.reader.read(env, observation, "reset"), repr(_generator(env)).encode())
         if self._digests.setdefault(seed, start) != start:
             do = "Pass the seed on: super().reset(seed=seed), in a wrapper self.env.reset(seed=seed, options=options)."
-            layer = culprit(env, lambda layer: not _repeats(layer, seed))
-            code = UsersCode("the environment's reset", layer, "reset")
+            code = UsersCode("the environment's reset", env, "reset")
             code.refuse(f"began two different episodes with seed={seed}", do)
         return observation
-
-
-def culprit(env: gymnasium.Env, broken: Callable[[gymnasium.Env], bool]) -> Any:
-    """The class of the innermost wrapper that is ``broken``; the whole environment if none shows the fault.
-
-    Wrappers around a broken one are broken, too.
-    """
-    return next((type(layer) for layer in reversed(layers(env)) if broken(layer)), env)
-
-
-def _bad_reset(env: gymnasium.Env, arguments: Mapping[str, Any]) -> Any:
-    return culprit(env, lambda layer: _malformed(lambda: layer.reset(**arguments), 2))
-
-
-def _bad_step(env: gymnasium.Env, action: int) -> Any:
-    return culprit(env, lambda layer: _malformed(lambda: (layer.reset(), layer.step(action))[1], 5))
 
 
 def _well_formed(result: Any, size: int) -> bool:
     """Whether ``reset`` (2 parts) or ``step`` (5 parts) returned a tuple that ends in a dictionary."""
     return isinstance(result, tuple | list) and len(result) == size and isinstance(result[-1], dict)
-
-
-def _malformed(call: Callable[[], Any], size: int) -> bool:
-    """Whether a call of ``reset`` or ``step`` fails or returns something malformed."""
-    try:
-        return not _well_formed(call(), size)
-    except Exception:  # noqa: BLE001 - whatever own code raises
-        return True
-
-
-def _repeats(env: gymnasium.Env, seed: int) -> bool:
-    """Whether ``RESETS`` episodes of one seed begin alike."""
-    try:
-        starts = [(deepcopy(env.reset(seed=seed)[0]), _generator(env)) for _ in range(RESETS)]
-    except Exception:  # noqa: BLE001 - whatever own code raises
-        return False
-    return all(data_equivalence(start, starts[0], exact=True) for start in starts)
 
 
 def _generator(env: gymnasium.Env) -> Any:
@@ -281,15 +234,12 @@ class Labels:
     def _all(self, env: gymnasium.Env, together: LabelAll) -> NDArray[np.bool_]:
         with UsersCode("the function of all labels", together) as code:
             labels: Any = together(env)
-            do = f"Give a dictionary of {', '.join(self.names)}, each True or False."
-            if not isinstance(labels, Mapping):
-                code.refuse(f"gave a {type(labels).__name__}, not a dictionary", do)
-            for name in self.names:
-                if name not in labels:
-                    code.refuse(f"gave no label for {name}", do)
-            for name in labels:
-                if name not in self.names:
-                    code.refuse(f"gave a label for {name!r}, which is not a sub-goal", do)
+            names = {*labels} if isinstance(labels, Mapping) else None
+            if names != {*self.names}:
+                received = (
+                    f"a {type(labels).__name__}" if names is None else f"labels for {', '.join(map(str, labels))}"
+                )
+                code.refuse(f"gave {received}", f"Give a dictionary of {', '.join(self.names)}, each True or False.")
             return np.array([code.truth(labels[name], f"the label of {name}") for name in self.names], np.bool_)
 
 
@@ -303,8 +253,6 @@ class GymnasiumEngine(TurnEngine):
     Episodes are truncated after ``max_steps`` steps, or earlier by the environment. ``success`` is called at the end of
     each, see ``GymnasiumDomain``.
     """
-
-    alike = True
 
     def __init__(
         self,
@@ -320,6 +268,7 @@ class GymnasiumEngine(TurnEngine):
         self.count, self.max_steps = count, max_steps
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self.memory: int = memory
+        self.room = 2 * memory
         self._envs = [make_checked(make) for _ in range(count)]
         self._labeller, self._success = labels, success
         self._earned, self._succeeded = [0.0] * count, [False] * count  # the episode so far; whether it just succeeded
@@ -336,10 +285,6 @@ class GymnasiumEngine(TurnEngine):
     @property
     def n_states(self) -> int:
         return len(self._labels) // max(1, len(self._labeller.names))
-
-    @property
-    def oldest(self) -> int:
-        return self.n_states - len(self._ring)
 
     def _begin(self, number: int) -> int:
         observation = self._starts.begin(self._envs[number], self.layouts.begin(number))
@@ -371,10 +316,7 @@ class GymnasiumEngine(TurnEngine):
         state = self._ids.get(look)
         if state is not None and state >= new - self.memory:
             return state
-        if len(self._ring) < 2 * self.memory:
-            self._ring.append(image)
-        else:
-            self._ring[new % (2 * self.memory)] = image
+        self._keep(new, image)
         self._labels += labels
         self._file(look, new)
         return new
@@ -387,11 +329,9 @@ class GymnasiumEngine(TurnEngine):
             self._ids.popitem(last=False)
 
     def images(self, ids: NDArray[np.int64], out: Observations | None = None) -> Observations:
-        if len(ids) and not self.oldest <= ids.min() <= ids.max() < self.n_states:
-            raise ValueError(f"states {self.oldest} to {self.n_states - 1} are kept, not {ids.min()} to {ids.max()}")
         out = self.room_for(len(ids), out)
-        for row, identity in enumerate(ids.tolist()):
-            out[row] = self._ring[identity % (2 * self.memory)]
+        for row, identity in enumerate(self._known(ids, kept=True).tolist()):
+            out[row] = self._ring[self._place(identity)]
         return out
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -403,12 +343,10 @@ class GymnasiumEngine(TurnEngine):
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
         return {
-            "ids": self.ids.copy(),
-            "elapsed": self.elapsed.copy(),
+            **super().snapshot(),
             "images": growing(np.stack(self._ring)),
             "labels": growing(np.frombuffer(self._labels, np.uint8).copy()),
             "played": [growing(actions, 0) for actions in self._played],
-            **({"layouts": self.layouts.snapshot()} if self.layouts.many else {}),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -416,17 +354,16 @@ class GymnasiumEngine(TurnEngine):
 
         A ``UserError`` if they lead to other states: the environment is not deterministic.
         """
-        width, size = len(self._labeller.names), 2 * self.memory
+        super().restore(snapshot)
+        width = len(self._labeller.names)
         self._labels = bytearray(snapshot["labels"].tobytes())
         self._ring = list(snapshot["images"])
-        if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, size):
+        if len(self._labels) % max(1, width) or len(self._ring) != min(self.n_states, self.room):
             raise Unlike("at /loop/engine: its pictures and labels differ in number")
         self._ids.clear()
         for identity in range(self.oldest, self.n_states):
             labels = self._labels[identity * width : (identity + 1) * width]
-            self._file(digest(self._ring[identity % size], labels), identity)
-        if self.layouts.many:
-            self.layouts.restore(snapshot["layouts"])
+            self._file(digest(self._ring[self._place(identity)], labels), identity)
         for number, actions in enumerate(snapshot["played"]):
             env, seed = self._envs[number], self.layouts.now[number]
             observation, _info = begun(env, seed=seed)
@@ -434,9 +371,8 @@ class GymnasiumEngine(TurnEngine):
             for action in actions:
                 observation, reward, *_ = stepped(env, action)
                 self._earned[number] += reward
-            state = int(snapshot["ids"][number])
-            if not np.array_equal(self.reader.read(env, observation), self._ring[state % size]):
+            kept = self._ring[self._place(int(self.ids[number]))]
+            if not np.array_equal(self.reader.read(env, observation), kept):
                 fault = "the environment does not repeat itself for the same seed, so this cannot be resumed"
                 raise UserError(fault, f"layout_seed={seed}", ANEW)
         self._played = [list(actions) for actions in snapshot["played"]]
-        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()

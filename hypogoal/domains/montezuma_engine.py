@@ -7,7 +7,6 @@ the frames of older ones are forgotten.
 import json
 from collections.abc import Mapping
 from itertools import chain
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains import montezuma_emulator as game
 from hypogoal.domains.base import TurnEngine
-from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, draw_start, labels_of, make_starts
+from hypogoal.domains.montezuma_env import MAX_STEPS, START_STATES, Start, labels_of, make_starts
 from hypogoal.domains.montezuma_ladders import ladder_named
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
@@ -40,7 +39,6 @@ class MontezumaEngine(TurnEngine):
     n_actions = game.N_ACTIONS
     observation_shape = game.OBSERVATION_SHAPE
     position_names = ("room", "x", "y")
-    alike = True
 
     def __init__(
         self,
@@ -49,7 +47,6 @@ class MontezumaEngine(TurnEngine):
         *,
         max_steps: int = MAX_STEPS,
         start_states: int = START_STATES,
-        along: float = 0.0,
         end_at_death: bool = True,
         memory: int = MEMORY,
         seed: int = 0,
@@ -57,17 +54,15 @@ class MontezumaEngine(TurnEngine):
         if memory < count or count < 1:
             do = "Give one environment or more, and memory for each."
             raise UserError("no such engine", f"count={count}, memory={memory}", do)
-        self.count, self.max_steps, self.along, self.end_at_death = count, max_steps, along, end_at_death
+        self.count, self.max_steps, self.end_at_death = count, max_steps, end_at_death
         self.memory: int = memory
+        self.room = memory
         self._emulators = [game.Emulator(seed + number) for number in range(count)]
-        of_ladders = [
-            make_starts(self._emulators[0], ladder_named(name), start_states, seed, along=along)
-            for name in start.split(",")
-        ]
-        # draw_start expects those at the top first.
-        self.starts: list[Start] = sorted(chain(*of_ladders), key=attrgetter("on_the_way"))
+        ladders = map(ladder_named, start.split(","))
+        starts = [make_starts(self._emulators[0], ladder, start_states, seed) for ladder in ladders]
+        self.starts: list[Start] = [*chain(*starts)]
         self._rng = rng_for(seed, "start-of-episode")
-        self._seen: list[game.Frames] = []  # a ring; four states' stacks share a frame in memory
+        self._ring: list[game.Frames] = []  # four states' stacks share a frame in memory
         self._positions = bytearray(b"".join(bytes(begin.position) for begin in self.starts))
         self._alive = bytearray([True] * len(self.starts))
         self.reset()
@@ -76,12 +71,8 @@ class MontezumaEngine(TurnEngine):
     def n_states(self) -> int:
         return len(self._alive)
 
-    @property
-    def oldest(self) -> int:
-        return self.n_states - len(self._seen)
-
     def _begin(self, number: int) -> int:
-        begin = draw_start(self.starts, self.along, self._rng)
+        begin = int(self._rng.integers(len(self.starts)))
         self._emulators[number].restore(self.starts[begin].snapshot)
         return begin
 
@@ -91,40 +82,25 @@ class MontezumaEngine(TurnEngine):
         over = emulator.ale.game_over()
         ram = emulator.ram().tobytes()
         alive = not over and ram[DYING] == 0
-        if len(self._seen) < self.memory:
-            self._seen.append(emulator.seen)
-        else:
-            self._seen[self._place(state)] = emulator.seen
+        self._keep(state, emulator.seen)
         self._positions += bytes((ram[ROOM], ram[X], ram[Y]))
         self._alive.append(alive)
         return state, reward, over or (self.end_at_death and not alive), elapsed >= self.max_steps
 
-    def _place(self, state: int) -> int:
-        """A state's place in the ring."""
-        return (state - len(self.starts)) % self.memory
-
-    def _checked(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        if len(ids) and not 0 <= ids.min() <= ids.max() < self.n_states:
-            raise ValueError(f"ids are 0 to {self.n_states - 1}, not {ids.min()} to {ids.max()}")
-        return ids
-
     def images(self, ids: NDArray[np.int64], out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
         """Observations uint8 (n, 84, 84, 4) of states (n,); ``ValueError`` if one is unknown or forgotten."""
-        fixed, oldest = len(self.starts), self.oldest
-        out = self.room_for(len(ids), out)
-        for image, state in zip(out, self._checked(ids).tolist(), strict=True):
-            if fixed <= state < oldest:
-                raise ValueError(f"state {state} is forgotten; the oldest kept is {oldest}")
-            seen = self.starts[state].snapshot.seen if state < fixed else self._seen[self._place(state)]
+        fixed, out = len(self.starts), self.room_for(len(ids), out)
+        for image, state in zip(out, self._known(ids, kept=True).tolist(), strict=True):
+            seen = self.starts[state].snapshot.seen if state < fixed else self._ring[self._place(state)]
             game.stack_frames(seen, image)
         return out
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._checked(ids)].astype(np.int64)
+        return np.frombuffer(self._positions, np.uint8).reshape(-1, 3)[self._known(ids)].astype(np.int64)
 
     def alive(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the agent is not dying and the game is not over, bool (n,), also in forgotten states."""
-        return np.frombuffer(self._alive, np.bool_)[self._checked(ids)]
+        return np.frombuffer(self._alive, np.bool_)[self._known(ids)]
 
     def labels(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
         return labels_of(self.positions(ids), self.alive(ids))
@@ -134,14 +110,13 @@ class MontezumaEngine(TurnEngine):
         saved = [emulator.save() for emulator in self._emulators]
         states = [np.frombuffer(each.state.serialize(), np.uint8) for each in saved]
         frames: dict[int, NDArray[np.uint8]] = {}  # by address, in the order of first use
-        stacks = [*self._seen, *(each.seen for each in saved)]
+        stacks = [*self._ring, *(each.seen for each in saved)]
         for seen in stacks:
             frames.update((id(frame), frame) for frame in seen)
         row = {address: number for number, address in enumerate(frames)}
         return {
+            **super().snapshot(),
             "rng": growing(np.frombuffer(json.dumps(self._rng.bit_generator.state).encode(), np.uint8)),
-            "ids": self.ids.copy(),
-            "elapsed": self.elapsed.copy(),
             "positions": growing(np.frombuffer(self._positions, np.uint8).copy()),
             "alive": growing(np.frombuffer(self._alive, np.uint8).copy()),
             "frames": growing(np.stack(list(frames.values()))),
@@ -155,8 +130,8 @@ class MontezumaEngine(TurnEngine):
         """Continue from a ``snapshot`` of an engine made with the same arguments."""
         from ale_py import ALEState
 
+        super().restore(snapshot)
         self._rng.bit_generator.state = json.loads(snapshot["rng"].tobytes())
-        self.ids, self.elapsed = snapshot["ids"].copy(), snapshot["elapsed"].copy()
         self._positions = bytearray(snapshot["positions"].tobytes())
         self._alive = bytearray(snapshot["alive"].tobytes())
         played = len(self._alive) - len(self.starts)
@@ -167,7 +142,7 @@ class MontezumaEngine(TurnEngine):
             raise Unlike("at /loop/engine: its states, positions and stacks differ in number")
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
         stacks = [tuple(frames[row] for row in rows) for rows in snapshot["stacks"].tolist()]
-        self._seen = stacks[: -self.count]
+        self._ring = stacks[: -self.count]
         states = np.split(snapshot["states"], np.cumsum(snapshot["state_sizes"])[:-1])
         now = zip(self._emulators, states, stacks[-self.count :], snapshot["screens"], strict=True)
         for emulator, state, seen, screen in now:

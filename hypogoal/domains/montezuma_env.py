@@ -3,7 +3,7 @@
 This is the reference: tests compare the training engine (``montezuma_engine.py``) with it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,28 +31,21 @@ class Start:
 
     snapshot: game.Snapshot
     position: game.Position  # of the agent
-    on_the_way: bool  # down, not at the top
     picture: NDArray[np.uint8]  # the console's, (210, 160, 3): a restored emulator has none until its first step
 
 
-def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int, *, along: float = 0.0) -> list[Start]:
-    """Spec D4: states at the top of a ladder from which the scripted descent survives, and some on the way down.
+def make_starts(emulator: game.Emulator, ladder: Ladder, count: int, seed: int) -> list[Start]:
+    """Spec D4: states at the top of a ladder from which the scripted descent survives.
 
     They differ in the phase of what moves, drawn from ``seed``, and look different if ``TRIES`` phases per state offer
     enough different looks. The top of 14-22 has one look only; its states differ out of sight.
 
-    The same seed gives the same states, those at the top first, whatever was played before; the emulator's state is
-    changed. ``along`` is the share of states on the way down, at random steps of the scripted descent; strictly between
-    0 and 1 there is at least one of each kind. Too few such states, or an invalid share, is a ``UserError``.
+    The same seed gives the same states, whatever was played before; the emulator's state is changed. Too few such
+    states is a ``UserError``.
     """
-    if not 0.0 <= along <= 1.0 or count < (2 if 0.0 < along < 1.0 else 1):
-        do = "Give along a share, 0 to 1, and one state or more of each kind."
-        raise UserError("start states cannot be split like this", f"start_states={count}, along={along}", do)
     rng = rng_for(seed, "start-states", ladder.name)
-    ways = round(along * count) if along in (0.0, 1.0) else min(max(round(along * count), 1), count - 1)
-    tops = _looking_different(_tops(emulator, ladder, TRIES * count, rng), count)
-    starts = [*tops[: count - ways], *_looking_different(_ways_down(emulator, ladder, tops, rng), ways)]
-    if len(starts) < count:
+    starts = _looking_different(_tops(emulator, ladder, TRIES * count, rng), count)
+    if len(starts) < max(count, 1):
         fault = f"only {len(starts)} of {count} start states survive the descent"
         raise UserError(fault, ladder.name, "Ask for fewer.")
     return starts
@@ -64,28 +57,12 @@ def _tops(emulator: game.Emulator, ladder: Ladder, tries: int, rng: np.random.Ge
         snapshot = emulator.place(*ladder.top, phase=phase)
         if snapshot is None or emulator.position() != ladder.top:
             continue
-        start = _start(emulator, on_the_way=False)
+        start = Start(snapshot, ladder.top, emulator.screen_rgb())
         emulator.screens = False
         survives = descend(emulator, ladder)
         emulator.screens = True
         if survives:
             yield start
-
-
-def _ways_down(
-    emulator: game.Emulator, ladder: Ladder, tops: Sequence[Start], rng: np.random.Generator
-) -> Iterator[Start]:
-    """Random steps of the descents from ``tops``, without the last, which is the base."""
-    for number in rng.permutation(len(tops) * (ladder.steps_down - 1)).tolist():
-        top, steps = divmod(number, ladder.steps_down - 1)
-        emulator.restore(tops[top].snapshot)
-        for _ in range(steps + 1):
-            emulator.step(game.DOWN)
-        yield _start(emulator, on_the_way=True)
-
-
-def _start(emulator: game.Emulator, *, on_the_way: bool) -> Start:
-    return Start(emulator.save(), emulator.position(), on_the_way, emulator.screen_rgb())
 
 
 def _looking_different(starts: Iterator[Start], count: int) -> list[Start]:
@@ -110,14 +87,6 @@ def descend(emulator: game.Emulator, ladder: Ladder) -> bool:
     return bool(within(np.array([emulator.position()]), [ladder.base], REACH))
 
 
-def draw_start(starts: Sequence[Start], along: float, rng: np.random.Generator) -> int:
-    """Draw an episode's start state, by number: with probability ``along`` one on the way down."""
-    tops = sum(not start.on_the_way for start in starts)
-    if along and rng.random() < along:
-        return int(rng.integers(tops, len(starts)))
-    return int(rng.integers(tops))
-
-
 def labels_of(positions: NDArray[np.int64], alive: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Spec B4: the true predicates, bool (n, 1), for positions (n, 3) of the agent and whether it is alive (n,)."""
     return (at_base(positions) & alive)[:, None]
@@ -134,7 +103,6 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         start: the ladder, see ``montezuma_ladders.LADDERS``.
         max_steps: agent steps after which an episode is truncated.
         end_at_death: True, an episode terminates when the agent begins to die; False, when the game is over.
-        along: the share of episodes that begin somewhere on the way down instead of at the top.
         render_mode: None, or ``rgb_array``: the console's picture, uint8 (210, 160, 3).
         start_states: the number of start states, see ``make_starts``.
         start_seed: draws those states. ``reset(seed)`` draws one of them, ``reset(options={"start_state": n})`` takes
@@ -148,16 +116,15 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         start: str = "1L",
         max_steps: int = MAX_STEPS,
         end_at_death: bool = True,
-        along: float = 0.0,
         render_mode: str | None = None,
         start_states: int = START_STATES,
         start_seed: int = 0,
     ):
-        self.max_steps, self.end_at_death, self.along, self.render_mode = max_steps, end_at_death, along, render_mode
+        self.max_steps, self.end_at_death, self.render_mode = max_steps, end_at_death, render_mode
         self.observation_space = spaces.Box(0, 255, game.OBSERVATION_SHAPE, np.uint8)
         self.action_space = spaces.Discrete(game.N_ACTIONS)
         self.emulator = game.Emulator()
-        self.starts = make_starts(self.emulator, ladder_named(start), start_states, start_seed, along=along)
+        self.starts = make_starts(self.emulator, ladder_named(start), start_states, start_seed)
         self.elapsed = 0
         self._picture: NDArray[np.uint8] | None = None
 
@@ -174,7 +141,7 @@ class MontezumaLadder(gymnasium.Env[NDArray[np.uint8], np.int64]):
         super().reset(seed=seed)
         number = (options or {}).get("start_state")
         if number is None:
-            number = draw_start(self.starts, self.along, self.np_random)
+            number = int(self.np_random.integers(len(self.starts)))
         self.emulator.restore(self.starts[number].snapshot)
         self._picture = self.starts[number].picture
         self.elapsed = 0

@@ -179,7 +179,7 @@ class TrainingStates:
         return torch.stack([torch.cat([chunk[member][0] for chunk in chunks]) for member in range(len(networks))])
 
     def batches(self, config: EnsembleConfig, seed: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see ``batch_kind``, ``class_balance``.
+        """``config.steps`` batches of labelled (B,) and unlabelled states (B,), see ``batch_kind``.
 
         Every state of a pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no
         such states.
@@ -198,11 +198,9 @@ class TrainingStates:
             ladders = self.ladders[positives]
             by_ladder = [positives[ladders == ladder] for ladder in np.unique(ladders)]
             labelled = [(by_ladder, count, "positives"), ([negatives], config.batch_size - count, "negatives")]
-        elif config.class_balance == "batch":
+        else:  # half of each, so that the class weights apply (DEV-13)
             half = config.batch_size // 2
             labelled = [([positives], half, "positives"), ([negatives], config.batch_size - half, "negatives")]
-        else:
-            labelled = [([np.arange(self.n_labelled)], config.batch_size, "labelled")]
         unlabelled = np.arange(self.n_labelled, self.n_labelled + self.n_unlabelled)
         return [*labelled, ([unlabelled], config.batch_size if len(unlabelled) else 0, "unlabelled")]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hypogoal.core.config import setting
+from hypogoal.core.config import fixed, setting
 
 BEYOND = "own: beyond the paper"
 
@@ -57,13 +57,7 @@ class EnsembleConfig:
     )
     class_weight_negative: float = setting(0.5, "weight of negatives in the cross entropy", source="Table 3", low=1e-6)
     class_weight_positive: float = setting(0.5, "weight of positives in the cross entropy", source="Table 3", low=1e-6)
-    class_balance: str = setting(
-        "batch",
-        "batch: half of each labelled batch is positive, so that the class weights apply; none: labelled states are "
-        "drawn as they come",
-        source="own choice: with none, go-to-goal (8 positives of 1,640) falls to .63 (DEV-13)",
-        choices=("batch", "none"),
-    )
+    class_balance: str = fixed("batch")  # a setting up to 0.15; with "none" go-to-goal falls to .63 (DEV-13)
     unlabelled_bn: bool = setting(
         True,
         "BatchNorm's running statistics include unlabelled batches, so that they cover more than one layout",
@@ -100,7 +94,7 @@ class EnsembleConfig:
     )
     batch_kind: str = setting(
         "plain",
-        "labelled batches: plain, by class_balance; per-ladder, 3/8 positives, equally many from each ladder",
+        "labelled batches: plain, half of them positive; per-ladder, 3/8 positives, equally many from each ladder",
         source=BEYOND,
         choices=("plain", "per-ladder"),
     )

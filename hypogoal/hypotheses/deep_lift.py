@@ -94,38 +94,32 @@ def method_of(member: nn.Module) -> str:
 
 
 def attributed(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
-    """Spec F2: every member's attributions, by the method valid for it; arguments as for :func:`deep_lift`."""
-    if method_of(ensemble.members[0]) == DEEP_LIFT:
-        return deep_lift(ensemble, observations, baseline)
+    """Spec F2: every member's attributions, by the method valid for it.
+
+    DeepLift has the rescale rule (Shrikumar et al. 2017), and computes in double, where rounding does not matter.
+    ``observations`` are the members' view of a few states (n, ...), compared with ``baseline`` (...).
+    """
+    method = method_of(ensemble.members[0])
+    inputs, reference = as_input(torch.from_numpy(observations)), as_input(torch.from_numpy(baseline[None]))
+    parts = [(_deep_lift if method == DEEP_LIFT else _integrated)(each, inputs, reference) for each in ensemble.members]
+    values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*parts, strict=True))
+    return Attributions(values, log_odds, baselines[0], method)
+
+
+def _integrated(member: nn.Module, inputs: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Attributions (n, ...), log-odds (n,) and the baseline's (1,)."""
     from captum.attr import IntegratedGradients
 
-    inputs, reference = as_input(torch.from_numpy(observations)), as_input(torch.from_numpy(baseline[None]))
-    parts = []
-    for member in ensemble.members:
-        network = nn.Sequential(member, _LogOdds(), nn.Flatten(0))
-        size = at_once(AT_ONCE, inputs.shape[1:])
-        values = IntegratedGradients(network).attribute(inputs, reference, n_steps=STEPS, internal_batch_size=size)
-        with torch.no_grad():
-            parts.append((_as_observations(values), network(inputs), network(reference)))
-    values, log_odds, baselines = (torch.stack(part, dim=1).double().numpy() for part in zip(*parts, strict=True))
-    return Attributions(values, log_odds, baselines[0], INTEGRATED)
+    network, size = nn.Sequential(member, _LogOdds()), at_once(AT_ONCE, inputs.shape[1:])
+    integrated = IntegratedGradients(network)
+    values = integrated.attribute(inputs, reference, target=0, n_steps=STEPS, internal_batch_size=size)
+    with torch.no_grad():
+        return _as_observations(values), network(inputs)[:, 0], network(reference)[:, 0]
 
 
-def deep_lift(ensemble: Ensemble, observations: Observations, baseline: Observations) -> Attributions:
-    """Spec F2: DeepLift (rescale rule, Shrikumar et al. 2017) for every member, an ``nn.Sequential`` of modules used
-    once, on the members' view of a few states (n, ...), compared with a baseline (...).
-    """
-    inputs = as_input(torch.from_numpy(observations)).double().requires_grad_()
-    reference = as_input(torch.from_numpy(baseline[None])).double()
-    parts = [_of_member(member, inputs, reference) for member in ensemble.members]
-    values, log_odds, baselines = (np.stack(part, axis=-1) for part in zip(*parts, strict=True))
-    return Attributions(np.moveaxis(values, -1, 1), log_odds, baselines[0])
-
-
-def _of_member(
-    member: nn.Module, inputs: Tensor, reference: Tensor
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Attributions (n, ...), log-odds (n,) and the baseline's (1,); in double, where rounding does not matter."""
+def _deep_lift(member: nn.Module, inputs: Tensor, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`_integrated`."""
+    inputs, reference = inputs.double(), reference.double()
     network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="IProgress not found")  # from tqdm, about a bar that is never drawn
@@ -134,10 +128,9 @@ def _of_member(
         warnings.filterwarnings("ignore", message=r"\s*Setting forward, backward hooks", category=UserWarning)
         size = at_once(AT_ONCE, (INSIDE, *inputs.shape[1:]))
         parts = [part.detach().requires_grad_() for part in inputs.split(size)]
-        values = torch.cat([DeepLift(network).attribute(part, reference, target=0) for part in parts])
+        values = torch.cat([DeepLift(network).attribute(part, reference, target=0).detach() for part in parts])
     with torch.no_grad():
-        log_odds, baseline = network(inputs)[:, 0], network(reference)[:, 0]
-    return _as_observations(values.detach()).numpy(), log_odds.numpy(), baseline.numpy()
+        return _as_observations(values), network(inputs)[:, 0], network(reference)[:, 0]
 
 
 def _as_observations(values: Tensor) -> Tensor:

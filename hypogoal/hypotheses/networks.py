@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from math import prod
@@ -34,7 +33,6 @@ CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
 Parts: TypeAlias = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
 MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
-MOST_PIXELS = 1024  # the largest side to try in the search for the smallest image
 ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
 
 
@@ -156,22 +154,18 @@ def build_network(
     """
     parts_of = load_network(name)
     where = f"observation shape {tuple(observation_shape)}"
-    channels = observation_shape[-1]
     sizes = as_input(torch.zeros(1, *observation_shape)).shape[1:]
     seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
     with torch.random.fork_rng(devices=[]):  # modules draw their weights from the global generator
         torch.manual_seed(seed)
         layers, hidden = parts_of(observation_shape)
         features = _features(layers, *sizes)
-        if features is None and len(observation_shape) != 3:
-            do = "Give --set network=mlp, or a network of your own (--set network=module:function)."
-            raise UserError(f"the network {name!r} takes images (H, W, C)", where, do)
         if features is None:
-            side = smallest_side(layers, channels)
-            if side is None:
-                fault = f"the network {name!r} takes no images of {channels} channels"
-                raise UserError(fault, where, "Its layers must take (N, channels, height, width).")
-            raise UserError(f"images too small for the network {name!r}", where, _way_out(side, observation_shape))
+            channels = observation_shape[-1]
+            built_in = {other: parts_of(channels)[0] for other, parts_of in NETWORKS.items()}
+            ways = [f"--set network={other}" for other, part in built_in.items() if _features(part, *sizes) is not None]
+            do = f"Give {', '.join(ways)}, larger pictures, or a network of your own (--set network=module:function)."
+            raise UserError(f"the network {name!r} does not take these observations", where, do)
         if not isinstance(features, Tensor):
             fault = f"the network {name!r} makes {features!r} of images, not a tensor"  # type: ignore[unreachable]
             raise UserError(fault, where, "Make a tensor.")
@@ -199,27 +193,6 @@ def _features(layers: list[nn.Module], *sizes: int) -> Tensor | None:
             return nn.Sequential(*layers).eval()(torch.zeros(1, *sizes))
     except (RuntimeError, ValueError):
         return None
-
-
-def smallest_side(layers: list[nn.Module], channels: int) -> int | None:
-    """The side, in pixels, of the smallest square image that a convolutional part takes; None if it takes none."""
-    takes = 1
-    while _features(layers, channels, takes, takes) is None:
-        takes *= 2
-        if takes > MOST_PIXELS:
-            return None
-    return bisect_left(range(takes), True, lo=1, key=lambda side: _features(layers, channels, side, side) is not None)
-
-
-def _way_out(side: int, observation_shape: tuple[int, ...]) -> str:
-    """What to do with images smaller than ``side`` pixels; names the networks that take them as they are."""
-    height, width, channels = observation_shape
-    remedies = ["give larger ones"]
-    for name, parts_of in NETWORKS.items():
-        if _features(parts_of(channels)[0], channels, height, width) is not None:
-            remedies.append(f"--set network={name}")
-    users = "a network of your own (--set network=module:function)"
-    return f"It takes {side}x{side} pixels: {', '.join(remedies)}, or {users}."
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:

@@ -13,7 +13,7 @@ from torch.autograd.graph import saved_tensors_hooks
 
 from hypogoal.core.seeding import torch_generator
 from hypogoal.dataset import NUMBERS, Observations, standard_of
-from hypogoal.diversity import OBJECTIVES, load_objective
+from hypogoal.diversity import OBJECTIVES
 from hypogoal.hypotheses.batches import TrainingStates
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
@@ -39,8 +39,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     """The cost of a step on a CPU with states like these (N, *shape), N > 1, and as many unlabelled ones in a batch.
 
     Batches grow from two states until ``seconds`` are over; the result is a line through the first and the last.
-    Members that share nothing cost the same, so one or two are tried. D-BAT replaces a user's objective, which is not
-    called. States that the network does not take are a ``UserError``.
+    D-BAT replaces a user's objective, which is not called. States that the network does not take are a ``UserError``.
     """
     pictures = states.dtype != NUMBERS
     cut, margin = pictures and config.view == "agent-crop", config.jitter
@@ -50,16 +49,14 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     shape = (config.crop_height, config.crop_width, *states.shape[3:]) if cut else states.shape[1:]
     view = FullView(shape, None if pictures else standard_of(shape, states))
     states = states if pictures else view.see(states)
-    separate, alone = config.encoder == "separate", config.schedule == "sequential"
     objective = config.diversity if config.diversity in OBJECTIVES else "dbat"
-    least = 1 if alone or load_objective(objective).pair_loss else 2  # an ensemble loss is 0 for one member
-    members = min(least, config.members) if separate else config.members
+    trained = 1 if config.schedule == "sequential" else config.members  # at once
     sizes = [2**doublings for doublings in range(1, config.batch_size.bit_length())]
     sizes += [config.batch_size] * (sizes[-1] < config.batch_size)
     config = replace(config, diversity=objective, batch_kind="plain", steps=len(sizes) + 2)
     with torch.random.fork_rng(devices=[]):
         generator = torch_generator(0, "trial")
-        ensemble = Ensemble(config.network, shape, members, generator, view, config.encoder, config.hidden_width)
+        ensemble = Ensemble(config.network, shape, config.members, generator, view, config.encoder, config.hidden_width)
         trunk, networks = ensemble.parts
         batches = TrainingStates(
             states,
@@ -72,7 +69,7 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
             trunk=trunk,
             frozen=ensemble.frozen,
         )
-        training = Round(networks, [0] if alone else range(members), batches, config, 0, 0)
+        training = Round(networks, range(trained), batches, config, 0, 0)
         _tried(training, sizes[0], ensemble)  # the first step allocates
         end, rows = time.process_time() + seconds, []
         for size in sizes:
@@ -83,16 +80,9 @@ def step_cost(states: Observations, config: EnsembleConfig, seconds: float = SEC
     kept_each, seconds_each = (max(0.0, rise) / max(1, more - fewer) for rise in (most - less, later - sooner))
     weights = sum(weight.nbytes for weight in ensemble.parameters())
     learning = LEARNING * sum(weight.nbytes for weight in training.optimiser.param_groups[0]["params"])
-    times = config.members / members  # relative to those tried
-    at_once = 1.0 if alone else times
-    copies = at_once + BACKWARD / (members if separate else 1)
-    return StepCost(
-        weights=times * weights,
-        memory=times * weights + at_once * learning + copies * (most - more * kept_each),
-        memory_each=copies * kept_each,
-        seconds=at_once * max(0.0, later - more * seconds_each),
-        seconds_each=at_once * seconds_each,
-    )
+    copies = 1.0 + BACKWARD / (trained if config.encoder == "separate" else 1)
+    memory = weights + learning + copies * (most - more * kept_each)
+    return StepCost(weights, memory, copies * kept_each, max(0.0, later - more * seconds_each), seconds_each)
 
 
 def _tried(training: Round, batch: int, ensemble: Ensemble) -> tuple[float, float]:

@@ -1,7 +1,6 @@
 """The contract of a domain, as tests for its author (Spec B6; see ``hypogoal.domains.base``)."""
 
 import dataclasses
-import math
 import traceback
 import warnings
 from collections.abc import Iterator, Mapping
@@ -17,7 +16,6 @@ from hypogoal.core.own_code import UsersCode
 from hypogoal.core.preflight import human
 from hypogoal.core.progress import Progress, duration
 from hypogoal.core.seeding import rng_for, torch_generator
-from hypogoal.core.terminal import say
 from hypogoal.dataset import (
     GET_MORE,
     NUMBERS,
@@ -30,7 +28,6 @@ from hypogoal.dataset import (
     require_names,
 )
 from hypogoal.domains.base import Domain, Engine, Step
-from hypogoal.domains.gymnasium_engine import culprit
 from hypogoal.settings import CONFIGS
 from hypogoal.testing.verdict import Test, TimeUp, Verdict, promise, run
 
@@ -39,8 +36,10 @@ LEAST_STEPS = 4  # of those STEPS, however slow the environment is
 PLAYS = 6  # how many times the tests of an engine play these steps
 SECONDS = 120.0  # the most that a check takes
 TIMED_SECONDS, TIMED_STEPS = 1.0, 5  # play needed to estimate a step's time, whichever is shorter
+TINY = 1e-9  # seconds
 ENGINE_SHARE, COLLECTING_SHARE = 1 / 3, 0.8  # of the time left when the check is planned
 IGNORED_WARNINGS = ("is different from the unwrapped version",)  # of Gymnasium's checker: wrappers are the point
+DETERMINISM = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."
 
 
 def check_domain(
@@ -60,68 +59,32 @@ def check_domain(
     ``seconds``; what it then skips is a warning, and so is a sub-goal that play does not reach. ``name`` is the user's
     name for the domain; ``progress`` shows how long this takes.
     """
-    clock = _Clock(seconds, progress or Progress("check", total=1, quiet=True))
-    yield from run(_Contract(domain, config, layout_seed, seed, clock, name).tests())
-    clock.progress.expect(clock.progress.done)
+    progress = progress or Progress("check", total=1, quiet=True)
+    progress.expect(PLAYS * COUNT * STEPS)
+    yield from run(_Contract(domain, config, layout_seed, seed, seconds, name, progress).tests())
+    progress.expect(progress.done)
 
 
-class _Clock:
-    """The time left for a check, and the time per step."""
-
-    def __init__(self, seconds: float, progress: Progress):
-        self.seconds, self.progress = seconds, progress
-        self._end = monotonic() + seconds
-        self._spent, self._steps = 0.0, 0
-
-    @property
-    def left(self) -> float:
-        """Seconds left."""
-        return self._end - monotonic()
+class _Contract:
+    def __init__(
+        self, domain: Domain, config: Any, layout_seed: int, seed: int, seconds: float, name: str, progress: Progress
+    ):
+        self.domain, self.config, self.layout_seed, self.seed = domain, config, layout_seed, seed
+        self.seconds, self.name, self.progress = seconds, name, progress
+        self.end, self.reached_all = monotonic() + seconds, True
+        self.count = STEPS  # of each test of an engine
+        self.spent, self.played = 0.0, 0  # seconds in ``steps``, and steps of single environments, for the pace
 
     @property
     def pace(self) -> float:
         """Seconds per step of one environment, new episodes and labels included."""
-        return self._spent / max(1, self._steps)
+        return max(self.spent, TINY) / max(1, self.played)
 
-    @property
-    def timed(self) -> bool:
-        """Whether enough was played to estimate the pace."""
-        return self._spent >= TIMED_SECONDS or self._steps >= TIMED_STEPS * COUNT
-
-    def count(self, started: float) -> None:
-        """Count a step of all environments that began at ``started``."""
-        self._spent += monotonic() - started
-        self._steps += COUNT
-
-    def require(self) -> None:
+    def require_time(self) -> None:
         """Raise ``TimeUp`` if time is up."""
-        if self.left < 0:
+        if monotonic() > self.end:
             do = "Give it more with --minutes, or seconds= in Python."
             raise TimeUp(f"the {duration(self.seconds)} that a check may take are over", None, do)
-
-
-class _Collecting(Progress):
-    """The progress of collecting, with ``times`` collections to come, as a part of a check's progress."""
-
-    def __init__(self, clock: _Clock, times: int):
-        super().__init__("collect", total=1, quiet=True)
-        self._clock, self._times = clock, times
-
-    def expect(self, total: int) -> None:
-        check = self._clock.progress
-        check.expect(check.done + self._times * total)
-
-    def update(self, done: int, **numbers: float) -> None:
-        self._clock.progress.advance(done - self.done)
-        self.done = done
-        self._clock.require()
-
-
-class _Contract:
-    def __init__(self, domain: Domain, config: Any, layout_seed: int, seed: int, clock: _Clock, name: str):
-        self.domain, self.config, self.layout_seed, self.seed = domain, config, layout_seed, seed
-        self.clock, self.name, self.reached_all = clock, name, True
-        self.count = STEPS  # of each test of an engine
 
     def tests(self) -> Iterator[Test]:
         yield "names", self.names
@@ -156,17 +119,18 @@ class _Contract:
         return ", ".join(f"{stage} {len(values)}" for stage, values in self.domain.defaults.items())
 
     def gymnasium(self) -> str:
-        """Gymnasium's own checker; a fault is attributed to the innermost wrapper that has it."""
+        """Gymnasium's own checker, except for rendering, and for closing, which makes the environment again."""
+        from gymnasium.utils.env_checker import check_env
+
         env = self.domain.make_env()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                _check_env(env)
+                check_env(env, skip_render_check=True, skip_close_check=True)
             except Exception as error:
                 names = " ".join(frame.name for frame in traceback.extract_tb(error.__traceback__))
                 method = next((method for method in ("reset", "step") if method in names), "")
-                layer = culprit(env, _breaks)
-                with UsersCode("the environment", layer, method, failed="breaks Gymnasium's contract:"):
+                with UsersCode("the environment", env, method, failed="breaks Gymnasium's contract:"):
                     raise
         for warning in caught:
             if not any(text in str(warning.message) for text in IGNORED_WARNINGS):
@@ -175,7 +139,7 @@ class _Contract:
 
     def make_engine(self) -> Engine:
         starts = self.domain.starts
-        arguments = {"start": starts[0], "along": 0.0, "memory": 10_000, "seed": self.seed} if starts else {}
+        arguments = {"start": starts[0], "memory": 10_000, "seed": self.seed} if starts else {}
         return self.domain.make_engine(self.layout_seed, COUNT, MAX_STEPS, **arguments)
 
     def engine(self) -> str:
@@ -279,10 +243,9 @@ class _Contract:
             _same_step(saved, restored, row, where, "Save all that the next steps depend on.")
         return "a restored engine goes on as the one it was saved from"
 
-    def collect(self, times: int) -> Collected:
-        """Collect states; ``times`` counts this and the collections to come."""
+    def collect(self) -> Collected:
         try:
-            return self.domain.collect(self.small, self.seed, _Collecting(self.clock, times))
+            return self.domain.collect(self.collected_with, self.seed, _Collecting(self))
         except Unmet as error:
             if error.collected is None:
                 raise
@@ -290,16 +253,16 @@ class _Contract:
             return error.collected
 
     def collection(self) -> str:
-        self.small = self.domain.small(self.config)
-        planned = self.domain.collected_steps(self.small)
-        affordable = int(COLLECTING_SHARE * self.clock.left / 2 / self.clock.pace)
+        self.collected_with = self.config
+        planned = self.domain.collected_steps(self.config)
+        affordable = int(COLLECTING_SHARE * (self.end - monotonic()) / 2 / self.pace)
         self.hurried = planned > affordable
         if self.hurried:
-            self.small = self.domain.shortened(self.small, affordable)
-            steps = self.domain.collected_steps(self.small)
+            self.collected_with = self.domain.shortened(self.config, affordable)
+            steps = self.domain.collected_steps(self.collected_with)
             text = f"played {steps:,} of the {planned:,} steps that 'collect' plays, for want of time"
-            warnings.warn(f"{text}: --minutes {self.minutes_for_all()} plays all", stacklevel=2)
-        self.collected = self.collect(2)
+            warnings.warn(f"{text}: --minutes gives it more", stacklevel=2)
+        self.collected = self.collect()
         goals = len(self.domain.sub_goals)
         text = f"the states' sub_goals are {self.collected.sub_goals}"
         same = tuple(self.collected.sub_goals) == tuple(self.domain.sub_goals)
@@ -338,7 +301,7 @@ class _Contract:
         return f"positives among labelled: {', '.join(text)}"
 
     def collected_again(self) -> str:
-        for (name, states), (_, again) in zip(_sets(self.collected), _sets(self.collect(1)), strict=True):
+        for (name, states), (_, again) in zip(_sets(self.collected), _sets(self.collect()), strict=True):
             same = np.array_equal(states.observations, again.observations) and np.array_equal(
                 states.labels, again.labels
             )
@@ -377,61 +340,36 @@ class _Contract:
         return f"{text}. {do}: {command(*arguments)}"
 
     def actions(self, engine: Engine, *, timed: bool = False) -> Iterator[NDArray[np.int64]]:
-        """Random actions (E,), the same at every call; ``timed``: plan the check by the first steps' time."""
+        """Random actions (E,), the same at every call; ``timed``: play less from now on if the first steps are slow."""
         rng = rng_for(self.seed, "check")
         number = 0
         while number < self.count:
-            self.clock.require()
+            self.require_time()
             started, number = monotonic(), number + 1
             yield rng.integers(engine.n_actions, size=COUNT)
             if timed:
-                planned = self.clock.timed
-                self.clock.count(started)
-                if self.clock.timed and not planned:
-                    self.plan()
-            self.clock.progress.advance(COUNT)
-
-    def plan(self) -> None:
-        """Set and announce the number of steps to play in the time left."""
-        pace, clock = self.clock.pace, self.clock
-        self.count = max(LEAST_STEPS, min(STEPS, int(ENGINE_SHARE * clock.left / (PLAYS * COUNT * pace))))
-        engine, collecting = PLAYS * COUNT * self.count, 2 * self.domain.collected_steps(self.domain.small(self.config))
-        steps = engine + min(collecting, int(COLLECTING_SHARE * max(0.0, clock.left / pace - engine)))
-        clock.progress.resume(0)
-        clock.progress.expect(steps)
-        took = f"{1000 * pace:.2g} ms" if pace < 0.1 else f"{pace:.2g} s"
-        text = f"check: a step takes {took}: about {duration(pace * steps)} for {steps:,} steps"
-        if steps < engine + collecting:
-            text += f" of {engine + collecting:,}; --minutes {self.minutes_for_all()} plays all"
-        if not clock.progress.quiet:
-            with clock.progress.paused():
-                say(text, err=True)
-
-    def minutes_for_all(self) -> int:
-        """The minutes that the check would take without a limit."""
-        steps = PLAYS * COUNT * STEPS / ENGINE_SHARE + 2 * self.domain.collected_steps(self.domain.small(self.config))
-        return math.ceil(steps * self.clock.pace / COLLECTING_SHARE / 60)
+                self.spent += monotonic() - started
+                self.played += COUNT
+            if timed and (self.spent >= TIMED_SECONDS or number == TIMED_STEPS):
+                affordable = int(ENGINE_SHARE * (self.end - monotonic()) / (PLAYS * COUNT * self.pace))
+                self.count = min(self.count, max(LEAST_STEPS, affordable))
+            self.progress.advance(COUNT)
 
 
-def _check_env(env: Any) -> None:
-    """Run Gymnasium's checker, except for rendering, and for closing, which makes the environment again."""
-    from gymnasium.utils.env_checker import check_env
+class _Collecting(Progress):
+    """The progress of collecting, as a part of a check's, which ends when its time is up."""
 
-    check_env(env, skip_render_check=True, skip_close_check=True)
+    def __init__(self, check: _Contract):
+        super().__init__("collect", total=1, quiet=True)
+        self.check = check
 
+    def expect(self, total: int) -> None:
+        self.check.progress.expect(self.check.progress.done + total)
 
-def _breaks(env: Any) -> bool:
-    """Whether Gymnasium's checker rejects it."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            _check_env(env)
-        except Exception:  # noqa: BLE001 - whatever own code raises
-            return True
-    return False
-
-
-DETERMINISM = "All randomness must come from the seed: for a Gymnasium environment from self.np_random."
+    def update(self, done: int, **numbers: float) -> None:
+        self.check.progress.advance(done - self.done)
+        self.done = done
+        self.check.require_time()
 
 
 def _sets(collected: Collected) -> list[tuple[str, States]]:

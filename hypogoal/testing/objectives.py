@@ -1,6 +1,6 @@
 """The laws of a diversity objective, as tests for its author (Spec C1, C2; see ``hypogoal.diversity``)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -8,24 +8,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hypogoal.diversity import Context, EnsembleLoss, Objective, PairLoss
+from hypogoal.diversity import Context, Objective
 from hypogoal.testing.verdict import Verdict, promise, run
 
 EXTREME = (20.0, 100.0, 1e4)  # logit gaps: from 17, a float32 probability is exactly 0 or 1
 AGREED = ((1, 0), (1, 1), (0, 0))
+LEAST_GRADIENT = 1e-6
+LOG_SPACE = "Compute from log_softmax"
 
 
 def check_objective(objective: Objective) -> Iterator[Verdict]:
     """Whether a diversity objective, see :func:`hypogoal.diversity.load_objective`, obeys the laws of training."""
-    laws: list[tuple[Callable[[Any], str], Any]] = [(law, objective) for law in OF_ALL]
-    if objective.pair_loss:
-        laws = [(shape, objective.pair_loss), *laws, *((law, objective.pair_loss) for law in OF_PAIRS)]
-    else:
-        laws = [(ensemble_shape, objective.ensemble_loss), *laws]
-        laws += [(law, objective.ensemble_loss) for law in OF_ENSEMBLES]
-    return run(
-        (law.__name__.replace("_", " ").removeprefix("ensemble "), partial(law, subject)) for law, subject in laws
-    )
+    laws = [shape_of_pairs if objective.pair_loss else shape, empty_sets, order_does_not_matter]
+    laws += [disagreement_lowers_it] if objective.pair_loss else []
+    laws += [finite_at_extreme_logits, gradient_does_not_vanish]
+    return run((law.__name__.removesuffix("_of_pairs").replace("_", " "), partial(law, objective)) for law in laws)
 
 
 def confident(*classes: int, gap: float = 6.0) -> Tensor:
@@ -34,75 +31,36 @@ def confident(*classes: int, gap: float = 6.0) -> Tensor:
     return torch.stack([-sign * gap / 2, sign * gap / 2], dim=-1)
 
 
-def shape(pair_loss: PairLoss) -> str:
+def shape_of_pairs(objective: Objective) -> str:
     """Leading axes are a batch."""
+    objective.losses(context_of())
+    assert objective.pair_loss
     a, b = torch.randn(2, 5, 7, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    loss = pair_loss(a, b)
+    loss = objective.pair_loss(a, b)
     text = f"logits (5, 7, 2) give a loss {tuple(loss.shape)}"
     promise(loss.shape == (5,), text, "Give (5,): a mean over the states, axis -2.")
-    alone = torch.allclose(loss[2], pair_loss(a[2], b[2]))
+    alone = torch.allclose(loss[2], objective.pair_loss(a[2], b[2]))
     promise(alone, "a pair's loss depends on the others in the batch", "Treat leading axes one by one.")
     return "(..., N, 2) gives (...,)"
 
 
-def disagreement_lowers_it(pair_loss: PairLoss) -> str:
+def shape(objective: Objective) -> str:
+    """One number, for any number of members in training and frozen ones."""
+    for members, frozen in ((1, 0), (2, 0), (3, 0), (1, 2), (2, 1)):
+        (loss,) = objective.losses(context_of(members, frozen=frozen))
+        text = f"{members} members and {frozen} frozen ones give {loss.tolist()}"
+        promise(loss.shape == () and bool(loss.isfinite()), text, "Give one finite number, a tensor ().")
+    return "one number for 1 to 3 members, frozen ones among them"
+
+
+def disagreement_lowers_it(objective: Objective) -> str:
     """The trap of Spec C2: Eq. (1) as printed rewards agreement."""
+    assert objective.pair_loss
     member = confident(1, 1, 0, 0)
-    agreeing, half = (float(pair_loss(member, other)) for other in (member, confident(1, 0, 1, 0)))
+    agreeing, half = (float(objective.pair_loss(member, other)) for other in (member, confident(1, 0, 1, 0)))
     text = f"members that agree everywhere have {agreeing:.4g}, members that differ on half of the states {half:.4g}"
     promise(half < agreeing, text, "The loss must be lower where they differ: has a sign been lost?")
     return f"{agreeing:.4g} agreeing, {half:.4g} differing on half of the states"
-
-
-def descent_parts_members(pair_loss: PairLoss, steps: int = 400) -> str:
-    """The gradient, not only the value, pushes members apart."""
-    fixed = confident(1, 1, 0, 0, gap=2.0)
-    moved = (fixed + 0.05 * torch.tensor([[0.0, 0.3], [0.0, -0.3], [0.2, 0.0], [-0.2, 0.0]])).requires_grad_()
-    optimiser = torch.optim.SGD([moved], lr=1.0)
-    for _ in range(steps):
-        optimiser.zero_grad()
-        pair_loss(fixed, moved).backward()
-        optimiser.step()
-    p, q = fixed.softmax(-1)[:, 1], moved.detach().softmax(-1)[:, 1]
-    before = float((2 * p * (1 - p)).mean())
-    after = float((p * (1 - q) + (1 - p) * q).mean())
-    text = f"after {steps} steps of descent members disagree with probability {after:.3f}, {before:.3f} before"
-    promise(after > before + 0.02, text, "Its gradient must push agreeing members apart.")
-    return f"disagreement rises from {before:.2f} to {after:.2f}"
-
-
-def finite_at_extreme_logits(pair_loss: PairLoss) -> str:
-    """Probabilities that round to exactly 0 and 1."""
-    for gap in EXTREME:
-        for pair in (((1, 0), (1, 0)), ((1, 0), (0, 1)), ((1, 1), (1, 1)), ((1, 1), (0, 0))):
-            a, b = (confident(*classes, gap=gap).requires_grad_() for classes in pair)
-            loss = pair_loss(a, b)
-            loss.backward()
-            gradients = [logits.grad for logits in (a, b) if logits.grad is not None]
-            finite = all(bool(numbers.isfinite().all()) for numbers in (loss, *gradients))
-            text = f"at logits {gap:g} apart the loss is {loss.detach():.4g}, its gradient not finite or none"
-            promise(finite, text, "Compute from log_softmax (logsumexp, logaddexp), not from probabilities.")
-            promise(len(gradients) == 2, "one member gets no gradient", "Do not detach either member's logits.")
-    return f"logits up to {EXTREME[-1]:g} apart"
-
-
-def gradient_does_not_vanish(pair_loss: PairLoss, gap: float = 10.0) -> str:
-    """Confident members that agree must still be pushed apart.
-
-    An objective that compares members across states, such as mutual information, has no gradient if each predicts one
-    class for all states, so one of three cases suffices.
-    """
-    largest = 0.0
-    for classes in AGREED:
-        a, b = (confident(*classes, gap=gap).requires_grad_() for _ in range(2))
-        pair_loss(a, b).backward()
-        largest = max(largest, *(float(x.grad.abs().max()) for x in (a, b) if x.grad is not None))
-    text = f"members that agree with logits {gap:g} apart get a gradient of {largest:.1g}"
-    promise(largest >= 1e-6, text, "Compute from log_softmax: from probabilities nothing of it is left.")
-    return f"{largest:.2g} where sure members agree"
-
-
-OF_PAIRS = (disagreement_lowers_it, descent_parts_members, finite_at_extreme_logits, gradient_does_not_vanish)
 
 
 def context_of(
@@ -146,15 +104,6 @@ def rearranged(context: Context, members: Tensor, states: Tensor) -> Context:
     )
 
 
-def ensemble_shape(ensemble_loss: EnsembleLoss) -> str:
-    """One number, for any number of members in training and frozen ones."""
-    for members, frozen in ((1, 0), (2, 0), (3, 0), (1, 2), (2, 1)):
-        loss = ensemble_loss(context_of(members, frozen=frozen))
-        text = f"{members} members and {frozen} frozen ones give {loss.tolist()}"
-        promise(loss.shape == () and bool(loss.isfinite()), text, "Give one finite number, a tensor ().")
-    return "one number for 1 to 3 members, frozen ones among them"
-
-
 def empty_sets(objective: Objective) -> str:
     """No unlabelled states."""
     context = context_of(states=0)
@@ -177,24 +126,34 @@ def order_does_not_matter(objective: Objective) -> str:
     return "members and states are interchangeable"
 
 
-def ensemble_finite_at_extreme_logits(ensemble_loss: EnsembleLoss) -> str:
+def finite_at_extreme_logits(objective: Objective) -> str:
     """Probabilities that round to exactly 0 and 1."""
     for gap in EXTREME:
         context = context_of(gap=gap, dtype=torch.float32)
-        loss = ensemble_loss(context)
+        loss = objective.losses(context).sum()
         finite = all(bool(number.isfinite().all()) for number in (loss, *_differentiate(loss, context)))
         text = f"at logits {gap:g} apart the loss is {loss.item():.4g}, or its gradient not finite"
-        promise(finite, text, "Compute from log_softmax (logsumexp, logaddexp), not from probabilities.")
+        promise(finite, text, f"{LOG_SPACE} (logsumexp, logaddexp), not from probabilities.")
     return f"logits up to {EXTREME[-1]:g} apart"
 
 
-def ensemble_gradient_does_not_vanish(ensemble_loss: EnsembleLoss) -> str:
-    """Each of three members gets a gradient, through its logits, features or input gradients."""
+def gradient_does_not_vanish(objective: Objective, gap: float = 10.0) -> str:
+    """Each of three members gets a gradient, through its logits, features or input gradients.
+
+    Of a pair, confident members that agree must also be pushed apart. An objective that compares members across states,
+    such as mutual information, has no gradient if each predicts one class for all states, so one of three cases
+    suffices.
+    """
     context = context_of()
-    gradients = _differentiate(ensemble_loss(context), context)
-    largest = [max(float(of_members[member].abs().max()) for of_members in gradients) for member in range(3)]
+    gradients = _differentiate(objective.losses(context).sum(), context)
+    largest = [max(float(by_member[member].abs().max()) for by_member in gradients) for member in range(3)]
     text = f"member {largest.index(min(largest))} gets a gradient of {min(largest):.1g}"
-    promise(min(largest) >= 1e-6, text, "Do not detach it, and compute from log_softmax.")
+    promise(min(largest) >= LEAST_GRADIENT, text, "Do not detach it, and compute from log_softmax.")
+    if objective.pair_loss:
+        agreed = [torch.stack([confident(*classes, gap=gap)] * 2).requires_grad_() for classes in AGREED]
+        sure = max(float(torch.autograd.grad(objective.pair_loss(*pair), pair)[0].abs().max()) for pair in agreed)
+        text = f"members that agree with logits {gap:g} apart get a gradient of {sure:.1g}"
+        promise(sure >= LEAST_GRADIENT, text, f"{LOG_SPACE}: from probabilities nothing of it is left.")
     return f"at least {min(largest):.2g} for each member"
 
 
@@ -205,7 +164,3 @@ def _differentiate(loss: Tensor, context: Context) -> list[Tensor]:
     if not loss.requires_grad:
         return [torch.zeros_like(leaf) for leaf in leaves]
     return list(torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True))
-
-
-OF_ALL = (empty_sets, order_does_not_matter)
-OF_ENSEMBLES = (ensemble_finite_at_extreme_logits, ensemble_gradient_does_not_vanish)

@@ -1,8 +1,8 @@
 """Spec B6, G2: random stacks of wrappers with a bad one, and random words of commands that are printed.
 
 ``python -m tests.attacks.own_code --cases 400`` prints a row for each family. A bad wrapper's case fails where
-``collect`` does not end as one line with the wrapper's file and line; a command's where ``sh`` gets other words than
-were printed.
+``collect`` does not end as one line that names its file and line, or its method; a command's where ``sh`` gets other
+words than were printed.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ GOOD = (Plain, gymnasium.wrappers.OrderEnforcing, lambda env: gymnasium.wrappers
 
 
 def wrappers(rng: random.Random) -> bool:
-    """Whether a bad wrapper somewhere in a stack is named, by the line where its method or a line of it stands."""
+    """Whether a bad wrapper somewhere in a stack is named: by a line of its method, or by the method in the error."""
     bad = rng.choice(BAD)
     method = getattr(bad, next(name for name in ("reset", "step") if name in vars(bad)))
     layers: list[Any] = [bad, *rng.choices(GOOD, k=rng.randrange(4))]
@@ -116,8 +116,9 @@ def wrappers(rng: random.Random) -> bool:
     try:
         domain.collect(FEW, rng.randrange(100), Progress("collect", 1, quiet=True))
     except UserError as error:
-        lines = [f"own_code.py, line {line}" for line in range(first, first + len(source))]
-        return "\n" not in str(error) and any(line in str(error) for line in lines)
+        places = [f"own_code.py, line {line}" for line in range(first, first + len(source))]
+        places.append(f"{bad.__name__}.{method.__name__}()")
+        return "\n" not in str(error) and any(place in str(error) for place in places)
     return False
 
 

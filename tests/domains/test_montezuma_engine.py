@@ -27,7 +27,7 @@ from hypogoal.domains.montezuma_emulator import (
     Emulator,
 )
 from hypogoal.domains.montezuma_engine import MontezumaEngine
-from hypogoal.domains.montezuma_env import SUB_GOALS, MontezumaLadder, descend, draw_start, make_starts
+from hypogoal.domains.montezuma_env import SUB_GOALS, MontezumaLadder, descend, make_starts
 from hypogoal.domains.montezuma_ladders import BY_NAME, at_base, distance_to_base
 
 pytestmark = pytest.mark.atari
@@ -68,7 +68,6 @@ def test_start_states_are_at_the_top_and_live(emulator: Emulator, name: str) -> 
     assert len({start.snapshot.stack.tobytes() for start in starts}) == 6
     for start in starts:
         assert start.position == ladder.top
-        assert not start.on_the_way
         emulator.restore(start.snapshot)
         assert emulator.position() == ladder.top
         assert emulator.alive()
@@ -80,35 +79,11 @@ def test_start_states_follow_from_the_seed(emulator: Emulator) -> None:
     """Spec G1: the same in another emulator that played something else; another seed gives others."""
     ladder = BY_NAME["1L"]
     looks = [
-        [start.snapshot.stack.tobytes() for start in make_starts(one, ladder, 5, seed, along=0.4)]
+        [start.snapshot.stack.tobytes() for start in make_starts(one, ladder, 5, seed)]
         for one, seed in ((emulator, 0), (Emulator(seed=9), 0), (emulator, 1))
     ]
     assert looks[0] == looks[1]
     assert not set(looks[0]) & set(looks[2])
-
-
-def test_start_states_on_the_way_down(emulator: Emulator) -> None:
-    """Spec D4: a share of them lies between top and base, at different heights; a descent from there lives."""
-    ladder = BY_NAME["1L"]
-    starts = make_starts(emulator, ladder, 10, seed=0, along=0.6)
-    assert [start.on_the_way for start in starts] == [False] * 4 + [True] * 6
-    assert len({start.snapshot.stack.tobytes() for start in starts}) == 10
-    heights = [start.position.y for start in starts[4:]]
-    assert all(ladder.base.y + 2 < height < ladder.top.y for height in heights)
-    assert len(set(heights)) >= 3
-    for start in starts[4:]:
-        emulator.restore(start.snapshot)
-        for _ in range(ladder.steps_down):
-            emulator.step(DOWN)
-        assert emulator.alive()
-        assert emulator.position() == ladder.base
-    rng = np.random.default_rng(0)
-    share = np.mean([starts[draw_start(starts, 0.25, rng)].on_the_way for _ in range(2000)])
-    assert abs(share - 0.25) < 0.04
-    only = make_starts(emulator, ladder, 3, seed=0, along=1.0)
-    assert all(start.on_the_way for start in only)
-    assert only[draw_start(only, 1.0, rng)].on_the_way
-    assert [start.on_the_way for start in make_starts(emulator, ladder, 2, seed=0, along=0.01)] == [False, True]
 
 
 def test_where_nothing_moves_the_rest_of_the_game_differs(emulator: Emulator) -> None:
@@ -125,10 +100,9 @@ def test_where_nothing_moves_the_rest_of_the_game_differs(emulator: Emulator) ->
 
 
 def test_start_states_that_cannot_be(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spec G2: too few phases to live from, or no share, is one clear line."""
-    for count, along in ((3, 1.5), (3, -0.1), (0, 0.0), (1, 0.5)):
-        with pytest.raises(UserError, match=f"start_states={count}, along={along}"):
-            make_starts(emulator, BY_NAME["1L"], count, seed=0, along=along)
+    """Spec G2: too few phases to live from, or no state at all, is one clear line."""
+    with pytest.raises(UserError, match="only 0 of 0 start states"):
+        make_starts(emulator, BY_NAME["1L"], 0, seed=0)
     monkeypatch.setattr(montezuma_env, "PHASES", range(2, 5))
     with pytest.raises(UserError, match=r"only 3 of 4 start states survive the descent: 1L\. Ask for fewer"):
         make_starts(emulator, BY_NAME["1L"], 4, seed=0)
@@ -365,17 +339,6 @@ def test_rewards_and_ends() -> None:
         assert engine.alive(np.array([0]))[0]
 
 
-def test_episodes_on_the_way_down() -> None:
-    """Spec D4: with ``along``, that share of episodes begins between top and base."""
-    engine = MontezumaEngine("1L", 2, start_states=6, along=0.5)
-    heights = []
-    for _ in range(150):
-        heights += engine.positions(engine.reset())[:, 2].tolist()
-    share = np.mean(np.array(heights) < 192)
-    assert 0.4 < share < 0.6
-    assert min(heights) > 150
-
-
 def played(engine: MontezumaEngine, actions: NDArray[np.int64]) -> list[NDArray[np.generic]]:
     """All that an engine says while it plays the actions (T, E)."""
     said: list[NDArray[np.generic]] = []
@@ -399,7 +362,7 @@ def test_a_seed_says_everything() -> None:
 def test_snapshots_are_exact() -> None:
     """Spec G1: an engine resumed from plain arrays goes on bit for bit, its memory overrun or not."""
     actions = busy(np.random.default_rng(2), (140, 2))
-    make = {"start_states": 5, "max_steps": 25, "memory": 90, "along": 0.5}
+    make = {"start_states": 5, "max_steps": 25, "memory": 90}
     unbroken, resumed = (MontezumaEngine("1L", 2, **make) for _ in range(2))  # type: ignore[arg-type]
     for begin, end in ((5, 40), (80, 140)):
         played(unbroken, actions[(unbroken.n_states - 5) // 2 : begin])

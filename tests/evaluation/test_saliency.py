@@ -17,7 +17,6 @@ from hypogoal.hypotheses.deep_lift import (
     Attributions,
     attributable,
     attributed,
-    deep_lift,
     explanation,
     mean_state,
     method_of,
@@ -51,7 +50,7 @@ def states(*rows):
 def test_a_linear_member_by_hand():
     """Spec F2: each pixel's attribution is its weight times what it differs from the baseline."""
     member = nn.Sequential(nn.Flatten(), dense([2.0, -3.0]))
-    found = deep_lift(Members(member), states([1, 0.2], [0, 0]), states([0.2, 0])[0])
+    found = attributed(Members(member), states([1, 0.2], [0, 0]), states([0.2, 0])[0])
     np.testing.assert_allclose(found.values[:, 0, 0, :, 0], [[1.6, -0.6], [-0.4, 0]], atol=1e-7)
     np.testing.assert_allclose(found.log_odds[:, 0], [1.4, 0], atol=1e-7)
     np.testing.assert_allclose(found.baseline_log_odds, [0.4], atol=1e-7)
@@ -67,7 +66,7 @@ def test_a_relu_by_hand():
     with torch.no_grad():
         first.weight[:], first.bias[:] = 1.0, -1.0
     member = nn.Sequential(nn.Flatten(), first, nn.ReLU(), dense([1.0]))
-    found = deep_lift(Members(member), states([1, 1]), states([0, 0])[0])
+    found = attributed(Members(member), states([1, 1]), states([0, 0])[0])
     np.testing.assert_allclose(found.values.ravel(), [0.5, 0.5], atol=1e-7)
 
 
@@ -120,7 +119,7 @@ def test_overlapping_windows_by_hand():
     Captum's own rule credits it for one, and its attributions do not add up.
     """
     member = nn.Sequential(nn.MaxPool2d((1, 2), stride=1), nn.Flatten(), dense([1.0, 10.0]))
-    found = deep_lift(Members(member), states([0, 1, 0]), states([0, 0, 0])[0])
+    found = attributed(Members(member), states([0, 1, 0]), states([0, 0, 0])[0])
     np.testing.assert_allclose(found.values.ravel(), [0, 11, 0], atol=1e-7)
     assert found.completeness_error().max() < BOUND
 
@@ -153,7 +152,7 @@ def test_attributions_are_complete(network):
     observations = (255 * (rng.random((3, *SHAPES[network])) > 0.7)).astype(np.uint8)
     ensemble = trained(network)
     before = ensemble.state()
-    found = deep_lift(
+    found = attributed(
         ensemble, observations, mean_state(rng.integers(256, size=(20, *SHAPES[network]), dtype=np.uint8))
     )
     assert found.values.shape == (3, 2, *SHAPES[network])
@@ -180,7 +179,7 @@ def test_the_chain_is_the_member(network):
 def test_global_pooling_is_taken_apart_too():
     """Spec F2: a network that ends in a maximum over the whole image is complete as well."""
     member = nn.Sequential(nn.AdaptiveMaxPool2d(1), nn.Flatten(), dense([2.0]))
-    found = deep_lift(Members(member), states([0.2, 1, 0.4]), states([0.6, 0.2, 0])[0])
+    found = attributed(Members(member), states([0.2, 1, 0.4]), states([0.6, 0.2, 0])[0])
     assert found.completeness_error().max() < BOUND
     assert found.values.sum() == pytest.approx(2 * (1 - 0.6))
 
@@ -191,7 +190,7 @@ def test_the_state_that_is_the_baseline_has_no_attribution():
     assert mean_state(observations).tolist() == [[[12, 20]]]
     ensemble = trained("montezuma", 1)
     state = np.full(SHAPES["montezuma"], 7, np.uint8)
-    assert np.abs(deep_lift(ensemble, state[None], state).values).max() < BOUND
+    assert np.abs(attributed(ensemble, state[None], state).values).max() < BOUND
 
 
 def test_attributions_are_to_what_members_see(tmp_path):

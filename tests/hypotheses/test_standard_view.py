@@ -12,7 +12,7 @@ from torch import nn
 
 from hypogoal.core.errors import UserError
 from hypogoal.hypotheses.config import EnsembleConfig
-from hypogoal.hypotheses.deep_lift import DEEP_LIFT, INTEGRATED, attributed, deep_lift, mean_state
+from hypogoal.hypotheses.deep_lift import DEEP_LIFT, INTEGRATED, attributed, mean_state
 from hypogoal.hypotheses.ensemble import Ensemble, read_ensemble, write_ensemble
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.hypotheses.training import fit
@@ -71,7 +71,7 @@ def test_attributions_to_numbers_are_complete(shape: tuple[int, ...]) -> None:
     ensemble, (seen, _) = trained(shape), states(50, 5, shape)
     baseline = mean_state(ensemble.see(seen))
     assert baseline.shape == shape and baseline.dtype == np.float32
-    found = deep_lift(ensemble, ensemble.see(seen), baseline)
+    found = attributed(ensemble, ensemble.see(seen), baseline)
     assert found.values.shape == (50, 2, *shape) and found.completeness_error().max() < 1e-9
     mean = np.abs(found.values).mean(0).reshape(2, 4)
     assert (mean.argmax(1) == 2).all() and (mean[:, 3] == 0).all()
@@ -87,7 +87,7 @@ def test_what_needs_pictures_is_refused(settings: dict[str, Any]) -> None:
 
 def test_a_network_for_pictures_is_refused() -> None:
     """Spec G2."""
-    with pytest.raises(UserError, match=r"'montezuma' takes images \(H, W, C\): .* Give --set network=mlp"):
+    with pytest.raises(UserError, match=r"'montezuma' does not take these observations: .* Give --set network=mlp"):
         trained(network="montezuma")
 
 
